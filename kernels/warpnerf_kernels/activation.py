@@ -1,0 +1,68 @@
+"""Pointwise functions from raw values to densities and colours, each with its adjoint below it."""
+
+import warp as wp
+
+from .types import real, vec3
+
+
+@wp.func
+def log1p_small(x: real) -> real:
+    """log(1 + x) for x in [0, 1], to full relative precision when x is small."""
+    if x < real(0.01):
+        return x * (
+            real(1.0)
+            - x * (real(1.0 / 2.0) - x * (real(1.0 / 3.0) - x * (real(0.25) - x * real(0.2))))
+        )
+    return wp.log(real(1.0) + x)
+
+
+@wp.func
+def opacity_of(tau: real, attenuation: real) -> real:
+    """1 - exp(-tau) for tau >= 0, given attenuation = exp(-tau); keeps precision when tau is small."""
+    if tau < real(0.01):
+        return tau * (
+            real(1.0)
+            - tau
+            * (
+                real(1.0 / 2.0)
+                - tau * (real(1.0 / 6.0) - tau * (real(1.0 / 24.0) - tau * real(1.0 / 120.0)))
+            )
+        )
+    return real(1.0) - attenuation
+
+
+@wp.func
+def softplus(x: real) -> real:
+    """log(1 + exp(x)), arranged so that a large x does not overflow."""
+    return wp.max(x, real(0.0)) + log1p_small(wp.exp(-wp.abs(x)))
+
+
+@wp.func
+def softplus_slope(x: real) -> real:
+    """d softplus / dx = sigmoid(x)."""
+    e = wp.exp(-wp.abs(x))
+    return wp.where(x >= real(0.0), real(1.0), e) / (real(1.0) + e)
+
+
+@wp.func
+def adj_softplus(slope: real, adj_y: real) -> real:
+    """Adjoint of softplus, given its slope."""
+    return slope * adj_y
+
+
+@wp.func
+def sigmoid(x: vec3) -> vec3:
+    """1 / (1 + exp(-x)), each component."""
+    one = real(1.0)
+    return vec3(one / (one + wp.exp(-x[0])), one / (one + wp.exp(-x[1])), one / (one + wp.exp(-x[2])))
+
+
+@wp.func
+def adj_sigmoid(y: vec3, adj_y: vec3) -> vec3:
+    """Adjoint of sigmoid, given its value y: dy / dx = y (1 - y)."""
+    one = real(1.0)
+    return vec3(
+        y[0] * (one - y[0]) * adj_y[0],
+        y[1] * (one - y[1]) * adj_y[1],
+        y[2] * (one - y[2]) * adj_y[2],
+    )

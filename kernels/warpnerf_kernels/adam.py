@@ -1,0 +1,47 @@
+"""The optimiser step. Kingma & Ba 2015, algorithm 1; entries without a gradient are left alone."""
+
+import warp as wp
+
+from .types import real, vec4
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def adam_step(
+    first: int,
+    learning_rate: vec4,  # per channel
+    beta1: real,
+    beta2: real,
+    epsilon: real,
+    correction1: real,  # 1 / (1 - beta1^step)
+    correction2: real,  # 1 / (1 - beta2^step)
+    gradients: wp.array2d(dtype=vec4),  # [n_workers, n_nodes] summed in order, then zeroed
+    values: wp.array(dtype=vec4),  # [n_nodes] updated
+    mean: wp.array(dtype=vec4),  # [n_nodes] first moment, updated
+    square: wp.array(dtype=vec4),  # [n_nodes] second moment, updated
+):
+    """One step. An entry whose gradient is exactly zero keeps its value and its moments."""
+    i = first + wp.tid()
+    zero = vec4()
+    gradient = gradients[0, i]
+    for worker in range(1, gradients.shape[0]):
+        gradient += gradients[worker, i]
+    if gradient == zero:
+        return
+    for worker in range(gradients.shape[0]):
+        gradients[worker, i] = zero
+    value = values[i]
+    m = mean[i]
+    v = square[i]
+    for channel in range(4):
+        g = gradient[channel]
+        if g != real(0.0):
+            m[channel] = beta1 * m[channel] + (real(1.0) - beta1) * g
+            v[channel] = beta2 * v[channel] + (real(1.0) - beta2) * g * g
+            value[channel] = value[channel] - learning_rate[channel] * (
+                correction1 * m[channel]
+            ) / (wp.sqrt(correction2 * v[channel]) + epsilon)
+    values[i] = value
+    mean[i] = m
+    square[i] = v

@@ -1,0 +1,114 @@
+"""Trilinear interpolation between the eight nodes around a point, and its transpose."""
+
+import warp as wp
+
+from .types import real, vec3, vec4
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def lowest_node(u: vec3, size: wp.vec3i) -> wp.vec3i:
+    """Lowest corner of the cell that holds grid coordinates u; u on the far face counts inside."""
+    return wp.vec3i(
+        wp.min(int(u[0]), size[0] - 2),
+        wp.min(int(u[1]), size[1] - 2),
+        wp.min(int(u[2]), size[2] - 2),
+    )
+
+
+@wp.func
+def flat_index(i: int, j: int, k: int, size: wp.vec3i) -> int:
+    """Index of node (i, j, k); z fastest."""
+    return (i * size[1] + j) * size[2] + k
+
+
+@wp.func
+def gather(
+    values: wp.array(dtype=vec4),  # [X * Y * Z]
+    size: wp.vec3i,
+    base: int,  # flat index of the lowest node
+    fraction: vec3,  # [0, 1]
+) -> vec4:
+    """Weighted mean of the eight nodes around a point."""
+    stride_y = size[2]
+    stride_x = size[1] * size[2]
+    fx = fraction[0]
+    fy = fraction[1]
+    fz = fraction[2]
+    gx = real(1.0) - fx
+    gy = real(1.0) - fy
+    gz = real(1.0) - fz
+    n00 = base
+    n01 = base + stride_y
+    n10 = base + stride_x
+    n11 = base + stride_x + stride_y
+    near_x = gy * (gz * values[n00] + fz * values[n00 + 1]) + fy * (
+        gz * values[n01] + fz * values[n01 + 1]
+    )
+    far_x = gy * (gz * values[n10] + fz * values[n10 + 1]) + fy * (
+        gz * values[n11] + fz * values[n11 + 1]
+    )
+    return gx * near_x + fx * far_x
+
+
+@wp.func
+def adj_gather(
+    size: wp.vec3i,
+    base: int,
+    fraction: vec3,
+    adj_value: vec4,
+    worker: int,
+    adj_values: wp.array2d(dtype=vec4),  # [n_workers, X * Y * Z], added to
+):
+    """Transpose of gather: hands adj_value to the eight nodes with the weights it was made with."""
+    stride_y = size[2]
+    stride_x = size[1] * size[2]
+    fx = fraction[0]
+    fy = fraction[1]
+    fz = fraction[2]
+    gx = real(1.0) - fx
+    gy = real(1.0) - fy
+    gz = real(1.0) - fz
+    n00 = base
+    n01 = base + stride_y
+    n10 = base + stride_x
+    n11 = base + stride_x + stride_y
+    low = gx * gy * adj_value
+    wp.atomic_add(adj_values, worker, n00, gz * low)
+    wp.atomic_add(adj_values, worker, n00 + 1, fz * low)
+    low = gx * fy * adj_value
+    wp.atomic_add(adj_values, worker, n01, gz * low)
+    wp.atomic_add(adj_values, worker, n01 + 1, fz * low)
+    low = fx * gy * adj_value
+    wp.atomic_add(adj_values, worker, n10, gz * low)
+    wp.atomic_add(adj_values, worker, n10 + 1, fz * low)
+    low = fx * fy * adj_value
+    wp.atomic_add(adj_values, worker, n11, gz * low)
+    wp.atomic_add(adj_values, worker, n11 + 1, fz * low)
+
+
+@wp.kernel
+def resample(
+    first: int,
+    values: wp.array(dtype=vec4),  # [X * Y * Z]
+    size: wp.vec3i,
+    scale: vec3,  # u in the old grid = u in the new one * scale + offset
+    offset: vec3,
+    out_size: wp.vec3i,
+    out_values: wp.array(dtype=vec4),  # [X' * Y' * Z']
+):
+    """Another grid's nodes, read off this one; outside of it, its nearest face."""
+    n = first + wp.tid()
+    k = n % out_size[2]
+    j = (n // out_size[2]) % out_size[1]
+    i = n // (out_size[2] * out_size[1])
+    u = wp.cw_mul(vec3(real(i), real(j), real(k)), scale) + offset
+    u = vec3(
+        wp.clamp(u[0], real(0.0), real(size[0] - 1)),
+        wp.clamp(u[1], real(0.0), real(size[1] - 1)),
+        wp.clamp(u[2], real(0.0), real(size[2] - 1)),
+    )
+    node = lowest_node(u, size)
+    fraction = u - vec3(real(node[0]), real(node[1]), real(node[2]))
+    out_values[n] = gather(values, size, flat_index(node[0], node[1], node[2], size), fraction)

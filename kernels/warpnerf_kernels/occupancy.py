@@ -1,0 +1,84 @@
+"""Free space: which cells of the grid's domain hold nothing that could be seen."""
+
+import warp as wp
+
+from .activation import softplus
+from .types import Grid, real
+
+wp.set_module_options({"enable_backward": False})
+
+FAR = wp.constant(8)  # distances are counted up to here, cells
+
+
+@wp.func
+def first_node(cell: int, n_cells: int, n_nodes: int) -> int:
+    """Lowest node, on one axis, that a cell's samples or their neighbours' can touch."""
+    return wp.max(0, (cell * (n_nodes - 1)) // n_cells - 1)
+
+
+@wp.func
+def last_node(cell: int, n_cells: int, n_nodes: int) -> int:
+    """Highest such node."""
+    return wp.min(n_nodes - 1, ((cell + 1) * (n_nodes - 1) + n_cells - 1) // n_cells + 1)
+
+
+@wp.kernel
+def mark_occupied(
+    first: int,
+    grid: Grid,
+    size: wp.vec3i,  # cells
+    step: real,  # the length over which alpha is judged, scene units
+    alpha_min: real,  # what counts as visible
+    out_distance: wp.array(dtype=wp.uint8),  # [MX * MY * MZ] 0 where occupied, else FAR + 1
+):
+    """A cell is occupied if any node in it or next to it would give a step this much alpha."""
+    n = first + wp.tid()
+    ck = n % size[2]
+    cj = (n // size[2]) % size[1]
+    ci = n // (size[2] * size[1])
+    highest = real(-1.0e30)
+    for i in range(first_node(ci, size[0], grid.size[0]), last_node(ci, size[0], grid.size[0]) + 1):
+        for j in range(
+            first_node(cj, size[1], grid.size[1]), last_node(cj, size[1], grid.size[1]) + 1
+        ):
+            for k in range(
+                first_node(ck, size[2], grid.size[2]), last_node(ck, size[2], grid.size[2]) + 1
+            ):
+                raw = grid.values[(i * grid.size[1] + j) * grid.size[2] + k]
+                highest = wp.max(highest, raw[0])
+    alpha = real(1.0) - wp.exp(
+        -step * grid.density_scale * softplus(highest + grid.density_shift)
+    )
+    if alpha > alpha_min:
+        out_distance[n] = wp.uint8(0)
+    else:
+        out_distance[n] = wp.uint8(FAR + 1)
+
+
+@wp.kernel
+def spread_distance(
+    first: int,
+    size: wp.vec3i,  # cells
+    axis: int,
+    distance: wp.array(dtype=wp.uint8),  # [MX * MY * MZ]
+    out_distance: wp.array(dtype=wp.uint8),  # [MX * MY * MZ]
+):
+    """One axis of the chessboard distance to the nearest occupied cell, up to FAR + 1.
+
+    max(|dx|, |dy|, |dz|) separates: d'(p) = min over s of max(|s|, d(p + s along the axis)).
+    """
+    n = first + wp.tid()
+    stride = int(1)
+    if axis == 0:
+        stride = size[1] * size[2]
+    if axis == 1:
+        stride = size[2]
+    position = (n // stride) % size[axis]
+    best = int(distance[n])
+    for s in range(1, FAR + 1):
+        if s < best:
+            if position >= s:
+                best = wp.min(best, wp.max(s, int(distance[n - s * stride])))
+            if position + s < size[axis]:
+                best = wp.min(best, wp.max(s, int(distance[n + s * stride])))
+    out_distance[n] = wp.uint8(best)

@@ -1,0 +1,100 @@
+"""A calibrated camera.
+
+Convention of the whole project: ``c2w`` maps camera to world with OpenGL axes (x right, y up,
+looking along -z); pixel (column u, row v) has its centre at (u + 0.5, v + 0.5); row 0 is the top.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Camera:
+    """Pinhole camera with OpenCV's radial and tangential distortion.
+
+    With (x, y) = (X/Z, Y/Z) in OpenCV axes and r^2 = x^2 + y^2, a point lands on the pixel
+
+        x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2),   u = fx x' + cx
+        y' = y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y,   v = fy y' + cy
+    """
+
+    width: int
+    """Pixels per row."""
+    height: int
+    """Rows."""
+    fx: float
+    """Focal length along u, pixels."""
+    fy: float
+    """Focal length along v, pixels."""
+    cx: float
+    """Principal point along u, pixels from the left edge of the image."""
+    cy: float
+    """Principal point along v, pixels from the top edge of the image."""
+    c2w: np.ndarray
+    """[3, 4] float64, camera to world, OpenGL axes, translation in scene units."""
+    k1: float = 0.0
+    """Radial distortion, r^2."""
+    k2: float = 0.0
+    """Radial distortion, r^4."""
+    k3: float = 0.0
+    """Radial distortion, r^6."""
+    p1: float = 0.0
+    """Tangential distortion."""
+    p2: float = 0.0
+    """Tangential distortion."""
+
+    @property
+    def position(self) -> np.ndarray:
+        """Camera centre, [3] scene units."""
+        return self.c2w[:, 3]
+
+    @property
+    def forward(self) -> np.ndarray:
+        """Unit vector along the optical axis, into the scene, [3]."""
+        return -self.c2w[:, 2]
+
+    def distort(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Distort points on the plane Z = 1, as in the equation of the class.
+
+        Args:
+            points: [n, 2] (x, y) = (X/Z, Y/Z) in OpenCV axes.
+
+        Returns:
+            [n, 2] (x', y'), and [n, 2, 2] its derivative by (x, y).
+        """
+        x, y = points[:, 0], points[:, 1]
+        r2 = x * x + y * y
+        radial = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        slope = 2.0 * (self.k1 + r2 * (2.0 * self.k2 + r2 * 3.0 * self.k3))  # d radial / d(r^2/2)
+        distorted = np.stack(
+            [
+                x * radial + 2.0 * self.p1 * x * y + self.p2 * (r2 + 2.0 * x * x),
+                y * radial + self.p1 * (r2 + 2.0 * y * y) + 2.0 * self.p2 * x * y,
+            ],
+            axis=1,
+        )
+        jacobian = np.empty((len(points), 2, 2))
+        jacobian[:, 0, 0] = radial + slope * x * x + 2.0 * self.p1 * y + 6.0 * self.p2 * x
+        jacobian[:, 0, 1] = slope * x * y + 2.0 * self.p1 * x + 2.0 * self.p2 * y
+        jacobian[:, 1, 0] = jacobian[:, 0, 1]
+        jacobian[:, 1, 1] = radial + slope * y * y + 6.0 * self.p1 * y + 2.0 * self.p2 * x
+        return distorted, jacobian
+
+    def downscaled(self, factor: int) -> Camera:
+        """Camera of the image whose pixels are means over ``factor`` by ``factor`` blocks.
+
+        Pixels at the right and bottom that fill no block are cropped. Distortion acts on (X/Z, Y/Z)
+        and stays as it is.
+        """
+        return replace(
+            self,
+            width=self.width // factor,
+            height=self.height // factor,
+            fx=self.fx / factor,
+            fy=self.fy / factor,
+            cx=self.cx / factor,
+            cy=self.cy / factor,
+        )

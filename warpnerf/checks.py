@@ -1,0 +1,55 @@
+"""Errors for bad input, and the checks that raise them where data enters."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+
+
+class InputError(ValueError):
+    """Bad input from outside: one sentence naming the file or field, what is wrong, and the way out.
+
+    The command prints the sentence and exits with 2; Python users can catch it as a ValueError.
+    """
+
+
+def require_positive(field: str, value: float) -> None:
+    """Raise ValueError unless value is a finite number above zero; NaN is refused as well."""
+    if not (value > 0 and math.isfinite(value)):
+        raise InputError(f"{field} must be a finite number above 0, not {value}.")
+
+
+def require_at_least(field: str, value: float, least: float) -> None:
+    """Raise ValueError unless value is a finite number of at least `least`."""
+    if not (value >= least and math.isfinite(value)):
+        raise InputError(f"{field} must be a finite number of at least {least:g}, not {value}.")
+
+
+def require_one_of(field: str, value: str, choices: Iterable[str]) -> None:
+    """Raise ValueError unless value is one of the choices."""
+    if value not in choices:
+        raise InputError(f"{field} must be one of {', '.join(choices)}, not {value!r}.")
+
+
+def require_rays(origins: np.ndarray, directions: np.ndarray) -> None:
+    """Raise ValueError unless both are [n_rays, 3], finite, and directions of unit length."""
+    for name, array in (("origins", origins), ("directions", directions)):
+        if array.ndim != 2 or array.shape[1] != 3:
+            raise InputError(f"{name} must have shape [n_rays, 3], not {list(array.shape)}.")
+        if not np.isfinite(array).all():
+            raise InputError(f"{name} must be finite, but hold NaN or infinity.")
+    if len(origins) != len(directions):
+        raise InputError(
+            f"origins and directions must be equally many, not {len(origins)} and "
+            f"{len(directions)}."
+        )
+    length = np.linalg.norm(directions, axis=1)
+    bad = np.flatnonzero(np.abs(length - 1.0) > 1e-3)
+    if bad.size:
+        raise InputError(
+            f"directions must be unit vectors, so that t is a distance: {bad.size} of "
+            f"{length.size} are not (first: ray {bad[0]}, length {length[bad[0]]:.3g}). "
+            "Divide them by their length."
+        )

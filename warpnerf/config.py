@@ -1,0 +1,170 @@
+"""How to train: small frozen values, each field with its unit, refused when wrong."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Literal, get_args
+
+from warpnerf.checks import InputError, require_at_least, require_one_of, require_positive
+
+Scaling = Literal["none", "quadratic", "clamped"]
+Jacobian = Literal["none", "density", "paper"]
+Contraction = Literal["none", "linf", "l2"]
+Background = Literal["auto", "white", "black", "random"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class GridConfig:
+    """The voxel grid over the scene's box."""
+
+    voxels: int = 160**3
+    """Nodes of the final grid, in all."""
+    grow_at: tuple[float, ...] = (0.05, 0.1, 0.15, 0.25)
+    """Shares of the training at which the number of nodes doubles."""
+    alpha_init: float = 1e-3
+    """Opacity of one voxel's length before training."""
+    contraction: Literal["auto", "none", "linf", "l2"] = "auto"
+    """How space outside the box is folded in; auto: linf for unbounded scenes, else none."""
+    border: float = 0.2
+    """Width of the shell that holds space outside the box, in half edges of the box; (0, 1]."""
+
+    def __post_init__(self) -> None:
+        """Refuse what makes no grid."""
+        require_at_least("grid.voxels", self.voxels, 8)
+        require_one_of("grid.contraction", self.contraction, ("auto", *get_args(Contraction)))
+        if not 0 < self.alpha_init < 1:
+            raise InputError(f"grid.alpha_init must lie between 0 and 1, not {self.alpha_init}.")
+        if not 0 < self.border <= 1:
+            raise InputError(f"grid.border must be above 0 and at most 1, not {self.border}.")
+        if list(self.grow_at) != sorted(self.grow_at) or not all(0 < s < 1 for s in self.grow_at):
+            raise InputError(
+                f"grid.grow_at must be shares between 0 and 1 in rising order, not {self.grow_at}."
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class MarchConfig:
+    """How rays are stepped."""
+
+    step_voxels: float = 0.5
+    """Step length, in voxel edges."""
+    near: float = 0.0
+    """Nothing is sampled nearer to the camera than this, scene units."""
+    far: float | None = None
+    """Nothing is sampled at or beyond this, scene units; None: where the box or the world ends."""
+    growth: float = 0.02
+    """Beyond the box of an unbounded scene, each step is this share longer than the one before."""
+    transmittance_min: float = 1e-3
+    """A ray ends where less light than this would pass."""
+    jitter: bool = True
+    """Shift each training ray's samples by a random part of a step."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be marched."""
+        require_positive("march.step_voxels", self.step_voxels)
+        require_at_least("march.near", self.near, 0.0)
+        require_at_least("march.growth", self.growth, 0.0)
+        if self.far is not None and not self.far > self.near:
+            raise InputError(f"march.far must lie beyond march.near, not at {self.far}.")
+        if not 0 <= self.transmittance_min < 1:
+            raise InputError(
+                f"march.transmittance_min must lie in [0, 1), not {self.transmittance_min}."
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class OptimConfig:
+    """Adam, its schedule, and regularisation."""
+
+    learning_rate_density: float = 0.2
+    """Step size of raw densities at the start."""
+    learning_rate_rgb: float = 0.1
+    """Step size of raw colours at the start."""
+    decay: float = 0.1
+    """What is left of the learning rates at the end of training."""
+    beta1: float = 0.9
+    """Decay of the first moment."""
+    beta2: float = 0.99
+    """Decay of the second moment."""
+    epsilon: float = 1e-8
+    """Added to the root of the second moment; gradients are of the mean over a batch's rays."""
+    tv_density: float = 1e-6
+    """Weight of the total variation of raw densities, per pair of neighbouring nodes."""
+    tv_rgb: float = 1e-7
+    """Weight of the total variation of raw colours."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be optimised with."""
+        require_positive("optim.learning_rate_density", self.learning_rate_density)
+        require_positive("optim.learning_rate_rgb", self.learning_rate_rgb)
+        require_positive("optim.decay", self.decay)
+        require_positive("optim.epsilon", self.epsilon)
+        require_at_least("optim.tv_density", self.tv_density, 0.0)
+        require_at_least("optim.tv_rgb", self.tv_rgb, 0.0)
+        for name in ("beta1", "beta2"):
+            if not 0 <= getattr(self, name) < 1:
+                raise InputError(f"optim.{name} must lie in [0, 1), not {getattr(self, name)}.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """One training run."""
+
+    steps: int = 4000
+    """Optimiser steps."""
+    time_limit: float | None = None
+    """Seconds after which training ends, its schedule squeezed to fit; None: no limit."""
+    scaling: Scaling = "clamped"
+    """How a sample's gradient depends on its distance t from the camera: none, quadratic
+    (t / D)^2, or clamped min(1, (t / D)^2), the method of "Floaters No More"."""
+    content_distance: float | Literal["auto"] = "auto"
+    """D: where gradients reach full strength, scene units; auto: the scene's estimate."""
+    jacobian: Jacobian = "none"
+    """Whether the scaling takes the contraction's change of volume into account."""
+    rays_per_step: int = 4096
+    """Rays in a batch."""
+    background: Background | tuple[float, float, float] = "auto"
+    """What is seen behind the scene: a colour, rgb in [0, 1], or random colours while training
+    (white when rendering); auto: white where photographs have alpha, else black."""
+    occupancy_every: int = 100
+    """Steps between two looks for free space."""
+    alpha_min: float = 1e-3
+    """A cell counts as free where no step would be more opaque than this."""
+    seed: int = 0
+    """Same seed, same number of threads: same bits on the CPU."""
+    threads: int | None = None
+    """CPU threads; None: one per core."""
+    device: str = "cpu"
+    """Where to train: cpu, cuda, cuda:1, ..."""
+    grid: GridConfig = field(default_factory=GridConfig)
+    """The voxel grid."""
+    march: MarchConfig = field(default_factory=MarchConfig)
+    """How rays are stepped."""
+    optim: OptimConfig = field(default_factory=OptimConfig)
+    """Adam, its schedule, and regularisation."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be trained with."""
+        require_at_least("steps", self.steps, 1)
+        require_at_least("rays_per_step", self.rays_per_step, 1)
+        require_at_least("occupancy_every", self.occupancy_every, 1)
+        require_at_least("alpha_min", self.alpha_min, 0.0)
+        if not 0 <= self.seed < 2**63:
+            raise InputError(f"seed must be at least 0 and below 2^63, not {self.seed}.")
+        require_one_of("scaling", self.scaling, get_args(Scaling))
+        require_one_of("jacobian", self.jacobian, get_args(Jacobian))
+        if self.time_limit is not None:
+            require_positive("time_limit", self.time_limit)
+        if self.threads is not None:
+            require_at_least("threads", self.threads, 1)
+        if isinstance(self.content_distance, str):
+            require_one_of("content_distance", self.content_distance, ("auto",))
+        else:
+            require_positive("content_distance", self.content_distance)
+        if isinstance(self.background, str):
+            require_one_of("background", self.background, get_args(Background))
+        elif len(self.background) != 3 or not all(
+            math.isfinite(c) and 0 <= c <= 1 for c in self.background
+        ):
+            raise InputError(f"background must be rgb in [0, 1], not {self.background}.")

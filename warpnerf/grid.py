@@ -1,0 +1,224 @@
+"""The voxel grid on its device: values, their place in the world, and what of it is free."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass, replace
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import warp as wp
+from warpnerf_kernels import contraction, interp, occupancy, types
+from warpnerf_kernels.types import FreeSpace, Grid, vec3, vec4
+
+from warpnerf.checks import InputError
+from warpnerf.config import Contraction
+from warpnerf.parallel import Workers
+
+CONTRACTIONS = {"none": contraction.NONE, "linf": contraction.LINF, "l2": contraction.L2}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class VoxelGrid:
+    """A dense grid [X, Y, Z] of raw density and raw rgb, z fastest, nodes at both ends of the box."""
+
+    values: wp.array
+    """[X * Y * Z] vec4: raw density, raw rgb."""
+    size: tuple[int, int, int]
+    """X, Y, Z."""
+    box_min: np.ndarray
+    """[3] float64, lower corner, scene units."""
+    box_max: np.ndarray
+    """[3] float64, upper corner."""
+    contraction: Contraction = "none"
+    """How space outside the box is folded into a shell around it."""
+    border: float = 0.0
+    """Width of that shell, in half edges of the box; 0 without contraction."""
+    density_shift: float = 0.0
+    """sigma = density_scale softplus(raw density + density_shift)."""
+    density_scale: float = 1.0
+    """1 / scene unit."""
+
+    @property
+    def voxel_size(self) -> np.ndarray:
+        """Distance between nodes inside the box, [3] scene units."""
+        extent = (self.box_max - self.box_min) * (1.0 + self.border)
+        return extent / (np.array(self.size) - 1)
+
+    def struct(self) -> Grid:
+        """The grid as kernels take it."""
+        return grid_struct(
+            types,
+            self.values,
+            self.size,
+            self.box_min,
+            self.box_max,
+            self.border,
+            self.density_shift,
+            self.density_scale,
+        )
+
+    def resized(
+        self,
+        workers: Workers,
+        size: tuple[int, int, int],
+        others: tuple[wp.array, ...] = (),
+        box: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> tuple[VoxelGrid, tuple[wp.array, ...]]:
+        """The same field on another grid, trilinearly read off this one.
+
+        Args:
+            workers: Where to work.
+            size: Nodes of the new grid.
+            others: Further arrays over the nodes, such as an optimiser's moments.
+            box: Corners of the new grid, within this one's; None: the same. Not with contraction.
+
+        Returns:
+            The new grid, and the other arrays on it.
+        """
+        box_min, box_max = box or (self.box_min, self.box_max)
+        old = (np.array(self.size) - 1) / (self.box_max - self.box_min)
+        new = (box_max - box_min) / (np.array(size) - 1)
+        scale, offset = vec3(*(old * new)), vec3(*(old * (box_min - self.box_min)))
+        n = math.prod(size)
+        resampled = []
+        for source in (self.values, *others):
+            out = wp.empty(n, dtype=vec4, device=workers.device)
+            workers.launch(
+                interp.resample,
+                n,
+                source,
+                wp.vec3i(*self.size),
+                scale,
+                offset,
+                wp.vec3i(*size),
+                out,
+            )
+            resampled.append(out)
+        grid = replace(self, values=resampled[0], size=size, box_min=box_min, box_max=box_max)
+        return grid, tuple(resampled[1:])
+
+
+def grid_struct(
+    types: ModuleType,
+    values: wp.array,
+    size: tuple[int, int, int],
+    box_min: np.ndarray,
+    box_max: np.ndarray,
+    border: float,
+    density_shift: float,
+    density_scale: float,
+) -> Any:
+    """A kernel's Grid, in the precision of the given ``warpnerf_kernels.types``."""
+    grid = types.Grid()
+    grid.values = values
+    grid.size = wp.vec3i(*size)
+    grid.centre = types.vec3(*(0.5 * (box_min + box_max)))
+    grid.half = types.vec3(*(0.5 * (box_max - box_min)))
+    grid.border = border
+    middle = 0.5 * (np.array(size) - 1)
+    grid.to_nodes = types.vec3(*(middle / (1.0 + border)))
+    grid.middle = types.vec3(*middle)
+    grid.density_shift = density_shift
+    grid.density_scale = density_scale
+    return grid
+
+
+def free_struct(
+    types: ModuleType, distance: wp.array, size: tuple[int, int, int], border: float
+) -> Any:
+    """A kernel's FreeSpace over a grid with this border, in the precision of ``types``."""
+    free = types.FreeSpace()
+    free.distance = distance
+    free.size = wp.vec3i(*size)
+    free.to_cells = types.vec3(*(0.5 * np.array(size) / (1.0 + border)))
+    return free
+
+
+def grid_size(extent: np.ndarray, voxels: int) -> tuple[int, int, int]:
+    """Nodes along each axis so that voxels are cubes and about `voxels` in all.
+
+    Args:
+        extent: [3] edges of the domain, scene units.
+        voxels: Nodes in all.
+    """
+    edge = (np.prod(extent) / voxels) ** (1.0 / 3.0)
+    size = np.maximum(2, np.round(extent / edge).astype(int) + 1)
+    return int(size[0]), int(size[1]), int(size[2])
+
+
+def require_memory(size: tuple[int, int, int], arrays: int) -> None:
+    """Raise InputError if that many arrays of 16 bytes a node do not fit this machine's memory."""
+    needed = math.prod(size) * 16 * arrays
+    total = _total_memory()
+    if total is not None and needed > total:
+        raise InputError(
+            f"grid.voxels: a grid of {size[0]} x {size[1]} x {size[2]} nodes needs "
+            f"{needed / 2**30:.1f} GiB to train, but this machine has {total / 2**30:.1f} GiB; "
+            "use fewer voxels."
+        )
+
+
+def _total_memory() -> int | None:
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        return None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FreeCells:
+    """Which cells of a grid's domain hold nothing visible, as distances to the nearest that does."""
+
+    distance: wp.array
+    """[MX * MY * MZ] uint8, cells to the nearest occupied one; 0 there."""
+    size: tuple[int, int, int]
+    """MX, MY, MZ."""
+
+    @staticmethod
+    def none(workers: Workers) -> FreeCells:
+        """All space is occupied."""
+        return FreeCells(
+            distance=wp.zeros(1, dtype=wp.uint8, device=workers.device), size=(1, 1, 1)
+        )
+
+    @staticmethod
+    def of(grid: VoxelGrid, workers: Workers, step: float, alpha_min: float) -> FreeCells:
+        """Look a grid over.
+
+        Args:
+            grid: The grid.
+            workers: Where to work.
+            step: Length over which opacity is judged, scene units.
+            alpha_min: The least opacity that counts as visible.
+        """
+        size = tuple(max(1, (n - 1) // 2) for n in grid.size)
+        n = math.prod(size)
+        distance = wp.empty(n, dtype=wp.uint8, device=workers.device)
+        spread = wp.empty_like(distance)
+        cells = wp.vec3i(*size)
+        workers.launch(
+            occupancy.mark_occupied, n, grid.struct(), cells, step, alpha_min, distance
+        )
+        for axis in range(3):
+            workers.launch(occupancy.spread_distance, n, cells, axis, distance, spread)
+            distance, spread = spread, distance
+        return FreeCells(distance=distance, size=(size[0], size[1], size[2]))
+
+    def struct(self, border: float) -> FreeSpace:
+        """Free space as kernels take it, for a grid with this border."""
+        return free_struct(types, self.distance, self.size, border)
+
+    def share(self) -> float:
+        """The share of cells that are occupied, [0, 1]."""
+        return float(np.mean(self.distance.numpy() == 0))
+
+    def occupied_range(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Lowest and highest corner of the occupied cells, each [3] as shares of the domain."""
+        occupied = np.argwhere(self.distance.numpy().reshape(self.size) == 0)
+        if not len(occupied):
+            return None
+        size = np.array(self.size)
+        return occupied.min(0) / size, (occupied.max(0) + 1) / size

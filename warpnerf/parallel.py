@@ -1,0 +1,89 @@
+"""All cores of the CPU: one Warp launch runs on one core, launches from several threads overlap.
+
+Each worker gets a contiguous share of the items that depends on nothing but their number and the
+number of workers. What a worker adds to, it owns; so no two race, and results are the same bits
+whatever else the machine is doing.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import warp as wp
+
+from warpnerf.checks import InputError
+
+MAX_ITEMS = 1 << 16
+"""Items per launch on the CPU: signals such as Ctrl-C wait for a launch to end."""
+
+
+class Workers:
+    """The threads that launch kernels on one device. A CUDA device needs, and gets, just one."""
+
+    def __init__(self, device: str = "cpu", threads: int | None = None) -> None:
+        """Open a device.
+
+        Args:
+            device: As Warp names it: cpu, cuda, cuda:1.
+            threads: CPU threads; None: one per core that this process may use.
+
+        Raises:
+            InputError: The device does not exist on this machine.
+        """
+        wp.config.log_level = wp.LOG_ERROR  # no banner, and no warning about a missing CUDA driver
+        wp.init()
+        try:
+            self.device = wp.get_device(device)
+        except Exception as error:
+            found = ", ".join(str(d) for d in wp.get_devices())
+            raise InputError(
+                f"device {device!r} is not available on this machine (found: {found}); "
+                "use --device cpu."
+            ) from error
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        self.count = 1 if self.device.is_cuda else (threads or cores or 1)
+        self._pool = ThreadPoolExecutor(self.count - 1) if self.count > 1 else None
+        self._loaded: set[Any] = set()
+
+    def launch(self, kernel: wp.Kernel, n: int, *arguments: Any) -> None:
+        """Run kernel(first, *arguments) over items 0..n-1, shared out over the workers.
+
+        Args:
+            kernel: Its thread index counts from the `first` that it is given.
+            n: Number of items.
+            arguments: The rest of the kernel's arguments.
+        """
+        self._launch(kernel, n, lambda worker: arguments)
+
+    def launch_owned(self, kernel: wp.Kernel, n: int, *arguments: Any) -> None:
+        """Run kernel(first, worker, *arguments) likewise: it writes to rows that a worker owns."""
+        self._launch(kernel, n, lambda worker: (worker, *arguments))
+
+    def _launch(
+        self, kernel: wp.Kernel, n: int, arguments: Callable[[int], tuple[Any, ...]]
+    ) -> None:
+        if n == 0:
+            return
+        if kernel not in self._loaded:
+            # Loaded here once: else every thread would compile it.
+            kernel.module.load(self.device, block_dim=256 if self.device.is_cuda else 1)
+            self._loaded.add(kernel)
+        if self.device.is_cuda:
+            wp.launch(kernel, n, inputs=[0, *arguments(0)], device=self.device)
+            return
+
+        def share(worker: int) -> None:
+            end = n * (worker + 1) // self.count
+            for first in range(n * worker // self.count, end, MAX_ITEMS):
+                inputs = [first, *arguments(worker)]
+                wp.launch(kernel, min(MAX_ITEMS, end - first), inputs=inputs, device=self.device)
+
+        others = [self._pool.submit(share, w) for w in range(1, self.count)] if self._pool else []
+        try:
+            share(0)
+        finally:
+            for other in others:
+                other.result()

@@ -1,0 +1,182 @@
+"""Rendering rays through a grid, and the training launch that does so both ways."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+import warp as wp
+from warpnerf_kernels import gradscale, types
+from warpnerf_kernels import render as kernels
+from warpnerf_kernels.types import Sample, real, vec3, vec4
+
+from warpnerf.config import Jacobian, Scaling
+from warpnerf.grid import CONTRACTIONS, FreeCells, VoxelGrid
+from warpnerf.parallel import Workers
+from warpnerf.rays import RayBatch
+
+SCALINGS = {
+    "none": gradscale.NONE,
+    "quadratic": gradscale.QUADRATIC,
+    "clamped": gradscale.CLAMPED,
+}
+JACOBIANS = {
+    "none": gradscale.JACOBIAN_NONE,
+    "density": gradscale.JACOBIAN_DENSITY,
+    "paper": gradscale.JACOBIAN_PAPER,
+}
+
+KEPT_SAMPLES = 1024
+"""Samples of a ray that a CPU worker keeps between the two passes; later ones are read again."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Steps:
+    """Where along a ray samples may sit: n_linear equal steps from near on, then growing ones."""
+
+    near: float
+    """Where the first step begins, scene units."""
+    far: float
+    """No sample at or beyond it, scene units."""
+    step: float
+    """Length of the equal steps, scene units."""
+    n_linear: int = 0
+    """How many there are; with growth only."""
+    growth: float = 0.0
+    """Each later step is (1 + growth) times the one before; 0: all are equal."""
+    transmittance_min: float = 0.0
+    """A ray ends where less light than this would pass."""
+
+    def struct(self, types: ModuleType = types) -> Any:
+        """The steps as kernels take them, in the precision of the given types."""
+        march = types.March()
+        march.near = self.near
+        march.far = self.far
+        march.step = self.step
+        march.growth = self.growth
+        march.n_linear = self.n_linear
+        march.transmittance_min = self.transmittance_min
+        return march
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RenderedRays:
+    """What rays see, on their device."""
+
+    rgb: wp.array
+    """[n_rays] vec3 in [0, 1], with background."""
+    transmittance: wp.array
+    """[n_rays] in [0, 1], light of the background."""
+    depth: wp.array
+    """[n_rays] sum of weight times t, scene units."""
+    n_samples: wp.array
+    """[n_rays] visited steps."""
+
+
+def render_rays(
+    grid: VoxelGrid,
+    free: FreeCells,
+    steps: Steps,
+    origins: wp.array,
+    directions: wp.array,
+    offsets: wp.array,
+    background: wp.array,
+    workers: Workers,
+) -> RenderedRays:
+    """Integrate emission and absorption along each ray.
+
+    rgb = sum_k T_k alpha_k c_k + T_end background,  alpha_k = 1 - exp(-sigma_k dt_k)
+    Source: Mildenhall et al. 2020, eq. 3. Adjoint: kernels/README.md, "A ray".
+
+    Args:
+        grid: Scene.
+        free: What of it is skipped.
+        steps: How to march.
+        origins: [n_rays] vec3, scene units.
+        directions: [n_rays] vec3 of unit length.
+        offsets: [n_rays] or [1], where in its step a sample sits.
+        background: [n_rays] or [1] vec3, rgb in [0, 1].
+        workers: Where to work.
+    """
+    n = origins.shape[0]
+    out = RenderedRays(
+        rgb=wp.empty(n, dtype=vec3, device=workers.device),
+        transmittance=wp.empty(n, dtype=real, device=workers.device),
+        depth=wp.empty(n, dtype=real, device=workers.device),
+        n_samples=wp.empty(n, dtype=wp.int32, device=workers.device),
+    )
+    variant = kernels.Variant(
+        CONTRACTIONS[grid.contraction], gradscale.NONE, gradscale.JACOBIAN_NONE
+    )
+    workers.launch(
+        kernels.render_forward_kernel(variant),
+        n,
+        grid.struct(),
+        free.struct(grid.border),
+        steps.struct(),
+        origins,
+        directions,
+        offsets,
+        background,
+        wp.empty(0, dtype=Sample, device=workers.device),
+        out.rgb,
+        out.transmittance,
+        out.depth,
+        out.n_samples,
+    )
+    return out
+
+
+class TrainingPass:
+    """Forward, loss and scaled adjoint of ray batches in one launch, into gradients of its own.
+
+    Loss: mean over rays of the squared error, summed over the channels.
+    """
+
+    def __init__(
+        self,
+        n_rays: int,
+        n_nodes: int,
+        scaling: Scaling,
+        jacobian: Jacobian,
+        contraction: str,
+        workers: Workers,
+    ) -> None:
+        """Allocate what a batch of n_rays into a grid of n_nodes needs, whatever its samples."""
+        device = workers.device
+        self._workers = workers
+        self._kernel = kernels.render_train_kernel(
+            kernels.Variant(CONTRACTIONS[contraction], SCALINGS[scaling], JACOBIANS[jacobian])
+        )
+        # On CUDA all rays are under way at once: there, reading a sample again is the cheaper way.
+        self._capacity = 0 if device.is_cuda else KEPT_SAMPLES
+        self._kept = wp.empty(workers.count * self._capacity, dtype=Sample, device=device)
+        self.error = wp.zeros(n_rays, dtype=real, device=device)
+        """[n_rays] squared error of the last batch."""
+        self.n_samples = wp.zeros(n_rays, dtype=wp.int32, device=device)
+        """[n_rays] visited steps of the last batch."""
+        self.gradients = wp.zeros((workers.count, n_nodes), dtype=vec4, device=device)
+        """[n_workers, n_nodes] vec4; their sum over the workers is the gradient."""
+
+    def run(self, grid: VoxelGrid, free: FreeCells, steps: Steps, batch: RayBatch) -> None:
+        """Add a batch's gradient to ``gradients``."""
+        self._workers.launch_owned(
+            self._kernel,
+            batch.count,
+            grid.struct(),
+            free.struct(grid.border),
+            steps.struct(),
+            batch.origins,
+            batch.directions,
+            batch.offsets,
+            batch.background,
+            batch.content_distance,
+            batch.target_rgb,
+            1.0 / batch.count,
+            self._capacity,
+            self._kept,
+            self.error,
+            self.n_samples,
+            self.gradients,
+        )

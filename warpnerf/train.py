@@ -1,0 +1,326 @@
+"""Training: one step, and the schedule that strings steps together. No files, no terminal."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import warp as wp
+from warpnerf_kernels.types import vec4
+
+from warpnerf.checks import InputError
+from warpnerf.config import Contraction, TrainConfig
+from warpnerf.field import Field
+from warpnerf.grid import FreeCells, VoxelGrid, grid_size, require_memory
+from warpnerf.optim import Moments, adam_step, add_total_variation
+from warpnerf.parallel import Workers
+from warpnerf.rays import PixelSampler
+from warpnerf.render import Steps, TrainingPass
+from warpnerf.scene import Scene
+
+FAR_BOXES = 64.0
+"""How far an unbounded scene is sampled, in half edges of its box; beyond lies the background."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """Where training stands."""
+
+    step: int
+    """Steps done."""
+    fraction: float
+    """Of the whole training, [0, 1]."""
+    seconds: float
+    """Since training began."""
+    loss: float
+    """Mean squared error per ray, summed over channels, mean over the steps since the last report."""
+    psnr: float
+    """Of the training rays since the last report, dB."""
+    samples_per_ray: float
+    """Visited steps per ray of the last batch."""
+    size: tuple[int, int, int]
+    """Nodes of the grid."""
+    occupied: float
+    """Share of cells that are not free, [0, 1]."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrainResult:
+    """What training leaves."""
+
+    field: Field
+    """The trained scene."""
+    content_distance: float
+    """The one that was used, scene units."""
+    progress: Progress
+    """The last report."""
+
+
+def train(
+    scene: Scene,
+    config: TrainConfig | None = None,
+    *,
+    on_progress: Callable[[Progress], None] | None = None,
+    report_every: int = 50,
+) -> TrainResult:
+    """Train a voxel grid on a scene's training views.
+
+    Each step draws random pixels, marches their rays, and runs one hand-written adjoint back into
+    the grid that scales each sample's gradient by its distance from the camera
+    (Philip & Deschaintre 2023). kernels/README.md derives it.
+
+    Args:
+        scene: From ``load_scene``.
+        config: How to train; None: the defaults, which are the preset "fast".
+        on_progress: Called every `report_every` steps and at the end.
+        report_every: Steps between two reports.
+
+    Returns:
+        The field, and how training ended.
+
+    Raises:
+        InputError: The device is missing, or the grid would not fit the memory.
+        FloatingPointError: The loss is no longer a finite number.
+    """
+    trainer = Trainer(scene, config or TrainConfig())
+    while trainer.fraction < 1.0:
+        trainer.step()
+        if trainer.steps_done % report_every == 0 or trainer.fraction >= 1.0:
+            progress = trainer.report()
+            if on_progress is not None:
+                on_progress(progress)
+    return TrainResult(
+        field=trainer.field(), content_distance=trainer.content_distance, progress=progress
+    )
+
+
+class Trainer:
+    """A training run between two steps: the grid, its optimiser, and what comes next."""
+
+    def __init__(self, scene: Scene, config: TrainConfig) -> None:
+        """Set up the first step.
+
+        Raises:
+            InputError: The device is missing, or the grid would not fit the memory.
+        """
+        self.config = config
+        self.workers = Workers(config.device, config.threads)
+        self.steps_done = 0
+        self.content_distance = (
+            scene.content_distance
+            if config.content_distance == "auto"
+            else float(config.content_distance)
+        )
+        views = [scene.views[i] for i in scene.splits["train"]]
+        has_alpha = any(view.image.shape[2] == 4 for view in views)
+        behind = config.background
+        if behind == "auto":
+            behind = "white" if has_alpha else "black"
+        self._background = _COLOURS[behind] if isinstance(behind, str) else behind
+        self._sampler = PixelSampler(
+            views,
+            self.content_distance,
+            None if behind == "random" else self._background,
+            config.rays_per_step,
+            config.march.jitter,
+            config.seed,
+            self.workers,
+        )
+        self._grown = 0
+        self._reach = _reach(scene)
+        self._unbounded = scene.unbounded
+        self.grid = self._first_grid(scene)
+        self.moments = Moments.zeros(self.grid, self.workers)
+        self.free = FreeCells.none(self.workers)
+        self._occupied = 1.0
+        self._pass = self._training_pass()
+        self._started = time.perf_counter()
+        self._seconds = 0.0
+        self._loss_sum = wp.zeros(1, dtype=float, device=self.workers.device)
+        self._errors: list[float] = []
+
+    @property
+    def fraction(self) -> float:
+        """How much of the training is done: of its steps, or of its time where that is further."""
+        done = self.steps_done / self.config.steps
+        if self.config.time_limit is not None:
+            done = max(done, self._seconds / self.config.time_limit)
+        return min(done, 1.0)
+
+    def step(self) -> None:
+        """Draw a batch and update the grid; grow the grid and look for free space when due."""
+        config = self.config
+        fraction = self.fraction
+        self._grow(fraction)
+        if self.steps_done % config.occupancy_every == 0 and self.steps_done > 0:
+            self._look_for_free_space()
+        batch = self._sampler.draw(self.steps_done)
+        self._pass.run(self.grid, self.free, self.march_steps(), batch)
+        add_total_variation(self.grid, self._pass.gradients, config.optim, self.workers)
+        self.steps_done += 1
+        adam_step(
+            self.grid,
+            self.moments,
+            self._pass.gradients,
+            self.steps_done,
+            config.optim.decay**fraction,
+            config.optim,
+            self.workers,
+        )
+        self._errors.append(float(self._pass.error.numpy().mean()))
+        self._seconds = time.perf_counter() - self._started
+
+    def report(self) -> Progress:
+        """Where training stands; the mean loss is of the steps since the last report.
+
+        Raises:
+            FloatingPointError: The loss is not finite.
+        """
+        loss = float(np.mean(self._errors)) if self._errors else math.nan
+        self._errors = []
+        if not math.isfinite(loss):
+            raise FloatingPointError(
+                f"the loss is not finite after step {self.steps_done}; lower the learning rates."
+            )
+        return Progress(
+            step=self.steps_done,
+            fraction=self.fraction,
+            seconds=self._seconds,
+            loss=loss,
+            psnr=-10.0 * math.log10(max(loss / 3.0, 1e-12)),
+            samples_per_ray=float(self._pass.n_samples.numpy().mean()),
+            size=self.grid.size,
+            occupied=self._occupied,
+        )
+
+    def field(self) -> Field:
+        """The scene as it stands."""
+        return Field(
+            grid=self.grid,
+            free=self.free,
+            steps=self.march_steps(),
+            background=self._background,
+            workers=self.workers,
+        )
+
+    def march_steps(self) -> Steps:
+        """How rays are marched through the grid as it stands."""
+        march = self.config.march
+        step = march.step_voxels * float(self.grid.voxel_size.min())
+        half = float(0.5 * (self.grid.box_max - self.grid.box_min).max())
+        folded = self.grid.contraction != "none"
+        far = march.far
+        if far is None:
+            far = FAR_BOXES * half + self._reach if folded else math.inf
+        n_linear = max(0, math.ceil((self._reach - march.near) / step))
+        return Steps(
+            near=march.near,
+            far=min(far, 1e30),
+            step=step,
+            n_linear=n_linear if folded else 0,
+            growth=march.growth if folded else 0.0,
+            transmittance_min=march.transmittance_min,
+        )
+
+    def _first_grid(self, scene: Scene) -> VoxelGrid:
+        config = self.config.grid
+        contraction: Contraction = (
+            ("linf" if scene.unbounded else "none")
+            if config.contraction == "auto"
+            else config.contraction
+        )
+        border = 0.0 if contraction == "none" else config.border
+        extent = (scene.box_max - scene.box_min) * (1.0 + border)
+        final = grid_size(extent, config.voxels)
+        # Values, two moments, a gradient for each worker.
+        require_memory(final, 3 + self.workers.count)
+        size = grid_size(extent, self._voxels(0))
+        voxel = float((extent / (np.array(final) - 1)).min())
+        n = math.prod(size)
+        return VoxelGrid(
+            values=wp.zeros(n, dtype=vec4, device=self.workers.device),
+            size=size,
+            box_min=scene.box_min,
+            box_max=scene.box_max,
+            contraction=contraction,
+            border=border,
+            # softplus(shift) is the optical depth of a voxel of the final grid.
+            density_shift=math.log(math.expm1(-math.log1p(-config.alpha_init))),
+            density_scale=1.0 / voxel,
+        )
+
+    def _voxels(self, grown: int) -> int:
+        """Nodes after that many growing steps."""
+        left = len(self.config.grid.grow_at) - grown
+        return max(8, self.config.grid.voxels >> left)
+
+    def _training_pass(self) -> TrainingPass:
+        return TrainingPass(
+            self.config.rays_per_step,
+            math.prod(self.grid.size),
+            self.config.scaling,
+            self.config.jacobian,
+            self.grid.contraction,
+            self.workers,
+        )
+
+    def _grow(self, fraction: float) -> None:
+        """Carry grid and optimiser over to more nodes, once the schedule says so."""
+        grown = sum(fraction >= at for at in self.config.grid.grow_at)
+        if grown == self._grown:
+            return
+        self._look_for_free_space()
+        box = self._tight_box()
+        extent = (box[1] - box[0]) * (1.0 + self.grid.border)
+        size = grid_size(extent, self._voxels(grown))
+        self.grid, (mean, square) = self.grid.resized(
+            self.workers, size, (self.moments.mean, self.moments.square), box
+        )
+        self.moments = replace(self.moments, mean=mean, square=square)
+        self._grown = grown
+        self._pass = self._training_pass()
+        self._look_for_free_space()
+
+    def _tight_box(self) -> tuple[np.ndarray, np.ndarray]:
+        """The box around what is occupied, where space is bounded; never larger than before."""
+        box_min, box_max = self.grid.box_min, self.grid.box_max
+        occupied = self.free.occupied_range()
+        if self.grid.contraction != "none" or occupied is None:
+            return box_min, box_max
+        extent = box_max - box_min
+        return box_min + occupied[0] * extent, box_min + occupied[1] * extent
+
+    def _look_for_free_space(self) -> None:
+        self.free = FreeCells.of(
+            self.grid, self.workers, self.march_steps().step, self.config.alpha_min
+        )
+        self._occupied = self.free.share()
+
+
+_COLOURS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "random": (1.0, 1.0, 1.0)}
+
+
+def _reach(scene: Scene) -> float:
+    """Distance from the outermost training camera to the farthest corner of the box."""
+    corner = 0.5 * float(np.linalg.norm(scene.box_max - scene.box_min))
+    centre = 0.5 * (scene.box_min + scene.box_max)
+    cameras = [scene.views[i].camera.position for i in scene.splits["train"]]
+    return corner + max(float(np.linalg.norm(p - centre)) for p in cameras)
+
+
+def require_split(scene: Scene, split: str) -> tuple[int, ...]:
+    """Indices of a split's views; "all" is every view.
+
+    Raises:
+        InputError: The scene has no such split, or it is empty.
+    """
+    if split == "all":
+        return tuple(range(len(scene.views)))
+    if not scene.splits.get(split):
+        raise InputError(
+            f"{scene.name} has no {split!r} views; it has {', '.join(sorted(scene.splits))} or all."
+        )
+    return scene.splits[split]
