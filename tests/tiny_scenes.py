@@ -1,0 +1,86 @@
+"""Scene folders of a few small images, for tests to break in one place each."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from warpnerf.camera import Camera
+
+DATA = Path(os.environ.get("WARPNERF_DATA", Path(__file__).parents[2] / "shared" / "data"))
+
+
+def needs_capture(name: str) -> pytest.MarkDecorator:
+    """Skip where a real capture is not on this machine."""
+    return pytest.mark.skipif(
+        not (DATA / name).is_dir(), reason=f"no capture {name} in {DATA}; set WARPNERF_DATA"
+    )
+
+
+def look_at(position: tuple[float, float, float], target: tuple[float, float, float]) -> np.ndarray:
+    """[4, 4] camera to world, OpenGL axes, z up."""
+    back = np.subtract(position, target).astype(np.float64)
+    back /= np.linalg.norm(back)
+    right = np.cross([0.0, 0.0, 1.0], back)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3] = np.stack([right, np.cross(back, right), back, np.array(position, float)], axis=1)
+    return pose
+
+
+def ring(n: int, *, radius: float = 3.0, height: float = 1.0) -> list[np.ndarray]:
+    """Poses on a circle that look at the origin."""
+    angles = 2.0 * np.pi * np.arange(n) / n
+    return [
+        look_at((radius * np.cos(a), radius * np.sin(a), height), (0.0, 0.0, 0.0)) for a in angles
+    ]
+
+
+def camera_at(pose: np.ndarray, **changes: Any) -> Camera:
+    values = {"width": 8, "height": 6, "fx": 10.0, "fy": 10.0, "cx": 4.0, "cy": 3.0} | changes
+    return Camera(c2w=pose[:3], **values)
+
+
+def picture(seed: int, *, width: int = 8, height: int = 6, channels: int = 3) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (height, width, channels), dtype=np.uint8)
+
+
+def transforms_content(n: int) -> dict[str, Any]:
+    """What ``write_transforms`` writes."""
+    lens = {"fl_x": 10.0, "fl_y": 11.0, "cx": 4.25, "cy": 2.75, "w": 8, "h": 6}
+    frames = [
+        {"file_path": f"images/{i:03d}.png", "transform_matrix": pose.tolist()}
+        for i, pose in enumerate(ring(n))
+    ]
+    return {**lens, "frames": frames}
+
+
+def write_transforms(folder: Path, n: int = 4) -> dict[str, Any]:
+    """A transforms.json with its images; returns the content, to be changed and saved again."""
+    (folder / "images").mkdir(parents=True)
+    for i in range(n):
+        Image.fromarray(picture(i)).save(folder / f"images/{i:03d}.png")
+    content = transforms_content(n)
+    save(folder / "transforms.json", content)
+    return content
+
+
+def write_blender(folder: Path, split: str, poses: list[np.ndarray], *, channels: int = 4) -> Any:
+    (folder / split).mkdir(parents=True)
+    frames = []
+    for i, pose in enumerate(poses):
+        Image.fromarray(picture(i, channels=channels)).save(folder / f"{split}/r_{i}.png")
+        frames.append({"file_path": f"./{split}/r_{i}", "transform_matrix": pose.tolist()})
+    content = {"camera_angle_x": 0.6911112070083618, "frames": frames}
+    save(folder / f"transforms_{split}.json", content)
+    return content
+
+
+def save(path: Path, content: Any) -> None:
+    path.write_text(json.dumps(content))

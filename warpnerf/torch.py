@@ -1,0 +1,354 @@
+"""Drop-in torch operations: the paper's gradient scaling, and rendering through our own adjoint."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import cache
+from types import ModuleType
+from typing import Any, NamedTuple, get_args
+
+import numpy as np
+import torch
+import warp as wp
+from warpnerf_kernels import contraction, gradscale, precision
+
+from warpnerf.checks import InputError, require_at_least, require_one_of, require_positive
+from warpnerf.config import Scaling
+from warpnerf.grid import free_struct, grid_struct
+from warpnerf.parallel import Workers
+from warpnerf.render import SCALINGS, Steps
+
+_PRECISIONS = {torch.float32: "float32", torch.float64: "float64"}
+
+
+def scale_gradient(
+    colors: torch.Tensor,
+    sigmas: torch.Tensor,
+    distances: torch.Tensor,
+    content_distance: float | torch.Tensor = 1.0,
+    scaling: Scaling = "clamped",
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Scale the gradients of samples by their distance; call it just before integrating them.
+
+    Identity forward. Backward, with s = 1 (none), (t / D)^2 (quadratic) or min(1, (t / D)^2)
+    (clamped): dL/dcolor <- s dL/dcolor, dL/dsigma <- s dL/dsigma.
+    Source: Philip & Deschaintre 2023, "Floaters No More", eq. 7.
+
+    Args:
+        colors: [..., C] of samples, any floating type.
+        sigmas: [...] or [..., 1] densities of the same samples.
+        distances: t, of the shape of sigmas, scene units from the camera centre.
+        content_distance: D, scene units; a number, or a tensor that broadcasts over distances.
+        scaling: none, quadratic or clamped.
+
+    Returns:
+        colors, sigmas and distances, unchanged. No gradient flows to distances.
+
+    Raises:
+        InputError: Shapes do not fit, or content_distance is not above zero.
+    """
+    require_one_of("scaling", scaling, get_args(Scaling))
+    if sigmas.shape != distances.shape:
+        raise InputError(
+            f"sigmas and distances must have one shape, not {list(sigmas.shape)} and "
+            f"{list(distances.shape)}."
+        )
+    # One distance for all channels of a color.
+    per_color = distances if colors.dim() == distances.dim() else distances.unsqueeze(-1)
+    if per_color.shape[:-1] != colors.shape[:-1] or per_color.shape[-1] != 1:
+        raise InputError(
+            f"colors must be [..., C] over sigmas [...] or [..., 1], not {list(colors.shape)} over "
+            f"{list(sigmas.shape)}."
+        )
+    if isinstance(content_distance, torch.Tensor):
+        if not bool((content_distance > 0).all()):
+            raise InputError("content_distance must be above 0 everywhere.")
+    else:
+        require_positive("content_distance", content_distance)
+    if scaling == "none":
+        return colors, sigmas, distances.detach()
+    ratio = distances.detach() / content_distance
+    scale = ratio * ratio
+    if scaling == "clamped":
+        scale = scale.clamp(max=1.0)
+    of_color = scale if colors.dim() == distances.dim() else scale.unsqueeze(-1)
+    return (
+        _Scaled.apply(colors, of_color),
+        _Scaled.apply(sigmas, scale),
+        distances.detach(),
+    )
+
+
+class _Scaled(torch.autograd.Function):
+    """x, whose gradient is multiplied by scale."""
+
+    @staticmethod
+    def forward(ctx: Any, x: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
+        ctx.save_for_backward(scale)
+        return x.view_as(x)
+
+    @staticmethod
+    def backward(ctx: Any, grad: torch.Tensor) -> tuple[torch.Tensor, None]:  # type: ignore[override]
+        (scale,) = ctx.saved_tensors
+        return grad * scale.to(grad.dtype), None
+
+
+class RenderedRays(NamedTuple):
+    """What rays see."""
+
+    rgb: torch.Tensor
+    """[n_rays, 3], with background."""
+    opacity: torch.Tensor
+    """[n_rays] in [0, 1]."""
+    depth: torch.Tensor
+    """[n_rays] sum of weight times t, scene units."""
+
+
+def render_rays(
+    raw: torch.Tensor,
+    origins: torch.Tensor,
+    directions: torch.Tensor,
+    box_min: Sequence[float] | torch.Tensor,
+    box_max: Sequence[float] | torch.Tensor,
+    *,
+    step: float,
+    near: float = 0.0,
+    far: float | None = None,
+    density_shift: float = 0.0,
+    background: Sequence[float] | torch.Tensor = (1.0, 1.0, 1.0),
+    scaling: Scaling = "none",
+    content_distance: float | torch.Tensor = 1.0,
+) -> RenderedRays:
+    """Render rays through a grid of raw values, differentiable with respect to them.
+
+    Samples sit at t = near + (k + 1/2) step for every k >= 0 whose point lies in the box and whose
+    t is below far; sigma = softplus(raw density + density_shift), rgb = sigmoid(raw rgb);
+
+        rgb = sum_k T_k alpha_k c_k + T_end background,  alpha_k = 1 - exp(-sigma_k step)
+
+    The gradient is warpnerf's hand-written adjoint (kernels/README.md), in which each sample's
+    share is multiplied by its distance scaling. It is then the gradient of no loss: see the paper.
+
+    Args:
+        raw: [X, Y, Z, 4] raw density and raw r, g, b at nodes
+            box_min + index (box_max - box_min) / (size - 1); float32 or float64, CPU or CUDA.
+        origins: [n_rays, 3] scene units, on the same device.
+        directions: [n_rays, 3] of unit length.
+        box_min: [3] lower corner, scene units.
+        box_max: [3] upper corner.
+        step: Length of a step, scene units.
+        near: Where the first step begins, scene units.
+        far: No sample at or beyond it, scene units; None: where the box ends.
+        density_shift: Added to raw densities before their activation.
+        background: [3] or [n_rays, 3], rgb.
+        scaling: none, quadratic or clamped.
+        content_distance: Where gradients reach full strength, scene units; a number or [n_rays].
+
+    Returns:
+        rgb [n_rays, 3], opacity [n_rays] and depth [n_rays], of raw's type and device.
+
+    Raises:
+        InputError: A shape, type, device or number does not fit.
+    """
+    require_one_of("scaling", scaling, get_args(Scaling))
+    require_positive("step", step)
+    require_at_least("near", near, 0.0)
+    if far is not None and not far > near:
+        raise InputError(f"far must lie beyond near, not at {far}.")
+    if not math.isfinite(density_shift):
+        raise InputError(f"density_shift must be finite, not {density_shift}.")
+    _require_grid(raw)
+    corners = _corner("box_min", box_min), _corner("box_max", box_max)
+    if not (corners[0] < corners[1]).all():
+        raise InputError(
+            f"box_max must lie above box_min on every axis, not {corners[1]} over {corners[0]}."
+        )
+    rays = _rays("origins", origins, raw), _rays("directions", directions, raw)
+    if len(rays[0]) != len(rays[1]):
+        raise InputError(
+            f"origins and directions must be equally many, not {len(rays[0])} and {len(rays[1])}."
+        )
+    length = rays[1].norm(dim=1)
+    if len(length) and not bool(((length - 1.0).abs() < 1e-3).all()):
+        raise InputError(
+            "directions must be unit vectors, so that t is a distance; divide them by their length."
+        )
+    behind = torch.as_tensor(background, dtype=raw.dtype, device=raw.device).detach()
+    if behind.shape not in ((3,), (len(rays[0]), 3)) or not bool(behind.isfinite().all()):
+        raise InputError(
+            f"background must be finite rgb, [3] or [n_rays, 3], not {list(behind.shape)}."
+        )
+    content = torch.as_tensor(content_distance, dtype=raw.dtype, device=raw.device).detach()
+    if content.shape not in ((), (1,), (len(rays[0]),)) or not bool((content > 0).all()):
+        raise InputError(
+            "content_distance must be above 0: a number or [n_rays], "
+            f"not {content.tolist() if content.dim() == 0 else list(content.shape)}."
+        )
+    steps = Steps(near=near, far=min(1e30, math.inf if far is None else far), step=step)
+    call = _Call(
+        corners=corners,
+        steps=steps,
+        density_shift=density_shift,
+        background=behind.reshape(-1, 3).contiguous(),
+        scaling=scaling,
+        content_distance=content.reshape(-1).contiguous(),
+    )
+    return RenderedRays(*_Render.apply(raw, *rays, call))
+
+
+class _Call(NamedTuple):
+    """What a rendering depends on besides tensors with gradients and rays."""
+
+    corners: tuple[np.ndarray, np.ndarray]
+    steps: Steps
+    density_shift: float
+    background: torch.Tensor
+    scaling: Scaling
+    content_distance: torch.Tensor
+
+
+class _Render(torch.autograd.Function):
+    """render_rays, forward and backward, each one launch."""
+
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any, raw: torch.Tensor, origins: torch.Tensor, directions: torch.Tensor, call: _Call
+    ) -> tuple[torch.Tensor, ...]:
+        kernels, types = _device_code(raw)
+        n = len(origins)
+        rgb, depth = raw.new_empty(n, 3), raw.new_empty(n)
+        transmittance = raw.new_empty(n)
+        n_samples = torch.empty(n, dtype=torch.int32, device=raw.device)
+        workers = _workers(str(raw.device))
+        outputs = _array(rgb, types.vec3), _array(transmittance), _array(depth), _array(n_samples)
+        with _stream(raw):
+            workers.launch(
+                kernels.render_forward_kernel(_variant(kernels, "none")),
+                n,
+                *_scene(raw, call, types),
+                *_ray_arrays(raw, origins, directions, call, types),
+                wp.empty(0, dtype=types.Sample, device=workers.device),
+                *outputs,
+            )
+        ctx.call = call
+        ctx.save_for_backward(raw, origins, directions, rgb, transmittance, depth, n_samples)
+        return rgb, 1.0 - transmittance, depth
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        raw, origins, directions, rgb, transmittance, depth, n_samples = ctx.saved_tensors
+        call: _Call = ctx.call
+        kernels, types = _device_code(raw)
+        workers = _workers(str(raw.device))
+        adj_rgb, adj_opacity, adj_depth = (grad.contiguous() for grad in grads)
+        adj_raw = raw.new_zeros(workers.count, raw[..., 0].numel(), 4)
+        with _stream(raw):
+            workers.launch_owned(
+                kernels.render_backward_kernel(_variant(kernels, call.scaling)),
+                len(origins),
+                *_scene(raw, call, types),
+                *_ray_arrays(raw, origins, directions, call, types),
+                _array(call.content_distance),
+                _array(rgb, types.vec3),
+                _array(transmittance),
+                _array(depth),
+                _array(n_samples),
+                _array(adj_rgb, types.vec3),
+                _array(adj_opacity),
+                _array(adj_depth),
+                wp.empty(0, dtype=types.Sample, device=workers.device),
+                _array(adj_raw, types.vec4),
+            )
+        return adj_raw.sum(0).reshape(raw.shape), None, None, None
+
+
+@cache
+def _workers(device: str) -> Workers:
+    return Workers(device)
+
+
+def _device_code(raw: torch.Tensor) -> tuple[ModuleType, ModuleType]:
+    """Kernels and types in raw's precision."""
+    name = _PRECISIONS[raw.dtype]
+    return precision.load(name, "render"), precision.load(name, "types")
+
+
+def _variant(kernels: ModuleType, scaling: Scaling) -> Any:
+    return kernels.Variant(contraction.NONE, SCALINGS[scaling], gradscale.JACOBIAN_NONE)
+
+
+def _stream(raw: torch.Tensor) -> Any:
+    """Work in torch's own order on CUDA; nothing to do on the CPU."""
+    if raw.is_cuda:
+        return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(raw.device)))
+    import contextlib
+
+    return contextlib.nullcontext()
+
+
+def _array(tensor: torch.Tensor, dtype: Any = None) -> wp.array:
+    """The tensor's memory as a Warp array; contiguous tensors only."""
+    return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
+
+
+def _scene(raw: torch.Tensor, call: _Call, types: ModuleType) -> tuple[Any, ...]:
+    """grid, free space and march, as kernels take them."""
+    size = (raw.shape[0], raw.shape[1], raw.shape[2])
+    values = _array(raw.detach().contiguous().reshape(-1, 4), types.vec4)
+    occupied = wp.zeros(1, dtype=wp.uint8, device=values.device)
+    return (
+        grid_struct(types, values, size, *call.corners, 0.0, call.density_shift, 1.0),
+        free_struct(types, occupied, (1, 1, 1), 0.0),
+        call.steps.struct(types),
+    )
+
+
+def _ray_arrays(
+    raw: torch.Tensor,
+    origins: torch.Tensor,
+    directions: torch.Tensor,
+    call: _Call,
+    types: ModuleType,
+) -> tuple[wp.array, ...]:
+    """origins, directions, offsets and background, as kernels take them."""
+    return (
+        _array(origins, types.vec3),
+        _array(directions, types.vec3),
+        _array(raw.new_full((1,), 0.5)),
+        _array(call.background, types.vec3),
+    )
+
+
+def _require_grid(raw: torch.Tensor) -> None:
+    if raw.dtype not in _PRECISIONS:
+        raise InputError(f"raw must be float32 or float64, not {raw.dtype}.")
+    if raw.layout != torch.strided:
+        raise InputError(f"raw must be a dense tensor, not {raw.layout}; call raw.to_dense().")
+    if raw.dim() != 4 or raw.shape[3] != 4 or min(raw.shape[:3]) < 2:
+        raise InputError(
+            f"raw must be [X, Y, Z, 4] with at least two nodes along each axis, "
+            f"not {list(raw.shape)}."
+        )
+    if raw.shape[:3].numel() >= 2**31:
+        raise InputError(f"raw must have fewer than 2^31 nodes, not {raw.shape[:3].numel()}.")
+
+
+def _corner(field: str, value: Sequence[float] | torch.Tensor) -> np.ndarray:
+    corner = np.asarray(
+        value.detach().cpu() if isinstance(value, torch.Tensor) else value, dtype=np.float64
+    )
+    if corner.shape != (3,) or not np.isfinite(corner).all():
+        raise InputError(f"{field} must be three finite numbers, not {value}.")
+    return corner
+
+
+def _rays(field: str, value: torch.Tensor, raw: torch.Tensor) -> torch.Tensor:
+    if value.dim() != 2 or value.shape[1] != 3:
+        raise InputError(f"{field} must be [n_rays, 3], not {list(value.shape)}.")
+    if value.device != raw.device:
+        raise InputError(f"{field} must be on {raw.device} as raw is, not on {value.device}.")
+    if not bool(value.isfinite().all()):
+        raise InputError(f"{field} must be finite, but hold NaN or infinity.")
+    return value.detach().to(raw.dtype).contiguous()
