@@ -47,7 +47,7 @@ class GridConfig:
 class MarchConfig:
     """How rays are stepped."""
 
-    step_voxels: float = 0.5
+    step_voxels: float = 1.0
     """Step length, in voxel edges."""
     near: float = 0.0
     """Nothing is sampled nearer to the camera than this, scene units."""
@@ -77,9 +77,9 @@ class MarchConfig:
 class OptimConfig:
     """Adam, its schedule, and regularisation."""
 
-    learning_rate_density: float = 0.2
+    learning_rate_density: float = 0.5
     """Step size of raw densities at the start."""
-    learning_rate_rgb: float = 0.1
+    learning_rate_rgb: float = 0.2
     """Step size of raw colours at the start."""
     decay: float = 0.1
     """What is left of the learning rates at the end of training."""
@@ -89,10 +89,12 @@ class OptimConfig:
     """Decay of the second moment."""
     epsilon: float = 1e-8
     """Added to the root of the second moment; gradients are of the mean over a batch's rays."""
-    tv_density: float = 1e-6
+    tv_density: float = 1e-8
     """Weight of the total variation of raw densities, per pair of neighbouring nodes."""
-    tv_rgb: float = 1e-7
+    tv_rgb: float = 1e-9
     """Weight of the total variation of raw colours."""
+    tv_every: int = 4
+    """Steps from one total-variation gradient to the next, which counts that many times."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot be optimised with."""
@@ -102,6 +104,7 @@ class OptimConfig:
         require_positive("optim.epsilon", self.epsilon)
         require_at_least("optim.tv_density", self.tv_density, 0.0)
         require_at_least("optim.tv_rgb", self.tv_rgb, 0.0)
+        require_at_least("optim.tv_every", self.tv_every, 1)
         for name in ("beta1", "beta2"):
             if not 0 <= getattr(self, name) < 1:
                 raise InputError(f"optim.{name} must lie in [0, 1), not {getattr(self, name)}.")
@@ -122,14 +125,14 @@ class TrainConfig:
     """D: where gradients reach full strength, scene units; auto: the scene's estimate."""
     jacobian: Jacobian = "none"
     """Whether the scaling takes the contraction's change of volume into account."""
-    rays_per_step: int = 4096
+    rays_per_step: int = 2048
     """Rays in a batch."""
     background: Background | tuple[float, float, float] = "auto"
     """What is seen behind the scene: a colour, rgb in [0, 1], or random colours while training
     (white when rendering); auto: white where photographs have alpha, else black."""
     occupancy_every: int = 100
     """Steps between two looks for free space."""
-    alpha_min: float = 1e-3
+    alpha_min: float = 1e-2
     """A cell counts as free where no step would be more opaque than this."""
     seed: int = 0
     """Same seed, same number of threads: same bits on the CPU."""
@@ -168,3 +171,17 @@ class TrainConfig:
             math.isfinite(c) and 0 <= c <= 1 for c in self.background
         ):
             raise InputError(f"background must be rgb in [0, 1], not {self.background}.")
+
+
+PRESETS: dict[str, TrainConfig] = {
+    # Minutes on two cores.
+    "fast": TrainConfig(),
+    # An hour on two cores, or minutes on a GPU.
+    "quality": TrainConfig(
+        steps=20_000,
+        rays_per_step=8192,
+        grid=GridConfig(voxels=224**3),
+        march=MarchConfig(step_voxels=0.5),
+    ),
+}
+"""Starting points by name; change one with ``dataclasses.replace``."""

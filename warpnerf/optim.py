@@ -6,12 +6,13 @@ import math
 from dataclasses import dataclass
 
 import warp as wp
-from warpnerf_kernels import adam, regularize
+from warpnerf_kernels import adam, interp, regularize
 from warpnerf_kernels.types import vec4
 
 from warpnerf.config import OptimConfig
 from warpnerf.grid import VoxelGrid
 from warpnerf.parallel import Workers
+from warpnerf.render import Gradients
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -36,7 +37,7 @@ class Moments:
 def adam_step(
     grid: VoxelGrid,
     moments: Moments,
-    gradients: wp.array,
+    gradients: Gradients,
     step: int,
     decay: float,
     config: OptimConfig,
@@ -47,7 +48,7 @@ def adam_step(
     Args:
         grid: Its values are updated; an entry whose gradient is exactly zero is left alone.
         moments: Updated likewise.
-        gradients: [n_workers, n_nodes] vec4, summed in the order of workers.
+        gradients: Summed in the order of workers.
         step: Counts from 1.
         decay: Factor on the learning rates.
         config: The rest.
@@ -56,39 +57,48 @@ def adam_step(
     rgb_rate = decay * config.learning_rate_rgb
     workers.launch(
         adam.adam_step,
-        math.prod(grid.size),
+        *_shares(grid, workers),
         vec4(decay * config.learning_rate_density, rgb_rate, rgb_rate, rgb_rate),
         config.beta1,
         config.beta2,
         config.epsilon,
         1.0 / (1.0 - config.beta1**step),
         1.0 / (1.0 - config.beta2**step),
-        gradients,
+        gradients.touched,
+        gradients.rows,
         grid.values,
         moments.mean,
         moments.square,
     )
+    gradients.touched.zero_()
 
 
 def add_total_variation(
-    grid: VoxelGrid, gradients: wp.array, config: OptimConfig, workers: Workers
+    grid: VoxelGrid, gradients: Gradients, config: OptimConfig, workers: Workers
 ) -> None:
     """Add the gradient of the grid's total variation at the nodes that have one already.
 
     Args:
         grid: The grid.
-        gradients: [n_workers, n_nodes] vec4; row 0 is added to.
-        config: Holds the weights.
+        gradients: Row 0 is added to.
+        config: Holds the weights, and how many steps this one gradient stands for.
         workers: Where to work.
     """
     if config.tv_density == 0.0 and config.tv_rgb == 0.0:
         return
-    rgb = config.tv_rgb
+    rgb = config.tv_every * config.tv_rgb
     workers.launch(
         regularize.total_variation_backward,
-        math.prod(grid.size),
+        *_shares(grid, workers),
         grid.values,
         wp.vec3i(*grid.size),
-        vec4(config.tv_density, rgb, rgb, rgb),
-        gradients,
+        vec4(config.tv_every * config.tv_density, rgb, rgb, rgb),
+        gradients.touched,
+        gradients.rows,
     )
+
+
+def _shares(grid: VoxelGrid, workers: Workers) -> tuple[int, int]:
+    """How many threads work on the nodes, and on how many each: a core takes a tile at a time."""
+    span = 1 if workers.device.is_cuda else interp.TILE
+    return -(-math.prod(grid.size) // span), span

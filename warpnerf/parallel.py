@@ -16,8 +16,10 @@ import warp as wp
 
 from warpnerf.checks import InputError
 
-MAX_ITEMS = 1 << 16
-"""Items per launch on the CPU: signals such as Ctrl-C wait for a launch to end."""
+NODES = 1 << 20
+RAYS = 1 << 13
+"""Items per launch on the CPU, of little and of much work each: a fraction of a second, because
+signals such as Ctrl-C wait for a launch to end."""
 
 
 class Workers:
@@ -36,6 +38,8 @@ class Workers:
         wp.config.log_level = wp.LOG_ERROR  # no banner, and no warning about a missing CUDA driver
         wp.init()
         try:
+            if device.startswith("cuda") and not wp.is_cuda_available():
+                raise ValueError("no CUDA driver")
             self.device = wp.get_device(device)
         except Exception as error:
             found = ", ".join(str(d) for d in wp.get_devices())
@@ -48,22 +52,25 @@ class Workers:
         self._pool = ThreadPoolExecutor(self.count - 1) if self.count > 1 else None
         self._loaded: set[Any] = set()
 
-    def launch(self, kernel: wp.Kernel, n: int, *arguments: Any) -> None:
+    def launch(self, kernel: wp.Kernel, n: int, *arguments: Any, chunk: int = NODES) -> None:
         """Run kernel(first, *arguments) over items 0..n-1, shared out over the workers.
 
         Args:
             kernel: Its thread index counts from the `first` that it is given.
             n: Number of items.
             arguments: The rest of the kernel's arguments.
+            chunk: Items per launch, NODES or RAYS.
         """
-        self._launch(kernel, n, lambda worker: arguments)
+        self._launch(kernel, n, lambda worker: arguments, chunk)
 
-    def launch_owned(self, kernel: wp.Kernel, n: int, *arguments: Any) -> None:
+    def launch_owned(
+        self, kernel: wp.Kernel, n: int, *arguments: Any, chunk: int = RAYS
+    ) -> None:
         """Run kernel(first, worker, *arguments) likewise: it writes to rows that a worker owns."""
-        self._launch(kernel, n, lambda worker: (worker, *arguments))
+        self._launch(kernel, n, lambda worker: (worker, *arguments), chunk)
 
     def _launch(
-        self, kernel: wp.Kernel, n: int, arguments: Callable[[int], tuple[Any, ...]]
+        self, kernel: wp.Kernel, n: int, arguments: Callable[[int], tuple[Any, ...]], chunk: int
     ) -> None:
         if n == 0:
             return
@@ -77,9 +84,9 @@ class Workers:
 
         def share(worker: int) -> None:
             end = n * (worker + 1) // self.count
-            for first in range(n * worker // self.count, end, MAX_ITEMS):
+            for first in range(n * worker // self.count, end, chunk):
                 inputs = [first, *arguments(worker)]
-                wp.launch(kernel, min(MAX_ITEMS, end - first), inputs=inputs, device=self.device)
+                wp.launch(kernel, min(chunk, end - first), inputs=inputs, device=self.device)
 
         others = [self._pool.submit(share, w) for w in range(1, self.count)] if self._pool else []
         try:

@@ -7,13 +7,13 @@ from types import ModuleType
 from typing import Any
 
 import warp as wp
-from warpnerf_kernels import gradscale, types
+from warpnerf_kernels import gradscale, interp, types
 from warpnerf_kernels import render as kernels
 from warpnerf_kernels.types import Sample, real, vec3, vec4
 
 from warpnerf.config import Jacobian, Scaling
 from warpnerf.grid import CONTRACTIONS, FreeCells, VoxelGrid
-from warpnerf.parallel import Workers
+from warpnerf.parallel import RAYS, Workers
 from warpnerf.rays import RayBatch
 
 SCALINGS = {
@@ -124,8 +124,28 @@ def render_rays(
         out.transmittance,
         out.depth,
         out.n_samples,
+        chunk=RAYS,
     )
     return out
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Gradients:
+    """The gradient of a loss with respect to a grid's values, in one row for each worker."""
+
+    rows: wp.array
+    """[n_workers, n_nodes] vec4; their sum over the workers is the gradient."""
+    touched: wp.array
+    """[n_tiles] uint8, 0 where a tile of nodes has no gradient."""
+
+    @staticmethod
+    def zeros(n_nodes: int, workers: Workers) -> Gradients:
+        """No gradient yet."""
+        n_tiles = -(-n_nodes // interp.TILE)
+        return Gradients(
+            rows=wp.zeros((workers.count, n_nodes), dtype=vec4, device=workers.device),
+            touched=wp.zeros(n_tiles, dtype=wp.uint8, device=workers.device),
+        )
 
 
 class TrainingPass:
@@ -156,8 +176,8 @@ class TrainingPass:
         """[n_rays] squared error of the last batch."""
         self.n_samples = wp.zeros(n_rays, dtype=wp.int32, device=device)
         """[n_rays] visited steps of the last batch."""
-        self.gradients = wp.zeros((workers.count, n_nodes), dtype=vec4, device=device)
-        """[n_workers, n_nodes] vec4; their sum over the workers is the gradient."""
+        self.gradients = Gradients.zeros(n_nodes, workers)
+        """What batches have added up to since the last optimiser step."""
 
     def run(self, grid: VoxelGrid, free: FreeCells, steps: Steps, batch: RayBatch) -> None:
         """Add a batch's gradient to ``gradients``."""
@@ -178,5 +198,6 @@ class TrainingPass:
             self._kept,
             self.error,
             self.n_samples,
-            self.gradients,
+            self.gradients.rows,
+            self.gradients.touched,
         )

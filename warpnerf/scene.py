@@ -10,7 +10,7 @@ import numpy as np
 from warpnerf.camera import Camera
 from warpnerf.checks import InputError
 
-UNBOUNDED_BOX_SHARE = 0.5
+UNBOUNDED_BOX_SHARE = 0.75
 """Half edge of the box of photographs, in content distances."""
 
 MIN_AXIS_SPREAD = 1e-4
@@ -201,3 +201,18 @@ def estimate_extent(cameras: Sequence[Camera], *, unbounded: bool) -> Extent:
             f"box of edge {2.0 * half:.3g}: {how}",
         ),
     )
+
+
+def require_split(scene: Scene, split: str) -> tuple[int, ...]:
+    """Indices of a split's views; "all" is every view.
+
+    Raises:
+        InputError: The scene has no such split, or it is empty.
+    """
+    if split == "all":
+        return tuple(range(len(scene.views)))
+    if not scene.splits.get(split):
+        raise InputError(
+            f"{scene.name} has no {split!r} views; it has {', '.join(sorted(scene.splits))} or all."
+        )
+    return scene.splits[split]

@@ -11,12 +11,12 @@ from typing import Any, NamedTuple, get_args
 import numpy as np
 import torch
 import warp as wp
-from warpnerf_kernels import contraction, gradscale, precision
+from warpnerf_kernels import contraction, gradscale, interp, precision
 
 from warpnerf.checks import InputError, require_at_least, require_one_of, require_positive
 from warpnerf.config import Scaling
 from warpnerf.grid import free_struct, grid_struct
-from warpnerf.parallel import Workers
+from warpnerf.parallel import RAYS, Workers
 from warpnerf.render import SCALINGS, Steps
 
 _PRECISIONS = {torch.float32: "float32", torch.float64: "float64"}
@@ -230,6 +230,7 @@ class _Render(torch.autograd.Function):
                 *_ray_arrays(raw, origins, directions, call, types),
                 wp.empty(0, dtype=types.Sample, device=workers.device),
                 *outputs,
+                chunk=RAYS,
             )
         ctx.call = call
         ctx.save_for_backward(raw, origins, directions, rgb, transmittance, depth, n_samples)
@@ -243,7 +244,9 @@ class _Render(torch.autograd.Function):
         kernels, types = _device_code(raw)
         workers = _workers(str(raw.device))
         adj_rgb, adj_opacity, adj_depth = (grad.contiguous() for grad in grads)
-        adj_raw = raw.new_zeros(workers.count, raw[..., 0].numel(), 4)
+        n_nodes = raw.shape[:3].numel()
+        adj_raw = raw.new_zeros(workers.count, n_nodes, 4)
+        touched = torch.zeros(-(-n_nodes // interp.TILE), dtype=torch.uint8, device=raw.device)
         with _stream(raw):
             workers.launch_owned(
                 kernels.render_backward_kernel(_variant(kernels, call.scaling)),
@@ -260,6 +263,7 @@ class _Render(torch.autograd.Function):
                 _array(adj_depth),
                 wp.empty(0, dtype=types.Sample, device=workers.device),
                 _array(adj_raw, types.vec4),
+                _array(touched),
             )
         return adj_raw.sum(0).reshape(raw.shape), None, None, None
 

@@ -11,7 +11,6 @@ import numpy as np
 import warp as wp
 from warpnerf_kernels.types import vec4
 
-from warpnerf.checks import InputError
 from warpnerf.config import Contraction, TrainConfig
 from warpnerf.field import Field
 from warpnerf.grid import FreeCells, VoxelGrid, grid_size, require_memory
@@ -23,6 +22,9 @@ from warpnerf.scene import Scene
 
 FAR_BOXES = 64.0
 """How far an unbounded scene is sampled, in half edges of its box; beyond lies the background."""
+
+REPORT_EVERY = 25
+"""Steps between two reports."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,9 +38,9 @@ class Progress:
     seconds: float
     """Since training began."""
     loss: float
-    """Mean squared error per ray, summed over channels, mean over the steps since the last report."""
+    """Of the last batch: mean over rays of the squared error, summed over channels."""
     psnr: float
-    """Of the training rays since the last report, dB."""
+    """Of the last batch, dB."""
     samples_per_ray: float
     """Visited steps per ray of the last batch."""
     size: tuple[int, int, int]
@@ -64,7 +66,6 @@ def train(
     config: TrainConfig | None = None,
     *,
     on_progress: Callable[[Progress], None] | None = None,
-    report_every: int = 50,
 ) -> TrainResult:
     """Train a voxel grid on a scene's training views.
 
@@ -75,8 +76,7 @@ def train(
     Args:
         scene: From ``load_scene``.
         config: How to train; None: the defaults, which are the preset "fast".
-        on_progress: Called every `report_every` steps and at the end.
-        report_every: Steps between two reports.
+        on_progress: Called every ``REPORT_EVERY`` steps and at the end.
 
     Returns:
         The field, and how training ended.
@@ -88,7 +88,7 @@ def train(
     trainer = Trainer(scene, config or TrainConfig())
     while trainer.fraction < 1.0:
         trainer.step()
-        if trainer.steps_done % report_every == 0 or trainer.fraction >= 1.0:
+        if trainer.report_due:
             progress = trainer.report()
             if on_progress is not None:
                 on_progress(progress)
@@ -139,8 +139,6 @@ class Trainer:
         self._pass = self._training_pass()
         self._started = time.perf_counter()
         self._seconds = 0.0
-        self._loss_sum = wp.zeros(1, dtype=float, device=self.workers.device)
-        self._errors: list[float] = []
 
     @property
     def fraction(self) -> float:
@@ -149,6 +147,11 @@ class Trainer:
         if self.config.time_limit is not None:
             done = max(done, self._seconds / self.config.time_limit)
         return min(done, 1.0)
+
+    @property
+    def report_due(self) -> bool:
+        """Whether it is time for a report."""
+        return self.steps_done % REPORT_EVERY == 0 or self.fraction >= 1.0
 
     def step(self) -> None:
         """Draw a batch and update the grid; grow the grid and look for free space when due."""
@@ -159,7 +162,8 @@ class Trainer:
             self._look_for_free_space()
         batch = self._sampler.draw(self.steps_done)
         self._pass.run(self.grid, self.free, self.march_steps(), batch)
-        add_total_variation(self.grid, self._pass.gradients, config.optim, self.workers)
+        if self.steps_done % config.optim.tv_every == 0:
+            add_total_variation(self.grid, self._pass.gradients, config.optim, self.workers)
         self.steps_done += 1
         adam_step(
             self.grid,
@@ -170,17 +174,15 @@ class Trainer:
             config.optim,
             self.workers,
         )
-        self._errors.append(float(self._pass.error.numpy().mean()))
         self._seconds = time.perf_counter() - self._started
 
     def report(self) -> Progress:
-        """Where training stands; the mean loss is of the steps since the last report.
+        """Where training stands.
 
         Raises:
             FloatingPointError: The loss is not finite.
         """
-        loss = float(np.mean(self._errors)) if self._errors else math.nan
-        self._errors = []
+        loss = float(self._pass.error.numpy().mean())
         if not math.isfinite(loss):
             raise FloatingPointError(
                 f"the loss is not finite after step {self.steps_done}; lower the learning rates."
@@ -309,18 +311,3 @@ def _reach(scene: Scene) -> float:
     centre = 0.5 * (scene.box_min + scene.box_max)
     cameras = [scene.views[i].camera.position for i in scene.splits["train"]]
     return corner + max(float(np.linalg.norm(p - centre)) for p in cameras)
-
-
-def require_split(scene: Scene, split: str) -> tuple[int, ...]:
-    """Indices of a split's views; "all" is every view.
-
-    Raises:
-        InputError: The scene has no such split, or it is empty.
-    """
-    if split == "all":
-        return tuple(range(len(scene.views)))
-    if not scene.splits.get(split):
-        raise InputError(
-            f"{scene.name} has no {split!r} views; it has {', '.join(sorted(scene.splits))} or all."
-        )
-    return scene.splits[split]

@@ -11,7 +11,11 @@ def log1p_small(x: real) -> real:
     if x < real(0.01):
         return x * (
             real(1.0)
-            - x * (real(1.0 / 2.0) - x * (real(1.0 / 3.0) - x * (real(0.25) - x * real(0.2))))
+            - x
+            * (
+                real(0.5)
+                - x * (real(1.0) / real(3.0) - x * (real(0.25) - x * (real(1.0) / real(5.0))))
+            )
         )
     return wp.log(real(1.0) + x)
 
@@ -24,8 +28,12 @@ def opacity_of(tau: real, attenuation: real) -> real:
             real(1.0)
             - tau
             * (
-                real(1.0 / 2.0)
-                - tau * (real(1.0 / 6.0) - tau * (real(1.0 / 24.0) - tau * real(1.0 / 120.0)))
+                real(0.5)
+                - tau
+                * (
+                    real(1.0) / real(6.0)
+                    - tau * (real(1.0) / real(24.0) - tau * (real(1.0) / real(120.0)))
+                )
             )
         )
     return real(1.0) - attenuation
@@ -54,7 +62,9 @@ def adj_softplus(slope: real, adj_y: real) -> real:
 def sigmoid(x: vec3) -> vec3:
     """1 / (1 + exp(-x)), each component."""
     one = real(1.0)
-    return vec3(one / (one + wp.exp(-x[0])), one / (one + wp.exp(-x[1])), one / (one + wp.exp(-x[2])))
+    return vec3(
+        one / (one + wp.exp(-x[0])), one / (one + wp.exp(-x[1])), one / (one + wp.exp(-x[2]))
+    )
 
 
 @wp.func

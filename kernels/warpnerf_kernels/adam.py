@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from .interp import tile_of
 from .types import real, vec4
 
 wp.set_module_options({"enable_backward": False})
@@ -10,38 +11,42 @@ wp.set_module_options({"enable_backward": False})
 @wp.kernel
 def adam_step(
     first: int,
+    span: int,  # nodes per thread: 1, or a tile
     learning_rate: vec4,  # per channel
     beta1: real,
     beta2: real,
     epsilon: real,
     correction1: real,  # 1 / (1 - beta1^step)
     correction2: real,  # 1 / (1 - beta2^step)
+    touched: wp.array(dtype=wp.uint8),  # [n_tiles] 0 where no gradient is
     gradients: wp.array2d(dtype=vec4),  # [n_workers, n_nodes] summed in order, then zeroed
     values: wp.array(dtype=vec4),  # [n_nodes] updated
     mean: wp.array(dtype=vec4),  # [n_nodes] first moment, updated
     square: wp.array(dtype=vec4),  # [n_nodes] second moment, updated
 ):
     """One step. An entry whose gradient is exactly zero keeps its value and its moments."""
-    i = first + wp.tid()
-    zero = vec4()
-    gradient = gradients[0, i]
-    for worker in range(1, gradients.shape[0]):
-        gradient += gradients[worker, i]
-    if gradient == zero:
+    start = (first + wp.tid()) * span
+    if touched[tile_of(start)] == wp.uint8(0):
         return
-    for worker in range(gradients.shape[0]):
-        gradients[worker, i] = zero
-    value = values[i]
-    m = mean[i]
-    v = square[i]
-    for channel in range(4):
-        g = gradient[channel]
-        if g != real(0.0):
-            m[channel] = beta1 * m[channel] + (real(1.0) - beta1) * g
-            v[channel] = beta2 * v[channel] + (real(1.0) - beta2) * g * g
-            value[channel] = value[channel] - learning_rate[channel] * (
-                correction1 * m[channel]
-            ) / (wp.sqrt(correction2 * v[channel]) + epsilon)
-    values[i] = value
-    mean[i] = m
-    square[i] = v
+    zero = vec4()
+    for i in range(start, wp.min(start + span, values.shape[0])):
+        gradient = gradients[0, i]
+        for worker in range(1, gradients.shape[0]):
+            gradient += gradients[worker, i]
+        if not (gradient == zero):
+            for worker in range(gradients.shape[0]):
+                gradients[worker, i] = zero
+            value = values[i]
+            m = mean[i]
+            v = square[i]
+            for channel in range(4):
+                g = gradient[channel]
+                if g != real(0.0):
+                    m[channel] = beta1 * m[channel] + (real(1.0) - beta1) * g
+                    v[channel] = beta2 * v[channel] + (real(1.0) - beta2) * g * g
+                    value[channel] = value[channel] - learning_rate[channel] * (
+                        correction1 * m[channel]
+                    ) / (wp.sqrt(correction2 * v[channel]) + epsilon)
+            values[i] = value
+            mean[i] = m
+            square[i] = v

@@ -142,7 +142,7 @@ def sample_pixels(
     if jitter == 1:
         offset = real(wp.randf(state))
     colour = pixels[pixel]
-    unit = real(1.0 / 255.0)
+    unit = real(1.0) / real(255.0)
     alpha = real(colour[3]) * unit
     rgb = unit * vec3(real(colour[0]), real(colour[1]), real(colour[2]))
     out_offsets[i] = offset

@@ -7,6 +7,16 @@ from .types import real, vec3, vec4
 wp.set_module_options({"enable_backward": False})
 
 
+TILE = 16
+"""Nodes in a tile, a run along z: what an optimiser step can pass over as a whole."""
+
+
+@wp.func
+def tile_of(node: int) -> int:
+    """The tile that holds a node, given by its flat index."""
+    return node // wp.static(TILE)
+
+
 @wp.func
 def lowest_node(u: vec3, size: wp.vec3i) -> wp.vec3i:
     """Lowest corner of the cell that holds grid coordinates u; u on the far face counts inside."""
@@ -60,6 +70,7 @@ def adj_gather(
     adj_value: vec4,
     worker: int,
     adj_values: wp.array2d(dtype=vec4),  # [n_workers, X * Y * Z], added to
+    touched: wp.array(dtype=wp.uint8),  # [n_tiles] set to 1 where a node of the tile is added to
 ):
     """Transpose of gather: hands adj_value to the eight nodes with the weights it was made with."""
     stride_y = size[2]
@@ -74,6 +85,16 @@ def adj_gather(
     n01 = base + stride_y
     n10 = base + stride_x
     n11 = base + stride_x + stride_y
+    # Workers share these flags: whoever comes first, the value is the same.
+    yes = wp.uint8(1)
+    touched[tile_of(n00)] = yes
+    touched[tile_of(n00 + 1)] = yes
+    touched[tile_of(n01)] = yes
+    touched[tile_of(n01 + 1)] = yes
+    touched[tile_of(n10)] = yes
+    touched[tile_of(n10 + 1)] = yes
+    touched[tile_of(n11)] = yes
+    touched[tile_of(n11 + 1)] = yes
     low = gx * gy * adj_value
     wp.atomic_add(adj_values, worker, n00, gz * low)
     wp.atomic_add(adj_values, worker, n00 + 1, fz * low)

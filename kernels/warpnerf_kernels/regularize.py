@@ -6,7 +6,7 @@
 
 import warp as wp
 
-from .interp import flat_index
+from .interp import flat_index, tile_of
 from .types import real, vec4
 
 wp.set_module_options({"enable_backward": False})
@@ -51,16 +51,11 @@ def adj_pair_variation(weight: vec4, a: vec4, b: vec4) -> vec4:
     )
 
 
-@wp.kernel
-def total_variation_forward(
-    first: int,
-    values: wp.array(dtype=vec4),  # [X * Y * Z]
-    size: wp.vec3i,
-    weight: vec4,  # per channel
-    out_variation: wp.array(dtype=real),  # [X * Y * Z] of each node's pairs towards larger indices
-):
-    """Each node's share of TV(x); their sum is TV(x)."""
-    n = first + wp.tid()
+@wp.func
+def node_variation(
+    values: wp.array(dtype=vec4), size: wp.vec3i, weight: vec4, n: int
+) -> real:
+    """TV of a node's pairs towards larger indices."""
     k = n % size[2]
     j = (n // size[2]) % size[1]
     i = n // (size[2] * size[1])
@@ -71,25 +66,14 @@ def total_variation_forward(
         total += pair_variation(weight, values[n], values[flat_index(i, j + 1, k, size)])
     if k + 1 < size[2]:
         total += pair_variation(weight, values[n], values[n + 1])
-    out_variation[n] = total
+    return total
 
 
-@wp.kernel
-def total_variation_backward(
-    first: int,
-    values: wp.array(dtype=vec4),  # [X * Y * Z]
-    size: wp.vec3i,
-    weight: vec4,  # per channel
-    adj_values: wp.array2d(dtype=vec4),  # [n_workers, X * Y * Z], row 0 is added to
-):
-    """d TV / d x at the nodes that already have a gradient; the others, unseen, stay as they are."""
-    n = first + wp.tid()
-    seen = bool(False)
-    for worker in range(adj_values.shape[0]):
-        if not (adj_values[worker, n] == vec4()):
-            seen = True
-    if not seen:
-        return
+@wp.func
+def adj_node_variation(
+    values: wp.array(dtype=vec4), size: wp.vec3i, weight: vec4, n: int
+) -> vec4:
+    """d TV / d x at a node: of all its pairs, towards larger and smaller indices."""
     k = n % size[2]
     j = (n // size[2]) % size[1]
     i = n // (size[2] * size[1])
@@ -107,4 +91,40 @@ def total_variation_backward(
         total += adj_pair_variation(weight, value, values[n - 1])
     if k + 1 < size[2]:
         total += adj_pair_variation(weight, value, values[n + 1])
-    adj_values[0, n] = adj_values[0, n] + total
+    return total
+
+
+@wp.kernel
+def total_variation_forward(
+    first: int,
+    values: wp.array(dtype=vec4),  # [X * Y * Z]
+    size: wp.vec3i,
+    weight: vec4,  # per channel
+    out_variation: wp.array(dtype=real),  # [X * Y * Z] of each node's pairs towards larger indices
+):
+    """Each node's share of TV(x); their sum is TV(x)."""
+    n = first + wp.tid()
+    out_variation[n] = node_variation(values, size, weight, n)
+
+
+@wp.kernel
+def total_variation_backward(
+    first: int,
+    span: int,  # nodes per thread: 1, or a tile
+    values: wp.array(dtype=vec4),  # [X * Y * Z]
+    size: wp.vec3i,
+    weight: vec4,  # per channel
+    touched: wp.array(dtype=wp.uint8),  # [n_tiles] 0 where no gradient is
+    adj_values: wp.array2d(dtype=vec4),  # [n_workers, X * Y * Z], row 0 is added to
+):
+    """d TV / d x at the nodes that already have a gradient; the others, unseen, stay as they are."""
+    start = (first + wp.tid()) * span
+    if touched[tile_of(start)] == wp.uint8(0):
+        return
+    for n in range(start, wp.min(start + span, values.shape[0])):
+        seen = int(0)
+        for worker in range(adj_values.shape[0]):
+            if not (adj_values[worker, n] == vec4()):
+                seen = 1
+        if seen == 1:
+            adj_values[0, n] = adj_values[0, n] + adj_node_variation(values, size, weight, n)

@@ -57,6 +57,7 @@ def adj_shade(
     adj_rgb: vec3,
     worker: int,
     adj_values: wp.array2d(dtype=vec4),  # [n_workers, X * Y * Z], added to
+    touched: wp.array(dtype=wp.uint8),  # [n_tiles] set to 1 where adj_values was added to
 ):
     """Hand the gradients of a sample's density and colour to the nodes around it."""
     adj_density = adj_softplus(sample.sigma_slope, adj_sigma)
@@ -68,6 +69,7 @@ def adj_shade(
         vec4(adj_density, adj_raw[0], adj_raw[1], adj_raw[2]),
         worker,
         adj_values,
+        touched,
     )
 
 
@@ -174,6 +176,7 @@ def adj_integrate(
     kept: wp.array(dtype=Sample),  # read, as integrate left it
     worker: int,
     adj_values: wp.array2d(dtype=vec4),  # [n_workers, X * Y * Z], added to
+    touched: wp.array(dtype=wp.uint8),  # [n_tiles] set to 1 where adj_values was added to
 ):
     """Adjoint of integrate. With G_i = dL/dw_i = <adj_rgb, c_i> + adj_depth t_i,
 
@@ -203,7 +206,7 @@ def adj_integrate(
         scale = distance_scale(sample.t, content_distance, sample.det_jacobian, scaling, jacobian)
         adj_sigma = scale * (sample.dt * (transmittance * adj_weight - behind))
         adj_sample_rgb = scale * (weight * adj_rgb)
-        adj_shade(grid, sample, adj_sigma, adj_sample_rgb, worker, adj_values)
+        adj_shade(grid, sample, adj_sigma, adj_sample_rgb, worker, adj_values, touched)
 
 
 @wp.func
@@ -290,6 +293,7 @@ def render_backward_kernel(variant: Variant) -> wp.Kernel:
         kept: wp.array(dtype=Sample),  # untouched
         # out
         adj_values: wp.array2d(dtype=vec4),  # [n_workers, X * Y * Z], added to
+        touched: wp.array(dtype=wp.uint8),  # [n_tiles] set to 1 where adj_values was added to
     ):
         i = first + wp.tid()
         ray = prepare_ray(
@@ -319,6 +323,7 @@ def render_backward_kernel(variant: Variant) -> wp.Kernel:
             kept,
             worker,
             adj_values,
+            touched,
         )
 
     return render_backward
@@ -354,6 +359,7 @@ def render_train_kernel(variant: Variant) -> wp.Kernel:
         out_error: wp.array(dtype=real),  # [n_rays] squared error
         out_n_samples: wp.array(dtype=wp.int32),  # [n_rays]
         adj_values: wp.array2d(dtype=vec4),  # [n_workers, X * Y * Z], added to
+        touched: wp.array(dtype=wp.uint8),  # [n_tiles] set to 1 where adj_values was added to
     ):
         i = first + wp.tid()
         row = worker * capacity
@@ -384,6 +390,7 @@ def render_train_kernel(variant: Variant) -> wp.Kernel:
             kept,
             worker,
             adj_values,
+            touched,
         )
 
     return render_train

@@ -1,0 +1,8 @@
+"""``python -m warpnerf`` is the command ``warpnerf``."""
+
+import sys
+
+from warpnerf.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())
