@@ -168,15 +168,15 @@ def test_trilinear_against_grid_sample() -> None:
 # distances along a ray
 
 
-@pytest.mark.parametrize("near", [0.0, 0.37, 6.0])
-def test_growing_steps_follow_the_recursion(near: float) -> None:
+@pytest.mark.parametrize(("near", "n_linear"), [(0.0, 34), (0.37, 1), (6.0, 0)])
+def test_growing_steps_follow_the_recursion(near: float, n_linear: int) -> None:
     step, growth, n_steps = 0.11, 0.03, 150
     edges = [near]
-    for _ in range(n_steps):
-        edges.append(edges[-1] + (step if edges[-1] <= step / growth else growth * edges[-1]))
+    for k in range(n_steps):
+        edges.append(edges[-1] + (step if k < n_linear else growth * edges[-1]))
     expected = np.array(edges)
-    assert edges[-1] > 2.0 * step / growth  # some steps do grow
-    samples = sample_distances(near, math.inf, step, growth, n_steps)
+    assert edges[-1] > near + 2.0 * n_steps * step  # some steps do grow
+    samples = sample_distances(near, math.inf, step, growth, n_linear, n_steps)
     np.testing.assert_allclose(samples.dt.numpy(), np.diff(expected), rtol=1e-9)
     np.testing.assert_allclose(samples.t.numpy(), (expected[1:] + expected[:-1]) / 2, rtol=1e-9)
     assert bool(samples.before_far.all())
@@ -184,16 +184,16 @@ def test_growing_steps_follow_the_recursion(near: float) -> None:
 
 def test_uniform_steps_offsets_and_far() -> None:
     offset = torch.tensor([0.0, 0.25], dtype=torch.float64)
-    t, dt, before_far = sample_distances(1.0, 2.25, 0.5, 0.0, 3, offset)
+    t, dt, before_far = sample_distances(1.0, 2.25, 0.5, 0.0, 0, 3, offset)
     expected = torch.tensor([[1.0, 1.5, 2.0], [1.125, 1.625, 2.125]], dtype=torch.float64)
     torch.testing.assert_close(t, expected)
     assert dt.tolist() == [0.5, 0.5, 0.5]
     assert bool(before_far.all())
-    assert sample_distances(1.0, 2.0, 0.5, 0.0, 3, offset).before_far.tolist() == [
+    assert sample_distances(1.0, 2.0, 0.5, 0.0, 0, 3, offset).before_far.tolist() == [
         [True, True, False],  # t = far is out
         [True, True, False],
     ]
-    t, dt, _ = sample_distances(1.0, 2.0, 0.5, 0.01, 3, dtype=torch.float32)
+    t, dt, _ = sample_distances(1.0, 2.0, 0.5, 0.01, 2, 3, dtype=torch.float32)
     assert t.dtype == dt.dtype == torch.float32 and t.shape == (3,)
 
 
@@ -357,8 +357,8 @@ def test_render_against_a_scalar_loop(transmittance_min: float, far: float) -> N
     "space",
     [
         {"norm": "none"},
-        {"norm": "linf", "border": 0.2, "far": 30.0, "growth": 0.1, "n_steps": 40},
-        {"norm": "l2", "border": 1.0, "far": 30.0, "growth": 0.1, "n_steps": 40},
+        {"norm": "linf", "border": 0.2, "far": 30.0, "growth": 0.1, "n_linear": 9, "n_steps": 40},
+        {"norm": "l2", "border": 1.0, "far": 30.0, "growth": 0.1, "n_linear": 9, "n_steps": 40},
     ],
     ids=lambda space: space["norm"],
 )
@@ -393,11 +393,23 @@ def test_background_shifts_by_the_transmittance() -> None:
 
 
 def test_float32_agrees_with_float64() -> None:
-    problem = tiny_problem() | {"norm": "linf", "far": 30.0, "growth": 0.1, "n_steps": 40}
+    problem = tiny_problem() | {
+        "norm": "linf",
+        "far": 30.0,
+        "growth": 0.1,
+        "n_linear": 9,
+        "n_steps": 40,
+    }
     exact, rounded = render(tiny_raw(), **problem), render(tiny_raw().float(), **problem)
     assert rounded.rgb.dtype == rounded.depth.dtype == torch.float32
     assert relative_error(rounded.rgb, exact.rgb) < 1e-5
     assert relative_error(rounded.depth, exact.depth) < 1e-5
+
+
+def test_density_scale_multiplies_the_density() -> None:
+    problem, raw = tiny_problem(), tiny_raw()
+    plain, denser = render(raw, **problem), render(raw, **problem, density_scale=2.0)
+    torch.testing.assert_close(denser.transmittance, plain.transmittance**2)
 
 
 def test_softplus_is_exact() -> None:
@@ -517,15 +529,16 @@ def test_total_variation_against_pairs() -> None:
     for i, j, k, c in np.ndindex(*raw.shape):
         for other in [(i + 1, j, k, c), (i, j + 1, k, c), (i, j, k + 1, c)]:
             if all(other[a] < raw.shape[a] for a in range(3)):
-                expected += float(weights[c] * (raw[i, j, k, c] - raw[other]) ** 2 / 2 / 60)
+                d = abs(float(raw[i, j, k, c] - raw[other]))
+                expected += float(weights[c]) * (d * d / 2 if d <= 1 else d - 0.5)
     assert math.isclose(float(total_variation(raw, weights)), expected)
     raw.requires_grad_()
     (gradient,) = torch.autograd.grad(total_variation(raw, weights), raw)
     direction = normal(*raw.shape, seed=22)
     difference = central_difference(
-        lambda values: total_variation(values, weights), raw.detach(), direction, 1e-3
+        lambda values: total_variation(values, weights), raw.detach(), direction, 1e-6
     )
-    assert relative_error((gradient * direction).sum(), difference) < 1e-9
+    assert relative_error((gradient * direction).sum(), difference) < 1e-8
     assert not gradient[..., 3].any()
 
 

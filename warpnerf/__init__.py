@@ -1,18 +1,15 @@
-"""warpnerf: voxel-grid radiance fields from posed photographs, without floaters.
+"""Voxel-grid radiance fields from posed photographs, without floaters near the cameras.
 
-    import warpnerf as wn
-    scene = wn.load_scene("builtin:room")
-    result = wn.train(scene, wn.TrainConfig(steps=2000, scaling="clamped"))
-    print(wn.evaluate(result.field, scene, split="test"))
+    scene = warpnerf.load_scene("path/to/scene")
+    result = warpnerf.train(scene)
+    image = result.field.render(scene.cameras[0])
 
-Names are imported from their modules when first used, so that ``import warpnerf`` costs nothing.
+Names are imported when they are first used, so that importing the package is quick.
 """
 
 from __future__ import annotations
 
-import sys
-from importlib import import_module
-from types import ModuleType
+import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -21,68 +18,65 @@ if TYPE_CHECKING:
     from warpnerf.checks import InputError
     from warpnerf.config import PRESETS, GridConfig, MarchConfig, OptimConfig, TrainConfig
     from warpnerf.data import load_scene
-    from warpnerf.evaluate import Evaluation, evaluate
+    from warpnerf.evaluation import Evaluation, evaluate
     from warpnerf.field import Field, Rendering
     from warpnerf.scene import Scene, View
-    from warpnerf.train import TrainResult, train
+    from warpnerf.training import Progress, TrainResult, train
 
 __version__ = "0.1.0"
 
-__all__ = [
-    "PRESETS",
+_HOMES = {
+    "Camera": "camera",
+    "load_field": "checkpoint",
+    "save_field": "checkpoint",
+    "InputError": "checks",
+    "PRESETS": "config",
+    "GridConfig": "config",
+    "MarchConfig": "config",
+    "OptimConfig": "config",
+    "TrainConfig": "config",
+    "load_scene": "data",
+    "Evaluation": "evaluation",
+    "evaluate": "evaluation",
+    "Field": "field",
+    "Rendering": "field",
+    "Scene": "scene",
+    "View": "scene",
+    "Progress": "training",
+    "TrainResult": "training",
+    "train": "training",
+}
+
+__all__ = [  # noqa: RUF022 (grouped by home, as above)
     "Camera",
-    "Evaluation",
-    "Field",
-    "GridConfig",
+    "load_field",
+    "save_field",
     "InputError",
+    "PRESETS",
+    "GridConfig",
     "MarchConfig",
     "OptimConfig",
+    "TrainConfig",
+    "load_scene",
+    "Evaluation",
+    "evaluate",
+    "Field",
     "Rendering",
     "Scene",
-    "TrainConfig",
-    "TrainResult",
     "View",
-    "evaluate",
-    "load_field",
-    "load_scene",
-    "save_field",
+    "Progress",
+    "TrainResult",
     "train",
 ]
 
-_HOMES = {
-    "camera": ("Camera",),
-    "checkpoint": ("load_field", "save_field"),
-    "checks": ("InputError",),
-    "config": ("PRESETS", "GridConfig", "MarchConfig", "OptimConfig", "TrainConfig"),
-    "data": ("load_scene",),
-    "evaluate": ("Evaluation", "evaluate"),
-    "field": ("Field", "Rendering"),
-    "scene": ("Scene", "View"),
-    "train": ("TrainResult", "train"),
-}
-_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
-
 
 def __getattr__(name: str) -> Any:
-    """Import a public name from its home (PEP 562)."""
-    if name not in _HOME_OF:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(f"{__name__}.{_HOME_OF[name]}"), name)
+    if name not in _HOMES:
+        raise AttributeError(f"module 'warpnerf' has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"warpnerf.{_HOMES[name]}"), name)
     globals()[name] = value
     return value
 
 
 def __dir__() -> list[str]:
-    """The public names, imported or not."""
     return sorted({*globals(), *__all__})
-
-
-class _Package(ModuleType):
-    """Keeps ``warpnerf.train`` the function: importing the module of that name would rebind it."""
-
-    def __setattr__(self, name: str, value: object) -> None:
-        if not (name in _HOME_OF and isinstance(value, ModuleType)):
-            super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Package

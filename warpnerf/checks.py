@@ -9,7 +9,7 @@ import numpy as np
 
 
 class InputError(ValueError):
-    """Bad input from outside: one sentence naming the file or field, what is wrong, and the way out.
+    """Bad input from outside: a sentence naming the file or field, what is wrong, and the way out.
 
     The command prints the sentence and exits with 2; Python users can catch it as a ValueError.
     """

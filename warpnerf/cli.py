@@ -7,7 +7,7 @@ import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
@@ -17,8 +17,9 @@ from warpnerf.config import PRESETS, Scaling, TrainConfig
 
 if TYPE_CHECKING:
     from warpnerf.scene import Scene
-    from warpnerf.train import Progress
+    from warpnerf.training import Progress
 
+FAILED = 1
 BAD_INPUT = 2
 INTERRUPTED = 130
 
@@ -57,7 +58,7 @@ def train_command(
         overwrite: Replace the run that the output folder holds.
     """
     config = PRESETS[preset]
-    chosen = {
+    chosen: dict[str, Any] = {
         "steps": steps,
         "time_limit": time_limit,
         "scaling": scaling,
@@ -66,9 +67,8 @@ def train_command(
         "threads": threads,
         "seed": seed,
     }
-    config = dataclasses.replace(
-        config, **{name: value for name, value in chosen.items() if value is not None}
-    )
+    given = {name: value for name, value in chosen.items() if value is not None}
+    config = dataclasses.replace(config, **given)
     if near is not None:
         config = dataclasses.replace(config, march=dataclasses.replace(config.march, near=near))
     return _train(scene, output, downscale, config, overwrite)
@@ -95,7 +95,7 @@ def eval_command(
     """
     from warpnerf.checkpoint import write_atomically
     from warpnerf.data import load_scene
-    from warpnerf.evaluate import evaluate
+    from warpnerf.evaluation import evaluate
     from warpnerf.run import Run
 
     run = Run(folder)
@@ -112,46 +112,69 @@ def eval_command(
     return 0
 
 
-def _train(
-    source: str, output: Path, downscale: int, config: TrainConfig, overwrite: bool
-) -> int:
+def _train(source: str, output: Path, downscale: int, config: TrainConfig, overwrite: bool) -> int:
     from warpnerf.data import load_scene
-    from warpnerf.run import Run
-    from warpnerf.train import Trainer
+    from warpnerf.evaluation import require_measurable
+    from warpnerf.run import Run, depth_range
+    from warpnerf.training import Trainer
 
     Run.require_free(output, overwrite)
     print(f"reading {source}", flush=True)
     scene = load_scene(source, downscale=downscale)
+    require_measurable(scene, "test")
     trainer = Trainer(scene, config)
     _describe(scene, trainer.content_distance, config)
     run = Run(output)
     run.create(scene, _absolute(source), downscale, trainer.content_distance, config)
     print("compiling kernels (once; later runs start at once)", flush=True)
-    try:
-        with _reporter(config) as report:
-            while trainer.fraction < 1.0:
-                trainer.step()
-                if trainer.report_due:
-                    progress = trainer.report()
-                    run.log(progress)
-                    report(progress)
-    except KeyboardInterrupt:
-        run.save_field(trainer.field())
+    with _StopRequest() as stop:
+        try:
+            with _reporter(config) as report:
+                while trainer.fraction < 1.0 and not stop.asked:
+                    trainer.step()
+                    if trainer.report_due:
+                        progress = trainer.report()
+                        run.log(progress)
+                        report(progress)
+        except FloatingPointError as error:
+            print(f"warpnerf: error: {error}", file=sys.stderr)
+            return FAILED
+        field = trainer.field()
+        run.save_field(field)
+    if stop.asked:
+        where = output / "field.safetensors"
         print(
-            f"stopped after step {trainer.steps_done}; the field so far is in "
-            f"{output / 'field.safetensors'}",
-            file=sys.stderr,
+            f"stopped after step {trainer.steps_done}; the field so far is in {where}", flush=True
         )
         return INTERRUPTED
-    except FloatingPointError as error:
-        print(f"warpnerf: error: {error}", file=sys.stderr)
-        return 1
-    field = trainer.field()
-    run.save_field(field)
     print("rendering the test views", flush=True)
-    print(run.evaluate(field, scene, "test"))
-    print(f"wrote {output}: field.safetensors, metrics.json, log.jsonl, config.json, test/*.png")
+    try:
+        print(run.evaluate(field, scene, "test"))
+    except KeyboardInterrupt:
+        print(f"stopped; the trained field is in {output}, for warpnerf eval", file=sys.stderr)
+        return INTERRUPTED
+    near, far = depth_range(field)
+    print(
+        f"wrote {output}: field.safetensors, metrics.json, log.jsonl, config.json, and test/*.png "
+        f"(truth, rendering, depth from {near:.3g} red to {far:.3g} violet)"
+    )
     return 0
+
+
+class _StopRequest:
+    """Ctrl-C and SIGTERM noted while training, so that a run stops between two steps."""
+
+    def __enter__(self) -> _StopRequest:
+        self.asked = False
+        self._before = {s: signal.signal(s, self._note) for s in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _note(self, number: int, frame: object) -> None:
+        self.asked = True
 
 
 def _describe(scene: Scene, content_distance: float, config: TrainConfig) -> None:
@@ -247,6 +270,9 @@ def main(arguments: list[str] | None = None) -> int:
     except InputError as error:
         print(f"warpnerf: error: {error}", file=sys.stderr)
         return BAD_INPUT
+    except OSError as error:
+        print(f"warpnerf: error: {error}", file=sys.stderr)
+        return FAILED
     except KeyboardInterrupt:
-        print("stopped before training began; nothing was written", file=sys.stderr)
+        print("stopped", file=sys.stderr)
         return INTERRUPTED

@@ -20,7 +20,7 @@ class GridConfig:
 
     voxels: int = 160**3
     """Nodes of the final grid, in all."""
-    grow_at: tuple[float, ...] = (0.05, 0.1, 0.15, 0.25)
+    grow_at: tuple[float, ...] = (0.3, 0.4, 0.5, 0.6)
     """Shares of the training at which the number of nodes doubles."""
     alpha_init: float = 1e-3
     """Opacity of one voxel's length before training."""
@@ -117,7 +117,8 @@ class TrainConfig:
     steps: int = 4000
     """Optimiser steps."""
     time_limit: float | None = None
-    """Seconds after which training ends, its schedule squeezed to fit; None: no limit."""
+    """Seconds after which training ends, its schedule squeezed to fit; compiling does not count.
+    None: no limit. What fits depends on the machine, so the result does too."""
     scaling: Scaling = "clamped"
     """How a sample's gradient depends on its distance t from the camera: none, quadratic
     (t / D)^2, or clamped min(1, (t / D)^2), the method of "Floaters No More"."""
@@ -125,7 +126,7 @@ class TrainConfig:
     """D: where gradients reach full strength, scene units; auto: the scene's estimate."""
     jacobian: Jacobian = "none"
     """Whether the scaling takes the contraction's change of volume into account."""
-    rays_per_step: int = 2048
+    rays_per_step: int = 4096
     """Rays in a batch."""
     background: Background | tuple[float, float, float] = "auto"
     """What is seen behind the scene: a colour, rgb in [0, 1], or random colours while training

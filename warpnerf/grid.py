@@ -22,7 +22,7 @@ CONTRACTIONS = {"none": contraction.NONE, "linf": contraction.LINF, "l2": contra
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class VoxelGrid:
-    """A dense grid [X, Y, Z] of raw density and raw rgb, z fastest, nodes at both ends of the box."""
+    """A dense grid [X, Y, Z] of raw density and raw rgb, z fastest, nodes on the box's faces."""
 
     values: wp.array
     """[X * Y * Z] vec4: raw density, raw rgb."""
@@ -170,7 +170,7 @@ def _total_memory() -> int | None:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FreeCells:
-    """Which cells of a grid's domain hold nothing visible, as distances to the nearest that does."""
+    """Which cells of a grid's domain hold nothing visible: distances to the nearest that does."""
 
     distance: wp.array
     """[MX * MY * MZ] uint8, cells to the nearest occupied one; 0 there."""
@@ -199,9 +199,7 @@ class FreeCells:
         distance = wp.empty(n, dtype=wp.uint8, device=workers.device)
         spread = wp.empty_like(distance)
         cells = wp.vec3i(*size)
-        workers.launch(
-            occupancy.mark_occupied, n, grid.struct(), cells, step, alpha_min, distance
-        )
+        workers.launch(occupancy.mark_occupied, n, grid.struct(), cells, step, alpha_min, distance)
         for axis in range(3):
             workers.launch(occupancy.spread_distance, n, cells, axis, distance, spread)
             distance, spread = spread, distance

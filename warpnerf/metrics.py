@@ -1,4 +1,4 @@
-"""How close an image is to the truth."""
+"""How close a rendering is to its photograph."""
 
 from __future__ import annotations
 
@@ -8,81 +8,75 @@ import numpy as np
 
 from warpnerf.checks import InputError
 
-SSIM_SIGMA = 1.5
-"""Standard deviation of the Gaussian, pixels."""
+SSIM_WINDOW = 11
+"""Pixels along the edge of SSIM's window."""
 
-SSIM_RADIUS = 5
-"""The window is 2 * 5 + 1 = 11 pixels wide."""
+MAX_PSNR = 120.0
+"""dB, of images that are equal: a number, so that means and JSON stay finite."""
 
-SSIM_WINDOW = 2 * SSIM_RADIUS + 1
-"""Edge of the smallest image that SSIM is defined for, pixels."""
-
-LEAST_ERROR = 1e-10
-"""Mean squared error below which images count as equal, so that PSNR stays finite."""
+_RADIUS = SSIM_WINDOW // 2
+_SIGMA = 1.5
 
 
-def psnr(rgb: np.ndarray, target_rgb: np.ndarray) -> float:
-    """Peak signal-to-noise ratio, -10 log10(mean squared error), at most 100 dB.
+def psnr(rgb: np.ndarray, target: np.ndarray) -> float:
+    """Peak signal-to-noise ratio, dB: -10 log10 of the mean squared error, at most MAX_PSNR.
 
     Args:
         rgb: [H, W, 3] in [0, 1].
-        target_rgb: [H, W, 3] in [0, 1].
+        target: The same shape.
 
     Raises:
         InputError: Shapes differ, or a value is not finite.
     """
-    image, target = _checked(rgb, target_rgb)
-    return -10.0 * math.log10(max(float(np.mean((image - target) ** 2)), LEAST_ERROR))
+    a, b = _checked(rgb, target)
+    error = float(np.mean((a - b) ** 2))
+    return -10.0 * math.log10(max(error, 10.0 ** (-MAX_PSNR / 10.0)))
 
 
-def ssim(rgb: np.ndarray, target_rgb: np.ndarray) -> float:
-    """Structural similarity, as mip-NeRF and DVGO report it.
+def ssim(rgb: np.ndarray, target: np.ndarray) -> float:
+    """Structural similarity, mean over pixels and channels; 1 for equal images.
 
-    mean (2 m_x m_y + c1)(2 v_xy + c2) / ((m_x^2 + m_y^2 + c1)(v_x + v_y + c2)),  c = (k * 1)^2
-
-    with moments under an 11 x 11 Gaussian of sigma 1.5, k1 = 0.01, k2 = 0.03, over the windows that
-    lie inside the image and over channels. Source: Wang et al. 2004, eq. 13.
+    Windows are 11 x 11 Gaussians of deviation 1.5, variances are those of the window's weights
+    (no sample correction), constants are (0.01)^2 and (0.03)^2, and only windows that lie inside
+    the image count. Source: Wang et al. 2004, with the settings of mip-NeRF and DVGO.
 
     Args:
-        rgb: [H, W, 3] in [0, 1].
-        target_rgb: [H, W, 3] in [0, 1].
+        rgb: [H, W, 3] in [0, 1], at least 11 x 11.
+        target: The same shape.
 
     Raises:
-        InputError: Shapes differ, a value is not finite, or an edge is shorter than the window.
+        InputError: Shapes differ, an image is too small, or a value is not finite.
     """
-    image, target = _checked(rgb, target_rgb)
-    if min(image.shape[:2]) < SSIM_WINDOW:
-        raise InputError(
-            f"SSIM needs images of at least {SSIM_WINDOW} x {SSIM_WINDOW} pixels, not "
-            f"{image.shape[1]} x {image.shape[0]}; use a smaller downscale."
-        )
+    a, b = _checked(rgb, target)
+    if min(a.shape[:2]) < SSIM_WINDOW:
+        raise InputError(f"SSIM needs images of at least 11 x 11 pixels, not {a.shape[:2]}.")
+    mean_a, mean_b = _blur(a), _blur(b)
+    var_a, var_b = _blur(a * a) - mean_a**2, _blur(b * b) - mean_b**2
+    covariance = _blur(a * b) - mean_a * mean_b
     c1, c2 = 0.01**2, 0.03**2
-    mean_x, mean_y = _blur(image), _blur(target)
-    var_x = _blur(image * image) - mean_x**2
-    var_y = _blur(target * target) - mean_y**2
-    covariance = _blur(image * target) - mean_x * mean_y
-    similarity = (2.0 * mean_x * mean_y + c1) * (2.0 * covariance + c2)
-    similarity /= (mean_x**2 + mean_y**2 + c1) * (var_x + var_y + c2)
+    similarity = ((2 * mean_a * mean_b + c1) * (2 * covariance + c2)) / (
+        (mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2)
+    )
     return float(similarity.mean())
 
 
-def _blur(image: np.ndarray) -> np.ndarray:
-    """Gaussian means of [H, W, C] over the windows inside: [H - 10, W - 10, C]."""
-    offsets = np.arange(-SSIM_RADIUS, SSIM_RADIUS + 1)
-    kernel = np.exp(-0.5 * (offsets / SSIM_SIGMA) ** 2)
-    kernel /= kernel.sum()
-    height, width = image.shape[0] - 2 * SSIM_RADIUS, image.shape[1] - 2 * SSIM_RADIUS
-    rows = sum(k * image[i : i + height] for i, k in enumerate(kernel))
-    return np.asarray(sum(k * rows[:, i : i + width] for i, k in enumerate(kernel)))
-
-
-def _checked(rgb: np.ndarray, target_rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    if rgb.shape != target_rgb.shape or rgb.ndim != 3 or not rgb.size:
+def _checked(rgb: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    a, b = np.asarray(rgb, np.float64), np.asarray(target, np.float64)
+    if a.shape != b.shape or a.ndim != 3:
         raise InputError(
-            "images to compare must both be [H, W, channels], not "
-            f"{list(rgb.shape)} and {list(target_rgb.shape)}."
+            f"images must have one shape [H, W, 3], not {list(a.shape)} and {list(b.shape)}."
         )
-    for name, image in (("rgb", rgb), ("target_rgb", target_rgb)):
-        if not np.isfinite(image).all():
-            raise InputError(f"{name} must be finite, but holds NaN or infinity.")
-    return rgb.astype(np.float64), target_rgb.astype(np.float64)
+    if not (np.isfinite(a).all() and np.isfinite(b).all()):
+        raise InputError("images must be finite, but hold NaN or infinity.")
+    return a, b
+
+
+def _blur(image: np.ndarray) -> np.ndarray:
+    """Gaussian-weighted mean over windows inside the image, [H - 10, W - 10, C]."""
+    x = np.arange(-_RADIUS, _RADIUS + 1)
+    weights = np.exp(-0.5 * (x / _SIGMA) ** 2)
+    weights /= weights.sum()
+    for axis in (0, 1):
+        n = image.shape[axis] - 2 * _RADIUS
+        image = sum(w * np.take(image, range(k, k + n), axis=axis) for k, w in enumerate(weights))
+    return image

@@ -63,9 +63,7 @@ class Workers:
         """
         self._launch(kernel, n, lambda worker: arguments, chunk)
 
-    def launch_owned(
-        self, kernel: wp.Kernel, n: int, *arguments: Any, chunk: int = RAYS
-    ) -> None:
+    def launch_owned(self, kernel: wp.Kernel, n: int, *arguments: Any, chunk: int = RAYS) -> None:
         """Run kernel(first, worker, *arguments) likewise: it writes to rows that a worker owns."""
         self._launch(kernel, n, lambda worker: (worker, *arguments), chunk)
 

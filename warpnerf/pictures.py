@@ -1,103 +1,74 @@
-"""Pictures for people: PNG files, depth in colour, renderings beside the truth."""
+"""Pictures to look at: renderings beside the truth, depth in colour."""
 
 from __future__ import annotations
 
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 
-from warpnerf.atomic import write_bytes
-from warpnerf.checks import InputError
+from warpnerf.checkpoint import write_atomically
+from warpnerf.field import Rendering
 
-DEPTH_STOPS = np.array(
+# Near to far: dark red, orange, yellow, green, blue, dark violet; brightness peaks in the middle.
+_STOPS = np.array([0.0, 0.15, 0.32, 0.5, 0.68, 0.85, 1.0])
+_COLOURS = np.array(
     [
-        [0.48, 0.04, 0.06],  # near: dark red
-        [0.86, 0.25, 0.12],
-        [0.98, 0.55, 0.18],
-        [0.95, 0.82, 0.27],
-        [0.62, 0.93, 0.35],
-        [0.22, 0.88, 0.62],
-        [0.16, 0.66, 0.90],
-        [0.25, 0.40, 0.86],
-        [0.19, 0.10, 0.38],  # far: indigo
+        [0.45, 0.02, 0.05],
+        [0.86, 0.24, 0.10],
+        [0.98, 0.66, 0.20],
+        [0.86, 0.95, 0.45],
+        [0.20, 0.75, 0.70],
+        [0.20, 0.40, 0.80],
+        [0.18, 0.10, 0.40],
     ]
 )
-"""Colours of depth from near to far, evenly spaced, rgb in [0, 1]: a rainbow with dark ends."""
-
-MIN_OPACITY = 0.5
-"""Pixels below show the background, so they have no depth."""
-
-
-def write_png(path: Path, rgb: np.ndarray, description: str = "") -> None:
-    """Write an image; it is replaced as a whole or not at all.
-
-    Args:
-        path: Where to; its folder exists.
-        rgb: [H, W, 3] in [0, 1]; what lies beyond is clipped.
-        description: Kept in the file, as its text "Description".
-
-    Raises:
-        InputError: It is no such image, or holds NaN.
-        OSError: The file cannot be written.
-    """
-    if rgb.ndim != 3 or rgb.shape[2] != 3 or not rgb.size:
-        raise InputError(f"{path}: rgb must be [H, W, 3], not {list(rgb.shape)}.")
-    if not np.isfinite(rgb).all():
-        raise InputError(f"{path}: rgb must be finite, but holds NaN or infinity.")
-    import imageio.v3 as iio
-    from PIL.PngImagePlugin import PngInfo
-
-    text = PngInfo()
-    if description:
-        text.add_text("Description", description)
-    pixels = np.round(np.clip(rgb, 0.0, 1.0) * 255.0).astype(np.uint8)
-    content = iio.imwrite("<bytes>", pixels, extension=".png", plugin="pillow", pnginfo=text)
-    write_bytes(path, content)
+_GAP = 4
 
 
 def depth_colours(depth: np.ndarray, near: float, far: float) -> np.ndarray:
-    """Depth in colour: near is red, far is blue; what lies beyond either has its colour.
+    """Depth as colour: red is near, violet is far.
 
     Args:
-        depth: [...], scene units.
-        near: Distance of the first colour, scene units.
-        far: Distance of the last, above ``near``.
+        depth: [H, W], scene units.
+        near: What gets the first colour, scene units.
+        far: What gets the last.
 
     Returns:
-        [..., 3] rgb in [0, 1].
+        [H, W, 3] in [0, 1].
+    """
+    x = np.clip((depth - near) / max(far - near, 1e-12), 0.0, 1.0)
+    return np.stack([np.interp(x, _STOPS, _COLOURS[:, c]) for c in range(3)], axis=-1)
+
+
+def comparison(target: np.ndarray, rendering: Rendering, near: float, far: float) -> np.ndarray:
+    """Truth, rendering and depth side by side; depth fades to white where nothing is.
+
+    Args:
+        target: [H, W, 3] in [0, 1].
+        rendering: Of the same size.
+        near: Depth of the first colour, scene units.
+        far: Depth of the last.
+
+    Returns:
+        [H, 3 W + 8, 3] in [0, 1].
+    """
+    opacity = rendering.opacity[..., None]
+    surface = rendering.depth / np.maximum(rendering.opacity, 1e-6)
+    depth = opacity * depth_colours(surface, near, far) + (1.0 - opacity)
+    gap = np.ones((target.shape[0], _GAP, 3))
+    return np.concatenate([target, gap, np.clip(rendering.rgb, 0, 1), gap, depth], axis=1)
+
+
+def write_png(path: str | Path, rgb: np.ndarray) -> None:
+    """Write an image [H, W, 3] in [0, 1] as an 8-bit PNG.
 
     Raises:
-        InputError: The range is empty or not finite.
+        OSError: It cannot be written.
     """
-    if not (near < far and np.isfinite([near, far]).all()):
-        raise InputError(f"the range of depth must have near below far, not {near} and {far}.")
-    stops = np.linspace(near, far, len(DEPTH_STOPS))
-    return np.stack([np.interp(depth, stops, channel) for channel in DEPTH_STOPS.T], axis=-1)
+    import imageio.v3 as imageio
 
-
-def comparison(
-    truth: np.ndarray,
-    rgb: np.ndarray,
-    depth: np.ndarray,
-    opacity: np.ndarray,
-    *,
-    near: float,
-    far: float,
-) -> np.ndarray:
-    """One image: truth | rendering | depth in colour, white where the background shows.
-
-    Args:
-        truth: [H, W, 3] in [0, 1].
-        rgb: [H, W, 3] in [0, 1].
-        depth: [H, W], sum of weight times t, scene units.
-        opacity: [H, W] in [0, 1].
-        near: Distance of the first colour, scene units.
-        far: Distance of the last.
-
-    Returns:
-        [H, 3 W, 3] in [0, 1].
-    """
-    opaque = opacity >= MIN_OPACITY
-    mean_depth = depth / np.maximum(opacity, MIN_OPACITY)  # of what is not background
-    coloured = np.where(opaque[..., None], depth_colours(mean_depth, near, far), 1.0)
-    return np.concatenate([truth, rgb, coloured], axis=1)
+    buffer = BytesIO()
+    pixels = np.round(255.0 * np.clip(rgb, 0.0, 1.0)).astype(np.uint8)
+    imageio.imwrite(buffer, pixels, extension=".png")
+    write_atomically(path, buffer.getvalue())

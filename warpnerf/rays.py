@@ -96,7 +96,10 @@ class PixelSampler:
         self._jitter = jitter
         firsts = np.cumsum([0] + [v.camera.width * v.camera.height for v in views])
         self._views = wp.array(
-            [view_struct(v.camera, int(first)) for v, first in zip(views, firsts[:-1], strict=True)],
+            [
+                view_struct(v.camera, int(first))
+                for v, first in zip(views, firsts[:-1], strict=True)
+            ],
             dtype=kernels.View,
             device=workers.device,
         )
@@ -122,7 +125,7 @@ class PixelSampler:
         )
 
     def draw(self, step: int) -> RayBatch:
-        """The batch of a step: the same arrays each time, filled anew; a function of seed and step."""
+        """The batch of a step, a function of it and the seed: the same arrays, filled anew."""
         batch = self._batch
         seed = int(np.random.SeedSequence((self._seed, step)).generate_state(1)[0] >> 1)
         self._workers.launch(

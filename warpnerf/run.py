@@ -1,10 +1,10 @@
 """A run's folder: what was asked for, how it went, what came out.
 
-    config.json         scene, downscale, content distance used, training configuration
-    log.jsonl           a line for each progress report
-    field.safetensors   the trained field
-    metrics.json        figures of the test views
-    test/               truth, rendering and depth of each test view, side by side
+config.json         scene, downscale, content distance used, training configuration
+log.jsonl           a line for each progress report
+field.safetensors   the trained field
+metrics.json        figures of the test views
+test/               truth, rendering and depth of each test view, side by side
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ import numpy as np
 from warpnerf.checkpoint import load_field, save_field, write_atomically
 from warpnerf.checks import InputError
 from warpnerf.config import TrainConfig
-from warpnerf.evaluate import Evaluation, evaluate
+from warpnerf.evaluation import Evaluation, evaluate
 from warpnerf.field import Field, Rendering
 from warpnerf.pictures import comparison, write_png
 from warpnerf.scene import Scene, View
-from warpnerf.train import Progress
+from warpnerf.training import Progress
 
 _OWN = ("config.json", "log.jsonl", "field.safetensors", "metrics.json")
 
@@ -55,7 +55,12 @@ class Run:
             )
 
     def create(
-        self, scene: Scene, source: str, downscale: int, content_distance: float, config: TrainConfig
+        self,
+        scene: Scene,
+        source: str,
+        downscale: int,
+        content_distance: float,
+        config: TrainConfig,
     ) -> None:
         """Make the folder and write its configuration; an older run's files are removed.
 
@@ -81,7 +86,9 @@ class Run:
                 },
             )
         except OSError as error:
-            raise InputError(f"--output {self.folder} cannot be written: {error.strerror}.") from error
+            raise InputError(
+                f"--output {self.folder} cannot be written: {error.strerror}."
+            ) from error
 
     def read_config(self) -> dict[str, Any]:
         """What ``create`` wrote.
@@ -115,11 +122,11 @@ class Run:
 
     def evaluate(self, field: Field, scene: Scene, split: str) -> Evaluation:
         """Measure a split, and write metrics.json and the pictures."""
-        near, far = _depth_range(field)
+        near, far = depth_range(field)
 
         def picture(view: View, target: np.ndarray, rendering: Rendering) -> None:
-            name = view.name.replace("/", "_").replace("\\", "_")
-            path = self.folder / "test" / f"{Path(name).stem}.png"
+            name = view.name.replace("/", "_").replace("\\", "_").removesuffix(".png")
+            path = self.folder / "test" / f"{name}.png"
             write_png(path, comparison(target, rendering, near, far))
 
         result = evaluate(field, scene, split, picture)
@@ -130,6 +137,6 @@ class Run:
         write_atomically(self.folder / name, (json.dumps(content, indent=2) + "\n").encode())
 
 
-def _depth_range(field: Field) -> tuple[float, float]:
+def depth_range(field: Field) -> tuple[float, float]:
     """Depths that get the first and the last colour: from the camera to across the box."""
     return 0.0, float(np.linalg.norm(field.grid.box_max - field.grid.box_min))

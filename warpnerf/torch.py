@@ -89,7 +89,7 @@ class _Scaled(torch.autograd.Function):
         return x.view_as(x)
 
     @staticmethod
-    def backward(ctx: Any, grad: torch.Tensor) -> tuple[torch.Tensor, None]:  # type: ignore[override]
+    def backward(ctx: Any, grad: torch.Tensor) -> tuple[torch.Tensor, None]:
         (scale,) = ctx.saved_tensors
         return grad * scale.to(grad.dtype), None
 
@@ -212,7 +212,7 @@ class _Render(torch.autograd.Function):
     """render_rays, forward and backward, each one launch."""
 
     @staticmethod
-    def forward(  # type: ignore[override]
+    def forward(
         ctx: Any, raw: torch.Tensor, origins: torch.Tensor, directions: torch.Tensor, call: _Call
     ) -> tuple[torch.Tensor, ...]:
         kernels, types = _device_code(raw)
@@ -294,6 +294,8 @@ def _stream(raw: torch.Tensor) -> Any:
 
 def _array(tensor: torch.Tensor, dtype: Any = None) -> wp.array:
     """The tensor's memory as a Warp array; contiguous tensors only."""
+    if tensor.numel() == 0:
+        tensor = tensor.new_empty(tensor.shape)  # an empty view may have any strides
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
 
 

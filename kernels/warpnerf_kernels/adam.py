@@ -30,12 +30,13 @@ def adam_step(
         return
     zero = vec4()
     for i in range(start, wp.min(start + span, values.shape[0])):
-        gradient = gradients[0, i]
-        for worker in range(1, gradients.shape[0]):
-            gradient += gradients[worker, i]
-        if not (gradient == zero):
-            for worker in range(gradients.shape[0]):
+        gradient = vec4()
+        for worker in range(gradients.shape[0]):
+            row = gradients[worker, i]
+            if not (row == zero):
+                gradient += row
                 gradients[worker, i] = zero
+        if not (gradient == zero):
             value = values[i]
             m = mean[i]
             v = square[i]

@@ -1,7 +1,7 @@
 """Total variation of the grid, and its adjoint.
 
-    TV(x) = sum_c weight_c sum_{neighbouring nodes a, b} huber(x_a,c - x_b,c),
-    huber(d) = d^2 / 2 for |d| <= 1, |d| - 1/2 beyond: an edge costs its height, not its square.
+TV(x) = sum_c weight_c sum_{neighbouring nodes a, b} huber(x_a,c - x_b,c),
+huber(d) = d^2 / 2 for |d| <= 1, |d| - 1/2 beyond: an edge costs its height, not its square.
 """
 
 import warp as wp
@@ -52,9 +52,7 @@ def adj_pair_variation(weight: vec4, a: vec4, b: vec4) -> vec4:
 
 
 @wp.func
-def node_variation(
-    values: wp.array(dtype=vec4), size: wp.vec3i, weight: vec4, n: int
-) -> real:
+def node_variation(values: wp.array(dtype=vec4), size: wp.vec3i, weight: vec4, n: int) -> real:
     """TV of a node's pairs towards larger indices."""
     k = n % size[2]
     j = (n // size[2]) % size[1]
@@ -70,9 +68,7 @@ def node_variation(
 
 
 @wp.func
-def adj_node_variation(
-    values: wp.array(dtype=vec4), size: wp.vec3i, weight: vec4, n: int
-) -> vec4:
+def adj_node_variation(values: wp.array(dtype=vec4), size: wp.vec3i, weight: vec4, n: int) -> vec4:
     """d TV / d x at a node: of all its pairs, towards larger and smaller indices."""
     k = n % size[2]
     j = (n // size[2]) % size[1]
@@ -117,7 +113,7 @@ def total_variation_backward(
     touched: wp.array(dtype=wp.uint8),  # [n_tiles] 0 where no gradient is
     adj_values: wp.array2d(dtype=vec4),  # [n_workers, X * Y * Z], row 0 is added to
 ):
-    """d TV / d x at the nodes that already have a gradient; the others, unseen, stay as they are."""
+    """d TV / d x at the nodes that already have a gradient; unseen ones stay as they are."""
     start = (first + wp.tid()) * span
     if touched[tile_of(start)] == wp.uint8(0):
         return

@@ -1,8 +1,8 @@
 """Rendering a ray and its adjoint: one walk, two passes, three kernels made of them.
 
-The forward pass composites samples front to back; the backward pass walks the same samples and needs
-of the rest of the ray only what lies behind, which it starts with and sheds sample by sample. Both
-get their samples from ``next_sample``, so there is one place that decides where a ray is sampled.
+The forward pass composites samples front to back; the backward pass walks the same samples and
+needs of the rest of the ray only what lies behind: it starts with that, and sheds it on its way.
+Both get their samples from ``next_sample``, the one place that decides where a ray is sampled.
 
 What selects a variant (``scaling``, ``jacobian``, ``contraction``) is a constant in each kernel, so
 the compiler drops what a variant does not use.
@@ -145,9 +145,7 @@ def integrate(
             if total.n_samples < capacity:
                 kept[row + total.n_samples] = sample
             total.n_samples += 1
-            weight = total.transmittance * opacity_of(
-                sample.sigma * sample.dt, sample.attenuation
-            )
+            weight = total.transmittance * opacity_of(sample.sigma * sample.dt, sample.attenuation)
             total.rgb += weight * sample.rgb
             total.depth += weight * sample.t
             total.transmittance *= sample.attenuation

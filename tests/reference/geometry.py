@@ -1,6 +1,5 @@
 """Where samples lie: contraction of space, grid coordinates, distances along a ray."""
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -142,15 +141,15 @@ def sample_distances(
     far: float,
     step: float,
     growth: float,
+    n_linear: int,
     n_steps: int,
     offset: float | Tensor = 0.5,
     dtype: torch.dtype = torch.float64,
 ) -> SampleDistances:
-    """Distances of the samples: steps of fixed length, growing in proportion to distance far out.
+    """Distances of the samples: equal steps, and from edge n_linear on geometrically growing ones.
 
-    edge(k) = near + k step                     for growth = 0, or k <= k0
-    edge(k) = edge(k0) (1 + growth)^(k - k0)    beyond
-    k0 = max(0, ceil((step / growth - near) / step)), the first edge at or past step / growth
+    edge(k) = near + k step                                 for growth = 0, or k <= n_linear
+    edge(k) = edge(n_linear) (1 + growth)^(k - n_linear)    beyond
     t_k = edge(k) + offset (edge(k + 1) - edge(k)),  dt_k = edge(k + 1) - edge(k)
 
     Edges are computed in float64 and rounded once, to dtype.
@@ -159,7 +158,8 @@ def sample_distances(
         near: Distance of the first edge, scene units.
         far: Samples at or beyond it are marked as such, scene units; may be infinite.
         step: Step length, scene units.
-        growth: Step length per distance once that exceeds `step`; 0 for uniform steps.
+        growth: Each edge beyond n_linear is (1 + growth) times the one before; 0: steps are equal.
+        n_linear: Number of equal steps; unused when growth is 0.
         n_steps: Number of samples.
         offset: Place within the step in [0, 1): 0.5 is the midpoint; [n_rays] for one per ray.
         dtype: Of the result.
@@ -170,9 +170,8 @@ def sample_distances(
     k = torch.arange(n_steps + 1, dtype=torch.float64)
     edges = near + k * step
     if growth > 0.0:
-        k0 = max(0, math.ceil((step / growth - near) / step))
-        grown = (near + k0 * step) * (1.0 + growth) ** (k - k0).clamp_min(0.0)
-        edges = torch.where(k <= k0, edges, grown)
+        grown = (near + n_linear * step) * (1.0 + growth) ** (k - n_linear).clamp_min(0.0)
+        edges = torch.where(k <= n_linear, edges, grown)
     dt = edges[1:] - edges[:-1]
     within = torch.as_tensor(offset, dtype=torch.float64).cpu()[..., None]  # [..., 1]
     t = (edges[:-1] + within * dt).to(dtype)

@@ -223,10 +223,12 @@ def render(
     step: float,
     n_steps: int,
     growth: float = 0.0,
+    n_linear: int = 0,
     offset: float | Tensor = 0.5,
     norm: str = "none",
     border: float = 1.0,
     density_shift: float = 0.0,
+    density_scale: float = 1.0,
     background: Tensor | Sequence[float] = (0.0, 0.0, 0.0),
     mask: Tensor | None = None,
     transmittance_min: float = 0.0,
@@ -236,7 +238,7 @@ def render(
 ) -> Rendering:
     """Render rays through a grid of raw values, every candidate sample of every ray at once.
 
-    sigma = softplus(raw_0 + density_shift),  c = sigmoid(raw_1..3)
+    sigma = density_scale softplus(raw_0 + density_shift),  c = sigmoid(raw_1..3)
 
     Both come after interpolation and before `integrate`. A candidate is valid where it lies in the
     grid (0 <= u <= size - 1; always, under contraction), t < far, and its mask cell is occupied.
@@ -253,10 +255,12 @@ def render(
         step: Step length, scene units.
         n_steps: Candidates per ray.
         growth: See `sample_distances`.
+        n_linear: See `sample_distances`.
         offset: Place within the step, one for all or [n_rays].
         norm: Contraction: "none", "linf" or "l2".
         border: Width of the contracted shell.
         density_shift: Added to the raw density.
+        density_scale: Factor on the activated density, 1 / scene unit.
         background: Colour [3] or [n_rays, 3].
         mask: Occupancy [MX, MY, MZ], bool; None for occupied everywhere.
         transmittance_min: Stop a ray once its transmittance is below this.
@@ -275,7 +279,7 @@ def render(
     corner_min, corner_max = like_raw(box_min), like_raw(box_max)
     shape = raw.shape[:3]
 
-    steps = sample_distances(near, far, step, growth, n_steps, offset, raw.dtype)
+    steps = sample_distances(near, far, step, growth, n_linear, n_steps, offset, raw.dtype)
     t = steps.t.to(raw.device).expand(origins.shape[0], n_steps)
     dt = steps.dt.to(raw.device)
     points = origins[:, None, :] + t[..., None] * directions[:, None, :]  # [n_rays, n_steps, 3]
@@ -290,7 +294,7 @@ def render(
         valid = valid & occupied(mask, u, shape)
 
     values = trilinear(raw, u)  # [n_rays, n_steps, 4]
-    sigma = softplus(values[..., 0] + density_shift)
+    sigma = density_scale * softplus(values[..., 0] + density_shift)
     colors = torch.sigmoid(values[..., 1:4])
 
     det = jacobian_determinant(normalized_coordinates(points, corner_min, corner_max), norm, border)

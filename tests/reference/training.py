@@ -20,9 +20,10 @@ def photometric_loss(rgb: Tensor, target: Tensor) -> Tensor:
 
 
 def total_variation(raw: Tensor, weights: Tensor) -> Tensor:
-    """Squared differences of neighbouring nodes, weighted by channel.
+    """Huber loss of the differences of neighbouring nodes, weighted by channel.
 
-    TV = sum_c weight_c / N sum_axes sum_pairs (raw_a - raw_b)^2 / 2,  N = X Y Z
+    TV = sum_c weight_c sum_axes sum_pairs huber(raw_a - raw_b)
+    huber(d) = d^2 / 2 for |d| <= 1, |d| - 1/2 beyond
 
     Args:
         raw: Node values [X, Y, Z, C].
@@ -31,11 +32,12 @@ def total_variation(raw: Tensor, weights: Tensor) -> Tensor:
     Returns:
         Total variation [].
     """
-    n_nodes = raw.shape[0] * raw.shape[1] * raw.shape[2]
     total = torch.zeros((), dtype=raw.dtype, device=raw.device)
     for axis in range(3):
         difference = raw.diff(dim=axis)
-        total = total + (weights * difference**2 / 2.0).sum() / n_nodes
+        size = difference.abs()
+        huber = torch.where(size <= 1.0, difference**2 / 2.0, size - 0.5)
+        total = total + (weights * huber).sum()
     return total
 
 

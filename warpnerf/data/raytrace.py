@@ -84,7 +84,9 @@ class Box:
         """Half the extent along x, scene units."""
         return (self.hi[0] - self.lo[0]) / 2
 
-    def interval(self, rays: Rays, axes: Sequence[int] = (0, 1, 2)) -> tuple[np.ndarray, np.ndarray]:
+    def interval(
+        self, rays: Rays, axes: Sequence[int] = (0, 1, 2)
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Where each ray enters and leaves the solid, [...] each; enter > leave: it misses."""
         kind = rays.inverse.dtype
         spans = []
@@ -98,7 +100,7 @@ class Box:
         return enter, leave
 
     def hit(self, rays: Rays) -> np.ndarray:
-        """First ``t`` on the solid, [...]: infinite where a ray misses, 0 where it starts inside."""
+        """First ``t`` on the solid, [...]: infinite where a ray misses, 0 if it starts inside."""
         enter, leave = self.interval(rays)
         return np.where((enter <= leave) & (leave > 0.0), np.maximum(enter, 0.0), np.inf)
 
@@ -111,7 +113,9 @@ class Box:
     def locate(self, points: np.ndarray) -> Surface:
         """Face, u and v of points [3, n] on the surface."""
         half = (np.array(self.hi) - np.array(self.lo)) / 2
-        off = (points - self.centre[:, None].astype(points.dtype)) / half[:, None].astype(points.dtype)
+        off = (points - self.centre[:, None].astype(points.dtype)) / half[:, None].astype(
+            points.dtype
+        )
         size = np.abs(off)
         is_z = (size[2] > size[0]) & (size[2] > size[1])
         is_x = ~is_z & (size[0] > size[1])
@@ -146,7 +150,9 @@ class Room(Box):
 class Cylinder(Box):
     """Upright cylinder, touching the sides of its box; faces 0 (curved), 4 and 5 (caps)."""
 
-    def interval(self, rays: Rays, axes: Sequence[int] = (0, 1, 2)) -> tuple[np.ndarray, np.ndarray]:
+    def interval(
+        self, rays: Rays, axes: Sequence[int] = (0, 1, 2)
+    ) -> tuple[np.ndarray, np.ndarray]:
         """See Box."""
         near, far = _quadric(self.centre[:2], self.radius, rays)
         bottom, top = super().interval(rays, axes=(2,))
@@ -180,7 +186,9 @@ class Cylinder(Box):
 class Ball(Box):
     """Sphere, touching the sides of its box; (u, v) = (azimuth, latitude) times radius."""
 
-    def interval(self, rays: Rays, axes: Sequence[int] = (0, 1, 2)) -> tuple[np.ndarray, np.ndarray]:
+    def interval(
+        self, rays: Rays, axes: Sequence[int] = (0, 1, 2)
+    ) -> tuple[np.ndarray, np.ndarray]:
         """See Box."""
         return _quadric(self.centre, self.radius, rays)
 
@@ -244,7 +252,9 @@ class Tracer:
         self.solids = tuple(solids)
         self._blockers = [solid for solid in self.solids if solid.glow == 0.0]
         self._patch = np.zeros((len(self.solids), 6), np.int32)  # [solid, face] -> column below
-        patches, baked, start = [], [], 0
+        patches: list[tuple[float, ...]] = []
+        baked: list[np.ndarray] = []
+        start = 0
         for index, solid in enumerate(self.solids):
             for face, (u0, u1, v0, v1) in solid.faces().items():
                 nu, nv = (2 + int(length / spacing) for length in (u1 - u0, v1 - v0))
@@ -313,10 +323,8 @@ class Tracer:
         x = ((np.arange(camera.width * samples) + 0.5) / samples - camera.cx) / camera.fx
         y = (camera.cy - (np.arange(camera.height * samples) + 0.5) / samples) / camera.fy
         right, up, back = (rotation[:, axis, None, None] for axis in range(3))
-        rays = make_rays(
-            position[:, None, None], (right * x + up * y[:, None] - back).astype(kind)
-        )
-        nearest = np.full(rays.directions.shape[1:], np.inf, kind)
+        rays = make_rays(position[:, None, None], (right * x + up * y[:, None] - back).astype(kind))
+        nearest: np.ndarray = np.full(rays.directions.shape[1:], np.inf, kind)
         which = np.zeros(nearest.shape, np.uint8)
         for index, solid in enumerate(self.solids):
             part = _footprint(solid, camera, samples)

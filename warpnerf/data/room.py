@@ -152,9 +152,16 @@ def outdoors(at: Surface) -> np.ndarray:
     """The view through the window: sky, clouds, hills, and white glazing bars."""
     y, z = at.u, at.v
     cloud = np.clip(3 * _noise(y * 0.5, z, 1.5) - 1.4, 0, 1)
-    rgb = _mix(_mix(_linear("d5e5ee"), _linear("8fbbdd"), np.clip((z - 1.3) / 0.8, 0, 1)),
-               _linear("ffffff"), cloud)
-    for base, height, colour in ((1.42, 0.22, "9db4a0"), (1.28, 0.2, "7fa06c"), (1.14, 0.14, "5f8a4a")):
+    rgb = _mix(
+        _mix(_linear("d5e5ee"), _linear("8fbbdd"), np.clip((z - 1.3) / 0.8, 0, 1)),
+        _linear("ffffff"),
+        cloud,
+    )
+    for base, height, colour in (
+        (1.42, 0.22, "9db4a0"),
+        (1.28, 0.2, "7fa06c"),
+        (1.14, 0.14, "5f8a4a"),
+    ):
         hill = z < base + height * (_noise(y + base, np.full_like(y, base), 2.4) - 0.5)
         rgb = _mix(rgb, _linear(colour) * (0.8 + 0.4 * _noise(y, z, 0.8)), hill)
     bars = (np.abs(y - 0.2) < 0.022) | (np.abs(z - 1.72) < 0.02)
@@ -164,10 +171,20 @@ def outdoors(at: Surface) -> np.ndarray:
 def painting(at: Surface) -> np.ndarray:
     """A landscape at dusk: sun, bands of sky, mountains, and a lake."""
     y, z = at.u, at.v
-    rgb = _mix(_linear("e9b872"), _linear("49688d"), np.clip((z - 1.6 + 0.1 * _noise(y, z, 0.6)) / 0.5, 0, 1))
+    rgb = _mix(
+        _linear("e9b872"),
+        _linear("49688d"),
+        np.clip((z - 1.6 + 0.1 * _noise(y, z, 0.6)) / 0.5, 0, 1),
+    )
     rgb = _mix(rgb, _linear("fbe7b2"), np.hypot(y - 0.35, z - 1.78) < 0.075)
-    for base, height, colour in ((1.72, 0.34, "6d6a86"), (1.6, 0.25, "4a5570"), (1.52, 0.15, "3c4a45")):
-        rgb = _mix(rgb, _linear(colour), z < base + height * (_noise(y, np.full_like(y, base), 1.3) - 0.5))
+    for base, height, colour in (
+        (1.72, 0.34, "6d6a86"),
+        (1.6, 0.25, "4a5570"),
+        (1.52, 0.15, "3c4a45"),
+    ):
+        rgb = _mix(
+            rgb, _linear(colour), z < base + height * (_noise(y, np.full_like(y, base), 1.3) - 0.5)
+        )
     wave = 0.35 * (np.sin(z * 260 + 5 * _noise(y, z, 0.5)) > 0.2)
     return _mix(rgb, _mix(_linear("5c7d92"), _linear("d9a971"), wave), z < 1.47)
 
@@ -181,7 +198,11 @@ def rug(at: Surface) -> np.ndarray:
     rgb = _mix(rgb, _linear("3c5570"), diamond < 0.08)
     zigzag = np.abs(np.mod((x + y) / 0.08, 1) - 0.5) < 0.25
     border = _mix(_linear("33465c"), _linear("cdb98f"), zigzag)
-    rgb = _mix(_mix(rgb, border, edge < 0.16), _linear("d8c39a"), (edge < 0.03) | (np.abs(edge - 0.17) < 0.015))
+    rgb = _mix(
+        _mix(rgb, border, edge < 0.16),
+        _linear("d8c39a"),
+        (edge < 0.03) | (np.abs(edge - 0.17) < 0.015),
+    )
     return _tint(rgb, at.u, at.v, 0.35, 0.2)
 
 
@@ -261,20 +282,33 @@ _SOFA, _CREAM, _BRASS = plain("5f7f86", 0.35, 0.3), plain("e6dcc6"), plain("b892
 _BOOKS = ("7c3b32", "2f4f63", "b0894a", "4d6a4f", "d7cbb0", "6a4a68", "a8633c", "38424a")
 
 
-def _box(x0: float, x1: float, y0: float, y1: float, z0: float, z1: float, paint: Texture,
-         glow: float = 0.0) -> Box:
+def _box(
+    x0: float,
+    x1: float,
+    y0: float,
+    y1: float,
+    z0: float,
+    z1: float,
+    paint: Texture,
+    glow: float = 0.0,
+) -> Box:
     return Box(lo=(x0, y0, z0), hi=(x1, y1, z1), texture=paint, glow=glow)
 
 
-def _can(x: float, y: float, radius: float, z0: float, z1: float, paint: Texture,
-         glow: float = 0.0) -> Box:
-    return Cylinder(lo=(x - radius, y - radius, z0), hi=(x + radius, y + radius, z1),
-                    texture=paint, glow=glow)
+def _can(
+    x: float, y: float, radius: float, z0: float, z1: float, paint: Texture, glow: float = 0.0
+) -> Box:
+    return Cylinder(
+        lo=(x - radius, y - radius, z0), hi=(x + radius, y + radius, z1), texture=paint, glow=glow
+    )
 
 
 def _ball(x: float, y: float, z: float, radius: float, paint: Texture) -> Box:
-    return Ball(lo=(x - radius, y - radius, z - radius), hi=(x + radius, y + radius, z + radius),
-                texture=paint)
+    return Ball(
+        lo=(x - radius, y - radius, z - radius),
+        hi=(x + radius, y + radius, z + radius),
+        texture=paint,
+    )
 
 
 def _furniture() -> Iterator[Box]:
@@ -300,8 +334,12 @@ def _furniture() -> Iterator[Box]:
             yield _box(x, x + 0.05, y, y + 0.05, 0.0, 0.4, _OAK_UP)
     yield _ball(-0.3, 0.2, 0.525, 0.09, stripes("3f6e8c", "e7e0cf", 0.03, upright=False))
     yield _can(-0.3, 0.2, 0.035, 0.59, 0.7, plain("3f6e8c"))
-    for x, y, z, colour in ((-0.3, 0.2, 0.95, "d9694a"), (-0.36, 0.25, 0.88, "e3b04b"),
-                            (-0.23, 0.24, 0.84, "e8dcc8"), (-0.29, 0.12, 0.82, "c9506a")):
+    for x, y, z, colour in (
+        (-0.3, 0.2, 0.95, "d9694a"),
+        (-0.36, 0.25, 0.88, "e3b04b"),
+        (-0.23, 0.24, 0.84, "e8dcc8"),
+        (-0.29, 0.12, 0.82, "c9506a"),
+    ):
         yield _can(x, y, 0.007, 0.66, z, plain("4d7a3c"))
         yield _ball(x, y, z, 0.045, plain(colour, 0.12, 0.35))
     yield _box(-0.52, -0.28, -0.4, -0.06, 0.44, 0.475, plain("7c3b32"))
@@ -352,9 +390,14 @@ def _furniture() -> Iterator[Box]:
     # plant
     yield _can(-1.45, -1.95, 0.21, 0.0, 0.36, checks("b9623f", "d9996c", 0.07))
     yield _can(-1.45, -1.95, 0.03, 0.36, 0.95, _OAK_UP)
-    for x, y, z, radius in ((-1.45, -1.95, 1.1, 0.25), (-1.25, -1.85, 0.85, 0.17),
-                            (-1.63, -1.8, 0.9, 0.18), (-1.5, -2.15, 0.85, 0.19),
-                            (-1.3, -2.1, 1.25, 0.18), (-1.6, -1.95, 1.4, 0.2)):
+    for x, y, z, radius in (
+        (-1.45, -1.95, 1.1, 0.25),
+        (-1.25, -1.85, 0.85, 0.17),
+        (-1.63, -1.8, 0.9, 0.18),
+        (-1.5, -2.15, 0.85, 0.19),
+        (-1.3, -2.1, 1.25, 0.18),
+        (-1.6, -1.95, 1.4, 0.2),
+    ):
         yield _ball(x, y, z, radius, leaves)
     # wall shelf, pictures, door handle
     yield _box(-0.85, 0.15, -2.5, -2.3, 1.25, 1.28, _OAK)
@@ -466,7 +509,10 @@ def _train_poses() -> Iterator[tuple[Vec3, Vec3]]:
     for k in range(14):  # outward, all around, up and down
         a = 2 * np.pi * k / 14 + 0.2
         eye = (0.15 - 0.45 * np.cos(a), -0.5 * np.sin(a), 1.35 + 0.15 * np.sin(3 * a))
-        yield eye, (eye[0] + np.cos(a), eye[1] + np.sin(a), eye[2] + (-0.4, 0.05, 0.35, -0.1)[k % 4])
+        yield (
+            eye,
+            (eye[0] + np.cos(a), eye[1] + np.sin(a), eye[2] + (-0.4, 0.05, 0.35, -0.1)[k % 4]),
+        )
     yield from _CLOSE
 
 
@@ -498,9 +544,7 @@ def room_scene(downscale: int = 1) -> Scene:
         ValueError: downscale is not a whole number that leaves at least one pixel.
     """
     if downscale != int(downscale) or not 1 <= downscale <= HEIGHT:
-        raise InputError(
-            f"downscale must be a whole number from 1 to {HEIGHT}, not {downscale}."
-        )
+        raise InputError(f"downscale must be a whole number from 1 to {HEIGHT}, not {downscale}.")
     tracer = _tracer()
     samples = min(int(downscale) + 1, 4)
     views = []

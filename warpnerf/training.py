@@ -26,6 +26,10 @@ FAR_BOXES = 64.0
 REPORT_EVERY = 25
 """Steps between two reports."""
 
+FIRST_LOOK = 200
+"""Steps before the first look for free space and the first growth: what is left out then stays out,
+so densities must have had time to show."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Progress:
@@ -36,7 +40,7 @@ class Progress:
     fraction: float
     """Of the whole training, [0, 1]."""
     seconds: float
-    """Since training began."""
+    """Since the first step, which may have had to compile."""
     loss: float
     """Of the last batch: mean over rays of the squared error, summed over channels."""
     psnr: float
@@ -137,7 +141,7 @@ class Trainer:
         self.free = FreeCells.none(self.workers)
         self._occupied = 1.0
         self._pass = self._training_pass()
-        self._started = time.perf_counter()
+        self._started = 0.0
         self._seconds = 0.0
 
     @property
@@ -158,7 +162,7 @@ class Trainer:
         config = self.config
         fraction = self.fraction
         self._grow(fraction)
-        if self.steps_done % config.occupancy_every == 0 and self.steps_done > 0:
+        if self.steps_done % config.occupancy_every == 0:
             self._look_for_free_space()
         batch = self._sampler.draw(self.steps_done)
         self._pass.run(self.grid, self.free, self.march_steps(), batch)
@@ -174,6 +178,8 @@ class Trainer:
             config.optim,
             self.workers,
         )
+        if self.steps_done == 1:
+            self._started = time.perf_counter()  # compiling is not training
         self._seconds = time.perf_counter() - self._started
 
     def report(self) -> Progress:
@@ -272,7 +278,7 @@ class Trainer:
     def _grow(self, fraction: float) -> None:
         """Carry grid and optimiser over to more nodes, once the schedule says so."""
         grown = sum(fraction >= at for at in self.config.grid.grow_at)
-        if grown == self._grown:
+        if grown == self._grown or self.steps_done < FIRST_LOOK:
             return
         self._look_for_free_space()
         box = self._tight_box()
@@ -296,6 +302,9 @@ class Trainer:
         return box_min + occupied[0] * extent, box_min + occupied[1] * extent
 
     def _look_for_free_space(self) -> None:
+        """Find what need not be sampled; not in the first steps, when nothing has grown yet."""
+        if self.steps_done < FIRST_LOOK:
+            return
         self.free = FreeCells.of(
             self.grid, self.workers, self.march_steps().step, self.config.alpha_min
         )

@@ -1,0 +1,92 @@
+"""What the scaling does: the built-in room, trained with and without it, near plane 0.
+
+Measured on the trained fields: PSNR and depth error on the test views, and density where no surface
+can be, nearer to a training camera than anything in the room: the mean optical depth of a ray from
+the camera to its clearance, the distance to the nearest true surface in any direction.
+
+    python benchmarks/floaters.py --time-limit 120
+
+Prints a table and writes benchmarks/results/floaters_<device>.json and a picture of each field.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+from workload import machine, write_record
+
+import warpnerf as wn
+from warpnerf.data.room import first_hit
+from warpnerf.pictures import comparison, write_png
+
+RESULTS = Path(__file__).parent / "results"
+N_DIRECTIONS = 2000
+
+
+def sphere(n: int) -> np.ndarray:
+    """Evenly spread unit vectors, [n, 3]: Fibonacci's spiral."""
+    k = np.arange(n) + 0.5
+    z = 1.0 - 2.0 * k / n
+    angle = np.pi * (1.0 + 5.0**0.5) * k
+    radius = np.sqrt(1.0 - z * z)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
+
+
+def near_density(field: wn.Field, scene: wn.Scene) -> float:
+    """Mean optical depth from a training camera to its clearance; the truth is 0."""
+    directions = sphere(N_DIRECTIONS)
+    depths = []
+    for camera in scene.training_cameras:
+        origins = np.broadcast_to(camera.position, directions.shape)
+        clearance = float(first_hit(origins, directions).min())
+        steps = dataclasses.replace(field.steps, far=clearance, transmittance_min=0.0)
+        seen = dataclasses.replace(field, steps=steps).render_rays(origins, directions)
+        depths.append(float(-np.log(np.maximum(1.0 - seen.opacity, 1e-6)).mean()))
+    return float(np.mean(depths))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("--time-limit", type=float, default=120.0, help="seconds each")
+    parser.add_argument("--steps", type=int, default=100_000, help="steps, where fewer")
+    parser.add_argument("--downscale", type=int, default=1)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--output", type=Path, default=RESULTS)
+    arguments = parser.parse_args()
+    scene = wn.load_scene("builtin:room", downscale=arguments.downscale)
+    print("scaling   steps   PSNR    SSIM  depth error [m]  density before any surface")
+    rows = {}
+    for scaling in ("none", "clamped"):
+        config = wn.TrainConfig(
+            steps=arguments.steps,
+            time_limit=arguments.time_limit,
+            scaling=scaling,
+            device=arguments.device,
+        )
+        result = wn.train(scene, config)
+        row = wn.evaluate(result.field, scene).mean
+        row["near_density"] = near_density(result.field, scene)
+        row["steps"] = result.progress.step
+        rows[scaling] = row
+        print(
+            f"{scaling:8} {row['steps']:6d}  {row['psnr']:5.2f}  {row['ssim']:.4f}  "
+            f"{row['depth_error']:15.3f}  {row['near_density']:.5f}",
+            flush=True,
+        )
+        view = scene.views[scene.splits["test"][4]]
+        picture = comparison(view.image / 255.0, result.field.render(view.camera), 0.0, 6.0)
+        write_png(arguments.output / f"floaters_{scaling}.png", picture)
+    record = {
+        "machine": machine(arguments.device, result.field.workers.count),
+        "time_limit": arguments.time_limit,
+        **rows,
+    }
+    path = write_record(record, arguments.output, "floaters", arguments.device)
+    print(f"wrote {path}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,340 @@
+"""What distance scaling costs in the adjoint, per 300 000 samples of a training-like step.
+
+    python benchmarks/gradient_scaling.py
+
+1500 rays x 200 steps, all in the box: exactly 300 000 samples. Measured in pairs, with and without:
+
+    render_backward    our adjoint launch, scaled ("clamped") against compiled without
+    render_train       our forward + loss + adjoint launch, likewise
+    control            our adjoint launch without scaling against itself: what the method of
+                       measuring makes of no difference at all
+    torch backward     the same rendering in torch, with the paper's operation against without
+    operation alone    the backward of the paper's operation on 300 000 samples
+
+The two of a pair take turns (ABBA), each counts its fastest; the figure is the median over pairs
+of their difference, with a 95 % interval from order statistics. Shares are of the unscaled backward
+pass of the same pipeline. Both of our variants write to the same arrays, so that their place in
+memory makes no difference. Compile time is not in it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+from torch_pipeline import Choices, ScaleGradient, TorchPipeline, fastest_by_threads
+from warpnerf_kernels import contraction
+from warpnerf_kernels import render as kernels
+from warpnerf_kernels.types import Sample, real, vec3
+from workload import (
+    Stopwatch,
+    Workload,
+    machine,
+    make_workload,
+    median_interval,
+    write_record,
+)
+
+from warpnerf.config import Scaling
+from warpnerf.grid import FreeCells
+from warpnerf.parallel import Workers
+from warpnerf.render import JACOBIANS, SCALINGS, Gradients, TrainingPass, render_rays
+
+N_RAYS = 1500
+N_STEPS = 200
+N_SAMPLES = 300_000
+
+Call = Callable[[], object]
+
+
+class WarpAdjoint:
+    """The workload's launches in warpnerf, for each scaling, on the same arrays."""
+
+    def __init__(self, work: Workload, device: str, threads: int) -> None:
+        """Load a workload and render it once, for what the adjoint starts from."""
+        self._workers = workers = Workers(device, threads)
+        self._grid = work.voxel_grid(workers)
+        self._free = FreeCells.none(workers)
+        self._steps = work.steps()
+        self._batch = batch = work.batch(workers)
+        self._out = render_rays(
+            self._grid,
+            self._free,
+            self._steps,
+            batch.origins,
+            batch.directions,
+            batch.offsets,
+            batch.background,
+            workers,
+        )
+        n = int(self._out.n_samples.numpy().sum())
+        if n != N_SAMPLES:
+            raise SystemExit(f"gradient_scaling: {n} samples were visited, not {N_SAMPLES}.")
+        rgb = self._out.rgb.numpy()
+        self._adj_rgb = wp.array(
+            2.0 / len(rgb) * (rgb - work.target_rgb), dtype=vec3, device=workers.device
+        )
+        self._nothing = wp.zeros(len(rgb), dtype=real, device=workers.device)
+        self._kept = wp.empty(0, dtype=Sample, device=workers.device)
+        self._passes = {scaling: self._training_pass(scaling) for scaling in ("none", "clamped")}
+        vars(self._passes["clamped"]).update(
+            {
+                name: value
+                for name, value in vars(self._passes["none"]).items()
+                if isinstance(value, wp.array | Gradients)
+            }
+        )
+
+    def _training_pass(self, scaling: Scaling) -> TrainingPass:
+        nodes = self._grid.values.shape[0]
+        return TrainingPass(self._batch.count, nodes, scaling, "none", "none", self._workers)
+
+    @property
+    def gradients(self) -> Gradients:
+        """What all launches add to."""
+        return self._passes["none"].gradients
+
+    def train(self, scaling: Scaling) -> Call:
+        """The fused launch."""
+        training_pass = self._passes[scaling]
+        return lambda: training_pass.run(self._grid, self._free, self._steps, self._batch)
+
+    def backward(self, scaling: Scaling) -> Call:
+        """The adjoint launch."""
+        kernel = kernels.render_backward_kernel(
+            kernels.Variant(contraction.NONE, SCALINGS[scaling], JACOBIANS["none"])
+        )
+        batch, out = self._batch, self._out
+        arguments = (
+            self._grid.struct(),
+            self._free.struct(self._grid.border),
+            self._steps.struct(),
+            batch.origins,
+            batch.directions,
+            batch.offsets,
+            batch.background,
+            batch.content_distance,
+            out.rgb,
+            out.transmittance,
+            out.depth,
+            out.n_samples,
+            self._adj_rgb,
+            self._nothing,
+            self._nothing,
+            self._kept,
+            self.gradients.rows,
+            self.gradients.touched,
+        )
+        return lambda: self._workers.launch_owned(kernel, batch.count, *arguments)
+
+    def gradient_of(self, launch: Call) -> np.ndarray:
+        """What a launch adds, [X, Y, Z, 4]."""
+        self.gradients.rows.zero_()
+        launch()
+        return self.gradients.rows.numpy().sum(axis=0).reshape(*self._grid.size, 4)
+
+
+def check(ours: WarpAdjoint, theirs: dict[Scaling, TorchPipeline]) -> None:
+    """Raise SystemExit unless all launches have the gradient that torch has."""
+    for scaling, pipeline in theirs.items():
+        expected = pipeline.training_step()[0].permute(1, 2, 3, 0).cpu().numpy()
+        for launch in (ours.backward(scaling), ours.train(scaling)):
+            error = np.abs(ours.gradient_of(launch) - expected).max() / np.abs(expected).max()
+            if not error < 1e-4:
+                raise SystemExit(
+                    f"gradient_scaling: scaling {scaling!r} differs from torch by {error:.1e} of "
+                    "the largest gradient; there is nothing to time."
+                )
+
+
+def operation_alone(device: str, threads: int) -> Call:
+    """The backward of the paper's operation, on as many samples."""
+    rgb = torch.rand(N_SAMPLES, 3, device=device, requires_grad=True)
+    sigma = torch.rand(N_SAMPLES, device=device, requires_grad=True)
+    out = ScaleGradient.apply(rgb, sigma, 1.5 * torch.rand(N_SAMPLES, device=device), 1.0)
+    adj = (torch.rand_like(rgb), torch.rand_like(sigma))
+
+    def call() -> object:
+        torch.set_num_threads(threads)
+        return torch.autograd.grad(out, (rgb, sigma), adj, retain_graph=True)
+
+    return call
+
+
+class Pairs:
+    """Times of two calls, taken in turns."""
+
+    def __init__(self, name: str, without: Call, with_it: Call, stopwatch: Stopwatch) -> None:
+        """Run both once, so that they are compiled and warm."""
+        self.name = name
+        self._calls = (without, with_it)
+        self._stopwatch = stopwatch
+        self._times: list[tuple[float, float]] = []
+        without()
+        with_it()
+
+    def take(self, repeats: int) -> None:
+        """One more pair: the fastest of some repeats of each, ABBA or BAAB."""
+        fastest = [float("inf"), float("inf")]
+        for repeat in range(repeats):
+            first = (len(self._times) + repeat) % 2
+            for side in (first, 1 - first):
+                seconds = self._stopwatch.seconds(self._calls[side])
+                fastest[side] = min(fastest[side], seconds)
+        self._times.append((fastest[0], fastest[1]))
+
+    def without_us(self) -> float:
+        """Median time of the first, microseconds."""
+        return 1e6 * float(np.median([t[0] for t in self._times]))
+
+    def record(self, backward_us: float) -> dict[str, Any]:
+        """The median difference and its interval, also as shares of a backward pass."""
+        difference = median_interval([1e6 * (t[1] - t[0]) for t in self._times])
+        return {
+            "name": self.name,
+            "pairs": len(self._times),
+            "without_us": self.without_us(),
+            "with_us": 1e6 * float(np.median([t[1] for t in self._times])),
+            "difference_us": dict(zip(("low", "median", "high"), difference, strict=True)),
+            "backward_us": backward_us,
+            "share_of_backward": {
+                key: value / backward_us
+                for key, value in zip(("low", "median", "high"), difference, strict=True)
+            },
+        }
+
+
+def counted_instructions(grid: int, scaling: Scaling) -> float | None:
+    """Instructions of one sample's adjoint, by the hardware's counter; None where there is none.
+
+    A process that launches more often is set against one that launches less often, so that all but
+    the launches cancels.
+    """
+    few, many = 20, 120
+    counts = []
+    for launches in (few, many):
+        command = ["perf", "stat", "-x", ",", "-e", "instructions:u", sys.executable, __file__]
+        command += ["--grid", str(grid), "--launch", scaling, str(launches)]
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+        except (OSError, subprocess.TimeoutExpired):
+            return None
+        line = next((s for s in done.stderr.splitlines() if ",instructions:u," in s), "")
+        count = line.split(",")[0]
+        if done.returncode != 0 or not count.isdigit():
+            return None
+        counts.append(int(count))
+    return (counts[1] - counts[0]) / (many - few) / N_SAMPLES
+
+
+def has_counters() -> bool:
+    """Whether perf can count instructions here."""
+    command = ["perf", "stat", "-x", ",", "-e", "instructions:u", "true"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=30)
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+    return done.stderr.split(",")[0].strip().isdigit()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--device", default="cpu", help="cpu, cuda:0")
+    parser.add_argument("--grid", type=int, default=64, help="nodes along each axis")
+    parser.add_argument("--pairs", type=int, default=200)
+    parser.add_argument("--repeats", type=int, default=2, help="of each side in a pair")
+    parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--output", type=Path, help="where the record goes")
+    parser.add_argument("--launch", nargs=2, metavar=("SCALING", "N"), help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    on_cuda = args.device.startswith("cuda")
+    work = make_workload("inside", args.grid, N_RAYS, N_STEPS)
+    if args.launch:  # the process that counted_instructions watches
+        launch = WarpAdjoint(work, "cpu", 1).backward(args.launch[0])
+        for _ in range(int(args.launch[1])):
+            launch()
+        return
+
+    stopwatch = Stopwatch(args.device)
+    ours = WarpAdjoint(work, args.device, args.threads)
+    candidates = fastest_by_threads(work, True, args.threads, args.device, stopwatch.seconds)
+    times = [
+        np.median([stopwatch.seconds(candidate.training_step) for _ in range(5)])
+        for candidate in candidates
+    ]
+    best: Choices = candidates[int(np.argmin(times))].choices
+    scalings: tuple[Scaling, ...] = ("none", "clamped")
+    theirs = {s: TorchPipeline(work, s != "none", best, args.device) for s in scalings}
+    check(ours, theirs)
+
+    def torch_backward(pipeline: TorchPipeline) -> Call:
+        loss = pipeline.loss()
+        return lambda: pipeline.gradient(loss, keep_graph=True)
+
+    plain = ours.backward("none")
+    backward = Pairs("render_backward", plain, ours.backward("clamped"), stopwatch)
+    train = Pairs("render_train", ours.train("none"), ours.train("clamped"), stopwatch)
+    control = Pairs("control", plain, plain, stopwatch)
+    in_torch = Pairs(
+        "torch backward",
+        torch_backward(theirs["none"]),
+        torch_backward(theirs["clamped"]),
+        stopwatch,
+    )
+    alone = Pairs(
+        "operation alone", lambda: None, operation_alone(args.device, best.threads), stopwatch
+    )
+    all_pairs = (backward, train, control, in_torch, alone)
+    for _ in range(args.pairs):
+        for pairs in all_pairs:
+            pairs.take(args.repeats)
+
+    ours_us, torch_us = backward.without_us(), in_torch.without_us()
+    records = [pairs.record(ours_us) for pairs in (backward, train, control)]
+    records += [pairs.record(torch_us) for pairs in (in_torch, alone)]
+    print(
+        f"{N_SAMPLES} samples, {args.grid}^3 grid, {args.pairs} pairs, {args.threads} threads "
+        f"(torch: {best.threads}); median difference [95 % interval]\n"
+    )
+    print(
+        f"{'':17s}{'without us':>11s}{'with us':>11s}   {'difference us':26s}   "
+        "of the backward pass"
+    )
+    for r in records:
+        d, s = r["difference_us"], r["share_of_backward"]
+        difference = f"{d['median']:+.1f} [{d['low']:+.1f}, {d['high']:+.1f}]"
+        print(
+            f"{r['name']:17s}{r['without_us']:11.0f}{r['with_us']:11.0f}   {difference:26s}   "
+            f"{s['median']:+.2%} [{s['low']:+.2%}, {s['high']:+.2%}]"
+        )
+
+    instructions: dict[str, float | None] | None = None
+    if not on_cuda and has_counters():
+        instructions = {s: counted_instructions(args.grid, s) for s in scalings}
+        print(f"\ninstructions of a sample's adjoint: {instructions}")
+    else:
+        print("\nno hardware counters on this machine")
+    record = {
+        "benchmark": "gradient_scaling",
+        "machine": machine(args.device, args.threads),
+        "n_samples": N_SAMPLES,
+        "grid": args.grid,
+        "repeats": args.repeats,
+        "torch_choices": asdict(best),
+        "results": records,
+        "instructions_per_sample": instructions,
+    }
+    print(f"record: {write_record(record, args.output, 'gradient_scaling', args.device)}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,36 @@
+"""Where the kernels under test run, and where their compiled code is kept."""
+
+import os
+
+import pytest
+import warp as wp
+from drive import Kernels
+
+if "WARP_CACHE_PATH" in os.environ:
+    wp.config.kernel_cache_dir = os.environ["WARP_CACHE_PATH"]
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--device", default="cpu", help="as Warp names it: cpu, cuda:0")
+
+
+@pytest.fixture(scope="session")
+def device(request: pytest.FixtureRequest) -> str:
+    return str(request.config.getoption("--device"))
+
+
+@pytest.fixture(scope="session")
+def on_cpu(device: str) -> None:
+    """For what holds on the CPU only: CUDA adds gradients up in no fixed order."""
+    if device != "cpu":
+        pytest.skip("the CPU's promise: CUDA adds gradients up in no fixed order")
+
+
+@pytest.fixture(scope="session")
+def kernels64(device: str) -> Kernels:
+    return Kernels("float64", device)
+
+
+@pytest.fixture(scope="session")
+def kernels32(device: str) -> Kernels:
+    return Kernels("float32", device)

@@ -1,0 +1,325 @@
+"""One rendering problem in plain numbers, driven through the kernels and through the oracle."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import reference
+import torch
+import warp as wp
+from numpy.typing import NDArray
+from warpnerf_kernels import interp, precision
+
+from warpnerf.grid import CONTRACTIONS, free_struct, grid_struct
+from warpnerf.parallel import Workers
+from warpnerf.render import JACOBIANS, SCALINGS, Steps
+
+Float64 = NDArray[np.float64]
+
+N_SEEDS = 20
+
+
+def none_free() -> NDArray[np.uint8]:
+    """Free space of one cell that is occupied."""
+    return np.zeros((1, 1, 1), np.uint8)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Problem:
+    """Rays through a grid."""
+
+    raw: Float64  # [X, Y, Z, 4]
+    box_min: Float64  # [3]
+    box_max: Float64  # [3]
+    origins: Float64  # [n_rays, 3]
+    directions: Float64  # [n_rays, 3] unit
+    background: Float64  # [n_rays, 3] or [1, 3]
+    target: Float64  # [n_rays, 3]
+    adj_rgb: Float64  # [n_rays, 3]
+    adj_opacity: Float64  # [n_rays]
+    adj_depth: Float64  # [n_rays]
+    steps: Steps
+    offsets: Float64 = field(default_factory=lambda: np.array([0.5]))  # [n_rays] or [1]
+    content_distance: Float64 = field(default_factory=lambda: np.array([1.0]))  # likewise
+    contraction: str = "none"
+    border: float = 0.0
+    density_shift: float = 0.3
+    density_scale: float = 1.0
+    free: NDArray[np.uint8] = field(default_factory=none_free)  # [MX, MY, MZ] distances, cells
+
+    @property
+    def n_rays(self) -> int:
+        return len(self.origins)
+
+
+def unit(vectors: Float64) -> Float64:
+    """Vectors over their length."""
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def make_problem(
+    seed: int, n_rays: int = 12, size: tuple[int, int, int] = (5, 6, 4), **changes: Any
+) -> Problem:
+    """Random rays, half of them from inside an off-centre box, a random grid and adjoints."""
+    rng = np.random.default_rng(seed)
+    box_min, box_max = np.array([-1.0, -0.8, -1.1]), np.array([1.2, 0.9, 1.0])
+    origins = 2.0 * unit(rng.normal(size=(n_rays, 3)))
+    origins[::2] *= 0.2
+    aim = 0.5 * rng.normal(size=(n_rays, 3))
+    problem = Problem(
+        raw=rng.normal(size=(*size, 4)),
+        box_min=box_min,
+        box_max=box_max,
+        origins=origins,
+        directions=unit(aim - origins),
+        background=rng.uniform(size=(n_rays, 3)),
+        target=rng.uniform(size=(n_rays, 3)),
+        adj_rgb=rng.normal(size=(n_rays, 3)),
+        adj_opacity=rng.normal(size=n_rays),
+        adj_depth=rng.normal(size=n_rays),
+        steps=Steps(near=0.07, far=2.9, step=0.11),
+    )
+    return replace(problem, **changes)
+
+
+def unbounded(problem: Problem, contraction: str, border: float) -> Problem:
+    """The same in a contracted space, with growing steps."""
+    steps = Steps(near=0.07, far=40.0, step=0.11, n_linear=12, growth=0.09)
+    return replace(problem, contraction=contraction, border=border, steps=steps)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rendered:
+    """What rays see, in numpy."""
+
+    rgb: Float64  # [n_rays, 3]
+    opacity: Float64  # [n_rays]
+    depth: Float64  # [n_rays]
+    n_samples: NDArray[np.int32]  # [n_rays]
+
+
+class Kernels:
+    """The rendering kernels in one precision, on one device."""
+
+    def __init__(self, name: str, device: str, threads: int = 1) -> None:
+        self.workers = Workers(device, threads)
+        self.device = self.workers.device
+        self.precision = name
+        self.render = precision.load(name, "render")
+        self.types = precision.load(name, "types")
+        self.dtype = np.float64 if name == "float64" else np.float32
+
+    def module(self, name: str) -> Any:
+        """Another module of the kernels in this precision."""
+        return precision.load(self.precision, name)
+
+    def array(self, values: Any, dtype: Any = None) -> wp.array:
+        """[...] numbers, or [..., n] of a vector type, on the device."""
+        dtype = dtype or self.types.real
+        return wp.array(np.ascontiguousarray(values, self.dtype), dtype=dtype, device=self.device)
+
+    def zeros(self, n: int | tuple[int, ...], dtype: Any = None) -> wp.array:
+        return wp.zeros(n, dtype=dtype or self.types.real, device=self.device)
+
+    def grid(self, p: Problem) -> Any:
+        """The problem's grid as kernels take it."""
+        return grid_struct(
+            self.types,
+            self.array(p.raw.reshape(-1, 4), self.types.vec4),
+            (p.raw.shape[0], p.raw.shape[1], p.raw.shape[2]),
+            p.box_min,
+            p.box_max,
+            p.border,
+            p.density_shift,
+            p.density_scale,
+        )
+
+    def _scene(self, p: Problem) -> tuple[Any, ...]:
+        distance = wp.array(p.free.ravel(), dtype=wp.uint8, device=self.device)
+        size = (p.free.shape[0], p.free.shape[1], p.free.shape[2])
+        free = free_struct(self.types, distance, size, p.border)
+        return self.grid(p), free, p.steps.struct(self.types)
+
+    def _rays(self, p: Problem) -> tuple[wp.array, ...]:
+        vec3 = self.types.vec3
+        return (
+            self.array(p.origins, vec3),
+            self.array(p.directions, vec3),
+            self.array(p.offsets),
+            self.array(p.background, vec3),
+        )
+
+    def variant(self, p: Problem, scaling: str = "none", jacobian: str = "none") -> Any:
+        return self.render.Variant(
+            CONTRACTIONS[p.contraction], SCALINGS[scaling], JACOBIANS[jacobian]
+        )
+
+    def kept(self, n: int) -> wp.array:
+        return wp.empty(n, dtype=self.types.Sample, device=self.device)
+
+    def _forward(self, p: Problem) -> tuple[wp.array, ...]:
+        n = p.n_rays
+        out = (
+            self.zeros(n, self.types.vec3),
+            self.zeros(n),
+            self.zeros(n),
+            self.zeros(n, wp.int32),
+        )
+        kernel = self.render.render_forward_kernel(self.variant(p))
+        self.workers.launch(kernel, n, *self._scene(p), *self._rays(p), self.kept(0), *out)
+        return out
+
+    def forward(self, p: Problem) -> Rendered:
+        """Render."""
+        rgb, transmittance, depth, n_samples = self._forward(p)
+        return Rendered(
+            rgb=rgb.numpy(),
+            opacity=1.0 - transmittance.numpy(),
+            depth=depth.numpy(),
+            n_samples=n_samples.numpy(),
+        )
+
+    def backward(self, p: Problem, scaling: str = "none", jacobian: str = "none") -> Float64:
+        """The gradient [X, Y, Z, 4] of the outputs' product with the problem's adjoints."""
+        gradients = self.zeros((self.workers.count, p.raw[..., 0].size), self.types.vec4)
+        touched = self.touched(gradients.shape[1])
+        self.workers.launch_owned(
+            self.render.render_backward_kernel(self.variant(p, scaling, jacobian)),
+            p.n_rays,
+            *self._scene(p),
+            *self._rays(p),
+            self.array(p.content_distance),
+            *self._forward(p),
+            self.array(p.adj_rgb, self.types.vec3),
+            self.array(p.adj_opacity),
+            self.array(p.adj_depth),
+            self.kept(0),
+            gradients,
+            touched,
+        )
+        return total_gradient(gradients, touched).reshape(p.raw.shape)
+
+    def touched(self, n_nodes: int, value: int = 0) -> wp.array:
+        """Flags of the tiles of nodes that have a gradient."""
+        n_tiles = -(-n_nodes // interp.TILE)
+        return wp.full(n_tiles, value, dtype=wp.uint8, device=self.device)
+
+    def train(
+        self, p: Problem, scaling: str = "none", jacobian: str = "none", capacity: int = 64
+    ) -> tuple[Float64, Float64]:
+        """Squared errors [n_rays], and the gradient [X, Y, Z, 4] of their mean."""
+        workers = self.workers
+        error, n_samples = self.zeros(p.n_rays), self.zeros(p.n_rays, wp.int32)
+        gradients = self.zeros((workers.count, p.raw[..., 0].size), self.types.vec4)
+        touched = self.touched(gradients.shape[1])
+        capacity = 0 if self.device.is_cuda else capacity
+        workers.launch_owned(
+            self.render.render_train_kernel(self.variant(p, scaling, jacobian)),
+            p.n_rays,
+            *self._scene(p),
+            *self._rays(p),
+            self.array(p.content_distance),
+            self.array(p.target, self.types.vec3),
+            1.0 / p.n_rays,
+            capacity,
+            self.kept(workers.count * capacity),
+            error,
+            n_samples,
+            gradients,
+            touched,
+        )
+        return error.numpy(), total_gradient(gradients, touched).reshape(p.raw.shape)
+
+
+def total_gradient(gradients: wp.array, touched: wp.array) -> Float64:
+    """The sum over workers [n_nodes, 4]; every tile that holds some of it must be flagged."""
+    rows = gradients.numpy()
+    nodes = np.flatnonzero(rows.any(axis=(0, 2)))
+    assert touched.numpy()[nodes // interp.TILE].all()
+    return np.asarray(rows.sum(axis=0))
+
+
+def oracle(
+    p: Problem, raw: torch.Tensor, scaling: str = "none", jacobian: str = "none"
+) -> reference.Rendering:
+    """The same problem in the reference, raw a tensor that may want a gradient."""
+    n_steps = 1
+    while last_edge(p.steps, n_steps) < min(p.steps.far, 50.0):
+        n_steps += 1
+    offsets, content = torch.tensor(p.offsets), torch.tensor(p.content_distance)
+    return reference.render(
+        raw,
+        torch.tensor(p.origins),
+        torch.tensor(p.directions),
+        box_min=torch.tensor(p.box_min),
+        box_max=torch.tensor(p.box_max),
+        near=p.steps.near,
+        far=p.steps.far,
+        step=p.steps.step,
+        n_steps=n_steps,
+        growth=p.steps.growth,
+        n_linear=p.steps.n_linear,
+        offset=offsets.expand(p.n_rays),
+        norm=p.contraction,
+        border=p.border,
+        density_shift=p.density_shift,
+        density_scale=p.density_scale,
+        background=torch.tensor(p.background).expand(p.n_rays, 3),
+        mask=torch.tensor(p.free == 0),
+        transmittance_min=p.steps.transmittance_min,
+        scaling=scaling,
+        content_distance=content.expand(p.n_rays),
+        jacobian=jacobian,
+    )
+
+
+def last_edge(steps: Steps, k: int) -> float:
+    """Where step k begins."""
+    if steps.growth == 0.0 or k <= steps.n_linear:
+        return steps.near + k * steps.step
+    linear = steps.near + steps.n_linear * steps.step
+    return float(linear * (1.0 + steps.growth) ** (k - steps.n_linear))
+
+
+def oracle_gradient(p: Problem, scaling: str = "none", jacobian: str = "none") -> Float64:
+    """What Kernels.backward must return."""
+    raw = torch.tensor(p.raw, requires_grad=True)
+    out = oracle(p, raw, scaling, jacobian)
+    adjoints = [torch.tensor(a) for a in (p.adj_rgb, p.adj_opacity, p.adj_depth)]
+    (gradient,) = torch.autograd.grad([out.rgb, out.opacity, out.depth], raw, adjoints)
+    return gradient.numpy()
+
+
+def oracle_train(
+    p: Problem, scaling: str = "none", jacobian: str = "none"
+) -> tuple[Float64, Float64]:
+    """What Kernels.train must return."""
+    raw = torch.tensor(p.raw, requires_grad=True)
+    out = oracle(p, raw, scaling, jacobian)
+    target = torch.tensor(p.target)
+    (gradient,) = torch.autograd.grad(reference.photometric_loss(out.rgb, target), raw)
+    return ((out.rgb - target) ** 2).sum(-1).detach().numpy(), gradient.numpy()
+
+
+def directional_differences(
+    f: Callable[[Float64], float], x: Float64, directions: Float64, h: float = 1e-4
+) -> Float64:
+    """Central differences of f at x along directions [n, *x.shape], to order h^4: [n]."""
+
+    def difference(d: Float64, h: float) -> float:
+        return (f(x + h * d) - f(x - h * d)) / (2.0 * h)
+
+    return np.array([(4.0 * difference(d, h) - difference(d, 2.0 * h)) / 3.0 for d in directions])
+
+
+def assert_close(value: Any, expected: Any, tolerance: float) -> None:
+    """Elementwise error over the largest entry, and the angle; the expected must say something."""
+    value, expected = np.asarray(value, np.float64), np.asarray(expected, np.float64)
+    assert value.shape == expected.shape
+    largest = np.abs(expected).max()
+    assert largest > 1e-6, "the reference is next to zero: a comparison with it shows nothing"
+    error = np.abs(value - expected).max() / largest
+    assert error <= tolerance, f"relative error {error:.3g} > {tolerance:.3g}"
+    cosine = np.vdot(value, expected) / (np.linalg.norm(value) * np.linalg.norm(expected))
+    assert cosine >= 1.0 - max(tolerance, 1e-12)

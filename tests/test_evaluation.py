@@ -1,0 +1,106 @@
+"""Figures of views whose truth is known because the field itself made it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tiny_fields import tiny_field
+from tiny_scenes import camera_at, ring
+
+from warpnerf.checks import InputError
+from warpnerf.evaluation import evaluate
+from warpnerf.field import Field
+from warpnerf.scene import Scene, View
+
+SIZE = {"width": 16, "height": 12, "fx": 14.0, "fy": 14.0, "cx": 8.0, "cy": 6.0}
+
+
+def scene_of(field: Field, *, depth: bool) -> Scene:
+    """What the field looks like, as photographs."""
+    views = []
+    for i, pose in enumerate(ring(4)):
+        camera = camera_at(pose, **SIZE)
+        seen = field.render(camera)
+        views.append(
+            View(
+                name=f"images/{i}.png",
+                camera=camera,
+                image=np.round(seen.rgb * 255.0).astype(np.uint8),
+                depth=seen.depth + np.float32(0.25) if depth else None,
+            )
+        )
+    return Scene(
+        name="mirror",
+        views=views,
+        splits={"train": (0, 1, 2), "test": (3,)},
+        box_min=field.grid.box_min,
+        box_max=field.grid.box_max,
+        unbounded=False,
+        content_distance=3.0,
+    )
+
+
+def test_a_field_scores_well_on_its_own_pictures() -> None:
+    field = tiny_field()
+    result = evaluate(field, scene_of(field, depth=True), split="all")
+    assert [image.name for image in result.images] == [f"images/{i}.png" for i in range(4)]
+    # Rounding to 8 bits: an error of 1/255/sqrt(12) rms, 58.9 dB.
+    assert result.mean["psnr"] == pytest.approx(58.9, abs=1.5)
+    assert result.mean["ssim"] > 0.999
+    assert result.mean["depth_error"] == pytest.approx(0.25, abs=1e-5)
+
+
+def test_another_picture_scores_worse() -> None:
+    field = tiny_field()
+    scene = scene_of(field, depth=False)
+    wrong = replace(scene.views[3], image=255 - scene.views[3].image)
+    result = evaluate(field, replace(scene, views=[*scene.views[:3], wrong]))
+    assert result.mean["psnr"] < 20.0
+
+
+def test_json_has_the_promised_form() -> None:
+    field = tiny_field()
+    without = json.loads(evaluate(field, scene_of(field, depth=False)).to_json())
+    assert list(without) == ["mean", "images"]
+    assert list(without["mean"]) == ["psnr", "ssim"]
+    assert [list(image) for image in without["images"]] == [["name", "psnr", "ssim"]]
+    assert without["mean"]["psnr"] == without["images"][0]["psnr"]
+    known = json.loads(evaluate(field, scene_of(field, depth=True)).to_json())
+    assert list(known["mean"]) == ["psnr", "ssim", "depth_error"]
+
+
+def test_alpha_is_seen_over_the_background_of_the_field() -> None:
+    field = tiny_field()
+    scene = scene_of(field, depth=False)
+    rng = np.random.default_rng(0)
+    cut_out = rng.integers(0, 256, (12, 16, 4), dtype=np.uint8)
+    shown = []
+    evaluate(
+        field,
+        replace(scene, views=[*scene.views[:3], replace(scene.views[3], image=cut_out)]),
+        on_image=lambda view, truth, rendering: shown.append((view.name, truth, rendering)),
+    )
+    (name, truth, rendering) = shown[0]
+    alpha = cut_out[..., 3:] / 255.0
+    expected = cut_out[..., :3] / 255.0 * alpha + np.array([0.1, 0.6, 0.9]) * (1.0 - alpha)
+    assert name == "images/3.png"
+    assert rendering.rgb.shape == (12, 16, 3)
+    np.testing.assert_allclose(truth, expected, atol=1e-12)
+
+
+def test_the_table_names_every_image_and_the_mean() -> None:
+    field = tiny_field()
+    table = str(evaluate(field, scene_of(field, depth=True), split="train")).splitlines()
+    assert len(table) == 5
+    assert "PSNR" in table[0]
+    assert [line.split()[0] for line in table[1:4]] == [f"images/{i}.png" for i in range(3)]
+    assert table[4].startswith("mean")
+
+
+def test_a_missing_split_is_named_with_those_that_exist() -> None:
+    field = tiny_field()
+    with pytest.raises(InputError, match=r"mirror.*'val'.*test, train"):
+        evaluate(field, scene_of(field, depth=False), split="val")

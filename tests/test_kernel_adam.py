@@ -1,0 +1,91 @@
+"""The optimiser step against the oracle."""
+
+from typing import Any
+
+import numpy as np
+import reference
+import torch
+from drive import N_SEEDS, Kernels
+from warpnerf_kernels.interp import TILE
+
+RATE = np.array([0.2, 0.1, 0.05, 0.02])
+BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-4
+
+
+def step(
+    kernels: Kernels,
+    number: int,
+    gradients: Any,
+    values: Any,
+    mean: Any,
+    square: Any,
+    span: int = TILE,
+    flags: Any = None,
+) -> tuple[Any, Any, Any, Any]:
+    vec4 = kernels.types.vec4
+    touched = kernels.touched(len(values), 1)
+    if flags is not None:
+        touched.assign(np.asarray(flags, np.uint8))
+    arrays = [kernels.array(a, vec4) for a in (gradients, values, mean, square)]
+    kernels.workers.launch(
+        kernels.module("adam").adam_step,
+        -(-len(values) // span),
+        span,
+        vec4(*RATE),
+        BETA1,
+        BETA2,
+        EPSILON,
+        1.0 / (1.0 - BETA1**number),
+        1.0 / (1.0 - BETA2**number),
+        touched,
+        *arrays,
+    )
+    gradients, values, mean, square = (a.numpy() for a in arrays)
+    return gradients, values, mean, square
+
+
+def test_against_the_oracle_skipping_exact_zeros(kernels64: Kernels) -> None:
+    for seed in range(N_SEEDS):
+        rng = np.random.default_rng(seed)
+        state = [rng.normal(size=(30, 4)), np.zeros((30, 4)), np.zeros((30, 4))]
+        expected = [torch.tensor(s) for s in state]
+        for number in range(1, 6):
+            gradients = rng.normal(size=(3, 30, 4)) * 10.0 ** rng.uniform(-7, 0, size=(1, 30, 4))
+            gradients[:, rng.uniform(size=(30, 4)) < 0.3] = 0.0
+            gradients[:, :3] = 0.0  # whole nodes as well
+            total = torch.tensor(gradients[0] + gradients[1] + gradients[2])
+            before = state
+            after, *state = step(kernels64, number, gradients, *state)
+            assert not after.any()
+            expected = list(
+                reference.adam(*expected, total, number, torch.tensor(RATE), BETA1, BETA2, EPSILON)
+            )
+            still = total.numpy() == 0.0
+            assert still.any() and not still.all()
+            for new, old, exact in zip(state, before, expected, strict=True):
+                np.testing.assert_allclose(new, exact, rtol=1e-12, atol=1e-300)
+                assert np.array_equal(new[still], old[still])
+                assert (new[~still] != old[~still]).all()
+
+
+def test_gradients_that_cancel_between_workers_are_zeroed_too(kernels64: Kernels) -> None:
+    gradients = np.zeros((2, 5, 4))
+    gradients[0, 1, 2], gradients[1, 1, 2] = 0.7, -0.7
+    values = np.ones((5, 4))
+    after, new, mean, square = step(kernels64, 1, gradients, values, 0 * values, 0 * values)
+    assert np.array_equal(new, values) and not mean.any() and not square.any()
+    assert not after.any()
+
+
+def test_tiles_that_are_not_flagged_are_passed_over(kernels64: Kernels) -> None:
+    rng = np.random.default_rng(4)
+    gradients, values = rng.normal(size=(2, 100, 4)), rng.normal(size=(100, 4))
+    full = step(kernels64, 1, gradients, values, 0 * values, 0 * values)
+    flags = np.arange(7) % 3 != 1
+    flagged = np.repeat(flags, TILE)[:100]
+    for span in (1, TILE):
+        found = step(kernels64, 1, gradients, values, 0 * values, 0 * values, span, flags)
+        assert np.array_equal(found[1][flagged], full[1][flagged])
+        assert np.array_equal(found[1][~flagged], values[~flagged])
+        assert not found[0][:, flagged].any()
+        assert np.array_equal(found[0][:, ~flagged], gradients[:, ~flagged])

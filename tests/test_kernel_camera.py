@@ -1,0 +1,171 @@
+"""Rays of cameras with lens distortion, and batches of random pixels."""
+
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import reference
+import warp as wp
+from drive import Kernels, unit
+
+LENSES: list[dict[str, float]] = [
+    {},
+    {"k1": -0.12, "k2": 0.03},
+    {"k1": 0.08, "k2": -0.02, "p1": 1e-3, "p2": -2e-3, "k3": 0.004},
+    {"p1": 4e-3},
+    {"p2": -5e-3},
+    {"k3": 0.03},
+]
+FX, FY, CX, CY, WIDTH, HEIGHT = 62.0, 58.0, 41.0, 29.6, 80, 60
+
+
+def pose(seed: int) -> Any:
+    rng = np.random.default_rng(seed)
+    rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    rotation *= np.sign(np.linalg.det(rotation))
+    return np.concatenate([rotation, rng.normal(size=(3, 1))], axis=1)
+
+
+def view(kernels: Kernels, c2w: Any, lens: dict[str, float], **changes: Any) -> Any:
+    types, view = kernels.types, kernels.module("camera").View()
+    view.rotation = types.mat33(*c2w[:, :3].ravel())
+    view.position = types.vec3(*c2w[:, 3])
+    view.focal = types.vec2(FX, FY)
+    view.principal = types.vec2(CX, CY)
+    view.radial = types.vec3(*(lens.get(k, 0.0) for k in ("k1", "k2", "k3")))
+    view.tangential = types.vec2(lens.get("p1", 0.0), lens.get("p2", 0.0))
+    view.width = WIDTH
+    view.first_pixel = 0
+    for name, value in changes.items():
+        setattr(view, name, value)
+    return view
+
+
+def rays(kernels: Kernels, c2w: Any, lens: dict[str, float]) -> tuple[Any, Any]:
+    n, vec3 = WIDTH * HEIGHT, kernels.types.vec3
+    origins, directions = kernels.zeros(n, vec3), kernels.zeros(n, vec3)
+    kernels.workers.launch(
+        kernels.module("camera").camera_rays, n, view(kernels, c2w, lens), origins, directions
+    )
+    shape = (HEIGHT, WIDTH, 3)
+    return origins.numpy().reshape(shape), directions.numpy().reshape(shape)
+
+
+def expected_rays(c2w: Any, lens: dict[str, float]) -> tuple[Any, Any]:
+    v, u = np.meshgrid(np.arange(HEIGHT), np.arange(WIDTH), indexing="ij")
+    return reference.pinhole_rays(FX, FY, CX, CY, c2w, u, v, **lens)
+
+
+@pytest.mark.parametrize("lens", LENSES, ids=str)
+def test_rays_against_the_oracle(lens: dict[str, float], kernels64: Kernels) -> None:
+    c2w = pose(len(lens))
+    origins, directions = rays(kernels64, c2w, lens)
+    expected = expected_rays(c2w, lens)
+    np.testing.assert_allclose(origins, expected[0], rtol=1e-15)
+    np.testing.assert_allclose(directions, expected[1], rtol=0, atol=1e-12)
+    if lens:
+        plain = expected_rays(c2w, {})[1]
+        assert np.abs(plain - expected[1]).max() > 1e-3
+
+
+@pytest.mark.parametrize("lens", LENSES, ids=str)
+def test_rays_against_opencv(lens: dict[str, float], kernels64: Kernels) -> None:
+    """projectPoints brings a point on each ray back to the pixel centre."""
+    c2w = pose(9)
+    in_camera = rays(kernels64, c2w, lens)[1].reshape(-1, 3) @ c2w[:, :3]
+    matrix = np.array([[FX, 0, CX], [0, FY, CY], [0, 0, 1]])
+    vector = np.array([lens.get(k, 0.0) for k in ("k1", "k2", "p1", "p2", "k3")])
+    points = 3.0 * in_camera * [1.0, -1.0, -1.0]
+    back = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, vector)[0].reshape(-1, 2)
+    v, u = np.divmod(np.arange(WIDTH * HEIGHT), WIDTH)
+    np.testing.assert_allclose(back, np.stack([u, v], axis=-1) + 0.5, rtol=0, atol=1e-8)
+
+
+def test_float32_rays(kernels32: Kernels) -> None:
+    for lens in LENSES:
+        directions = rays(kernels32, pose(3), lens)[1]
+        np.testing.assert_allclose(directions, expected_rays(pose(3), lens)[1], rtol=0, atol=1e-6)
+        np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1.0, atol=3e-7)
+
+
+def draw(
+    kernels: Kernels, n: int, seed: int, background: Any, mode: int, jitter: int
+) -> dict[str, Any]:
+    """Pixels of three views; the red and green of each pixel say which one it is."""
+    types, camera = kernels.types, kernels.module("camera")
+    views, pixels = [], []
+    for number in range(3):
+        first = number * WIDTH * HEIGHT
+        views.append(view(kernels, pose(number), LENSES[2], first_pixel=first))
+        v, u = np.divmod(np.arange(WIDTH * HEIGHT), WIDTH)
+        alpha = np.full_like(u, 255 if number == 0 else 51)
+        pixels.append(np.stack([u, v, 100 * np.full_like(u, number), alpha], axis=-1))
+    vec3, real = types.vec3, types.real
+    out = {
+        "origins": kernels.zeros(n, vec3),
+        "directions": kernels.zeros(n, vec3),
+        "offsets": kernels.zeros(n, real),
+        "background": kernels.zeros(n, vec3),
+        "content_distance": kernels.zeros(n, real),
+        "target": kernels.zeros(n, vec3),
+    }
+    kernels.workers.launch(
+        camera.sample_pixels,
+        n,
+        wp.array(views, dtype=camera.View, device=kernels.device),
+        wp.array(np.concatenate(pixels).astype(np.uint8), dtype=wp.vec4ub, device=kernels.device),
+        kernels.array([2.0, 3.0, 5.0]),
+        seed,
+        vec3(*background),
+        mode,
+        jitter,
+        *out.values(),
+    )
+    return {name: value.numpy() for name, value in out.items()}
+
+
+def test_sampled_pixels_are_their_rays(kernels64: Kernels) -> None:
+    black = draw(kernels64, 5000, 7, (0.0, 0.0, 0.0), 0, 0)
+    white = draw(kernels64, 5000, 7, (1.0, 1.0, 1.0), 0, 0)
+    assert (black["offsets"] == 0.5).all()
+    assert (black["background"] == 0.0).all() and (white["background"] == 1.0).all()
+    number = np.searchsorted([2.0, 3.0, 5.0], black["content_distance"])
+    counts = np.bincount(number, minlength=3)
+    assert (np.abs(counts - 5000 / 3) < 200).all()
+    alpha = np.where(number == 0, 1.0, 0.2)[:, None]
+    np.testing.assert_allclose(white["target"] - black["target"], np.tile(1 - alpha, 3), atol=1e-12)
+    pixel = black["target"] / alpha * 255.0
+    np.testing.assert_allclose(pixel[:, 2], 100 * number, atol=1e-9)
+    u, v = pixel[:, 0].round().astype(int), pixel[:, 1].round().astype(int)
+    assert len(np.unique(number * WIDTH * HEIGHT + v * WIDTH + u)) > 4000
+    for k in range(3):
+        of_view = number == k
+        origins, directions = expected_rays(pose(k), LENSES[2])
+        at = v[of_view], u[of_view]
+        np.testing.assert_allclose(black["origins"][of_view], origins[at], rtol=1e-14)
+        np.testing.assert_allclose(black["directions"][of_view], directions[at], atol=1e-12)
+
+
+def test_random_background_and_jitter(kernels64: Kernels) -> None:
+    drawn = draw(kernels64, 5000, 11, (0.0, 0.0, 0.0), 1, 1)
+    for values in (*drawn["background"].T, drawn["offsets"]):
+        assert values.min() >= 0.0 and values.max() < 1.0
+        assert abs(values.mean() - 0.5) < 0.02 and abs(values.std() - 12**-0.5) < 0.01
+    together = np.corrcoef(np.column_stack([drawn["background"], drawn["offsets"]]).T)
+    assert np.abs(together - np.eye(4)).max() < 0.06
+    # a pixel with alpha shows its own ray's background
+    number = np.searchsorted([2.0, 3.0, 5.0], drawn["content_distance"])
+    see_through = number == 1
+    blue = drawn["target"][see_through, 2]
+    expected = 0.2 * 100 / 255 + 0.8 * drawn["background"][see_through, 2]
+    np.testing.assert_allclose(blue, expected, atol=1e-12)
+
+
+def test_a_batch_is_a_function_of_its_seed(kernels32: Kernels) -> None:
+    one, same = (draw(kernels32, 300, 5, (0.0, 0.0, 0.0), 1, 1) for _ in range(2))
+    other = draw(kernels32, 300, 6, (0.0, 0.0, 0.0), 1, 1)
+    for name in one:
+        assert np.array_equal(one[name], same[name])
+    assert not np.array_equal(one["directions"], other["directions"])
+    assert np.allclose(unit(one["directions"]), one["directions"], atol=1e-6)

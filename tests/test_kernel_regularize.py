@@ -1,0 +1,118 @@
+"""Total variation and its adjoint."""
+
+from typing import Any
+
+import numpy as np
+import reference
+import torch
+import warp as wp
+from drive import N_SEEDS, Kernels, assert_close, directional_differences
+from warpnerf_kernels.interp import TILE
+
+
+def problem(seed: int) -> tuple[Any, Any]:
+    """A grid with differences on both sides of 1, and weights that differ by channel."""
+    rng = np.random.default_rng(seed)
+    size = rng.integers(2, 6, size=3)
+    return rng.normal(size=(*size, 4)), rng.uniform(0.5, 2.0, size=4)
+
+
+def variation(kernels: Kernels, values: Any, weight: Any) -> float:
+    n = values[..., 0].size
+    out = kernels.zeros(n)
+    kernels.workers.launch(
+        kernels.module("regularize").total_variation_forward,
+        n,
+        kernels.array(values.reshape(-1, 4), kernels.types.vec4),
+        wp.vec3i(*values.shape[:3]),
+        kernels.types.vec4(*weight),
+        out,
+    )
+    return float(out.numpy().sum())
+
+
+def adj_variation(
+    kernels: Kernels, values: Any, weight: Any, gradients: Any, span: int = TILE, flags: Any = None
+) -> Any:
+    """gradients [n_workers, n_nodes, 4], with the gradient of total variation added."""
+    n = values[..., 0].size
+    touched = kernels.touched(n, 1)
+    if flags is not None:
+        touched.assign(np.asarray(flags, np.uint8))
+    out = kernels.array(gradients, kernels.types.vec4)
+    kernels.workers.launch(
+        kernels.module("regularize").total_variation_backward,
+        -(-n // span),
+        span,
+        kernels.array(values.reshape(-1, 4), kernels.types.vec4),
+        wp.vec3i(*values.shape[:3]),
+        kernels.types.vec4(*weight),
+        touched,
+        out,
+    )
+    return out.numpy()
+
+
+def test_value_and_adjoint_against_the_oracle(kernels64: Kernels) -> None:
+    for seed in range(N_SEEDS):
+        values, weight = problem(seed)
+        raw = torch.tensor(values, requires_grad=True)
+        expected = reference.total_variation(raw, torch.tensor(weight))
+        assert_close(variation(kernels64, values, weight), expected.item(), 1e-13)
+        (gradient,) = torch.autograd.grad(expected, raw)
+        steps = np.concatenate([np.abs(np.diff(values, axis=a)).ravel() for a in range(3)])
+        assert (steps < 1.0).any() and (steps > 1.0).any()
+        already = np.random.default_rng(seed).normal(size=(1, values[..., 0].size, 4))
+        added = adj_variation(kernels64, values, weight, already) - already
+        assert_close(added.reshape(values.shape), gradient, 1e-12)
+
+
+def test_adjoint_against_central_differences(kernels64: Kernels) -> None:
+    for seed in range(N_SEEDS):
+        values, weight = problem(seed)
+        directions = np.random.default_rng(seed).normal(size=(5, *values.shape))
+        # A small h: the slope of huber has a kink at 1, which few pairs may cross.
+        expected = directional_differences(
+            lambda v, weight=weight: variation(kernels64, v, weight), values, directions, h=1e-6
+        )
+        ones = np.ones((1, values[..., 0].size, 4))
+        added = (adj_variation(kernels64, values, weight, ones) - ones).reshape(values.shape)
+        assert_close(np.tensordot(directions, added, axes=4), expected, 1e-7)
+
+
+def test_only_nodes_with_a_gradient_are_touched(kernels64: Kernels) -> None:
+    """A node counts as touched when any worker has a gradient in any channel there."""
+    for seed in range(N_SEEDS):
+        values, weight = problem(seed)
+        n = values[..., 0].size
+        rng = np.random.default_rng(seed)
+        gradients = np.zeros((2, n, 4))
+        touched = rng.uniform(size=n) < 0.5
+        touched[0] = True
+        for node in np.flatnonzero(touched):
+            gradients[rng.integers(2), node, rng.integers(4)] = rng.normal()
+        full = adj_variation(kernels64, values, weight, np.ones((1, n, 4)))[0] - 1.0
+        after = adj_variation(kernels64, values, weight, gradients)
+        assert np.array_equal(after[1], gradients[1])
+        assert np.array_equal(after[0, ~touched], gradients[0, ~touched])
+        assert_close(after[0, touched] - gradients[0, touched], full[touched], 1e-12)
+
+
+def test_tiles_that_are_not_flagged_are_passed_over(kernels64: Kernels) -> None:
+    rng = np.random.default_rng(3)
+    values, weight = rng.normal(size=(4, 5, 7, 4)), np.ones(4)
+    ones = np.ones((1, 140, 4))
+    full = adj_variation(kernels64, values, weight, ones)[0]
+    flags = np.arange(9) % 3 != 1
+    flagged = np.repeat(flags, TILE)[:140]
+    for span in (1, TILE):
+        after = adj_variation(kernels64, values, weight, ones, span, flags)[0]
+        assert np.array_equal(after[flagged], full[flagged])
+        assert (after[~flagged] == 1.0).all()
+
+
+def test_a_flat_grid_has_none(kernels64: Kernels) -> None:
+    flat = np.full((3, 4, 5, 4), 0.7)
+    assert variation(kernels64, flat, np.ones(4)) == 0.0
+    ones = np.ones((1, 60, 4))
+    assert np.array_equal(adj_variation(kernels64, flat, np.ones(4), ones), ones)

@@ -1,0 +1,65 @@
+"""PSNR by hand, SSIM against scikit-image."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from skimage.metrics import structural_similarity
+
+from warpnerf.checks import InputError
+from warpnerf.metrics import psnr, ssim
+
+
+def images(seed: int, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    truth = rng.random((height, width, 3))
+    return np.clip(truth + rng.normal(0.0, 0.1 * (seed + 1), truth.shape), 0.0, 1.0), truth
+
+
+def test_psnr_of_a_known_error() -> None:
+    truth = np.full((4, 5, 3), 0.5)
+    assert psnr(truth + 0.1, truth) == pytest.approx(20.0, abs=1e-9)
+
+
+@pytest.mark.parametrize(("height", "width"), [(11, 11), (13, 40), (48, 31)])
+@pytest.mark.parametrize("seed", range(3))
+def test_ssim_is_that_of_scikit_image(seed: int, height: int, width: int) -> None:
+    rgb, truth = images(seed, height, width)
+    expected = structural_similarity(
+        rgb,
+        truth,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1.0,
+        channel_axis=2,
+    )
+    assert expected < 0.99
+    assert ssim(rgb, truth) == pytest.approx(expected, abs=1e-6)
+    assert ssim(rgb.astype(np.float32), truth) == pytest.approx(expected, abs=1e-6)
+
+
+def test_equal_images_are_alike() -> None:
+    rgb, _ = images(0, 16, 16)
+    assert ssim(rgb, rgb) == pytest.approx(1.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("metric", [psnr, ssim])
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@pytest.mark.parametrize("which", [0, 1])
+def test_not_finite_is_refused(metric, bad: float, which: int) -> None:
+    pair = [np.zeros((12, 12, 3)), np.zeros((12, 12, 3))]
+    pair[which][3, 4, 1] = bad
+    with pytest.raises(InputError, match="finite"):
+        metric(*pair)
+
+
+@pytest.mark.parametrize("metric", [psnr, ssim])
+def test_differing_shapes_are_refused(metric) -> None:
+    with pytest.raises(InputError, match=r"12, 12, 3.*12, 13, 3"):
+        metric(np.zeros((12, 12, 3)), np.zeros((12, 13, 3)))
+
+
+def test_ssim_refuses_what_is_smaller_than_its_window() -> None:
+    with pytest.raises(InputError, match="11 x 11"):
+        ssim(np.zeros((10, 30, 3)), np.zeros((10, 30, 3)))
