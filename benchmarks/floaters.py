@@ -56,6 +56,7 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--output", type=Path, default=RESULTS)
     arguments = parser.parse_args()
+    arguments.output.mkdir(parents=True, exist_ok=True)
     scene = wn.load_scene("builtin:room", downscale=arguments.downscale)
     print("scaling   steps   PSNR    SSIM  depth error [m]  density before any surface")
     rows = {}
@@ -84,7 +85,8 @@ def main() -> None:
         "time_limit": arguments.time_limit,
         **rows,
     }
-    path = write_record(record, arguments.output, "floaters", arguments.device)
+    name = f"floaters_{arguments.device.replace(':', '')}.json"
+    path = write_record(record, arguments.output / name, "floaters", arguments.device)
     print(f"wrote {path}")
 
 

@@ -111,7 +111,9 @@ def test_a_run_is_not_written_over_unasked(trained: tuple[Path, str]) -> None:
 
 def test_overwrite_replaces_a_run(tmp_path: Path) -> None:
     (tmp_path / "test").mkdir()
-    for name in ("config.json", "log.jsonl", "metrics.json", "test/old.png"):
+    older = {"scene": "builtin:room", "downscale": 8, "content_distance": 1.0, "train": {}}
+    (tmp_path / "config.json").write_text(json.dumps(older))
+    for name in ("log.jsonl", "metrics.json", "test/old.png"):
         (tmp_path / name).write_text("older")
     code, _, err = run("train", *TINY, "--steps", "3", "--output", tmp_path, "--overwrite")
     assert code == 0, err

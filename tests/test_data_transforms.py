@@ -31,8 +31,8 @@ def test_tiny_scene_is_loaded(tmp_path: Path) -> None:
     assert scene.splits == {"train": (1, 2, 3, 4, 5, 6, 7), "test": (0, 8)}
     assert scene.unbounded
     assert scene.content_distance == pytest.approx(np.sqrt(10.0))
-    np.testing.assert_allclose(scene.box_min, -0.5 * np.sqrt(10.0))
-    np.testing.assert_allclose(scene.box_max, 0.5 * np.sqrt(10.0))
+    np.testing.assert_allclose(scene.box_min, -0.75 * np.sqrt(10.0))
+    np.testing.assert_allclose(scene.box_max, 0.75 * np.sqrt(10.0))
     for i, view in enumerate(scene.views):
         np.testing.assert_array_equal(view.image, picture(i))
         np.testing.assert_allclose(view.camera.c2w, content["frames"][i]["transform_matrix"][:3])

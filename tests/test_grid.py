@@ -89,6 +89,8 @@ def test_grid_size_makes_cubes() -> None:
 def test_a_grid_larger_than_memory() -> None:
     require_memory((10, 10, 10), 4)
     with pytest.raises(InputError, match=r"grid\.voxels: a grid of .* use fewer voxels"):
+        require_memory((1200, 1200, 1200), 400)
+    with pytest.raises(InputError, match=r"grid\.voxels must give fewer than 2\^31 nodes"):
         require_memory((20000, 20000, 20000), 4)
 
 

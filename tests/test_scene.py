@@ -111,7 +111,7 @@ def test_notes_say_how() -> None:
     assert notes[0] == (
         "content distance 3.16: median depth of the point that the training cameras look at"
     )
-    assert notes[1].startswith("box of edge 3.16: 0.5 of the content distance")
+    assert notes[1].startswith("box of edge 4.74: 0.75 of the content distance")
 
 
 @pytest.mark.parametrize("n", [0, 1])

@@ -97,7 +97,22 @@ def _field(
     header: dict[str, Any], tensors: dict[str, np.ndarray], path: Path, workers: Workers
 ) -> Field:
     values, free = tensors["values"], tensors["free_distance"]
-    if header["contraction"] not in CONTRACTIONS or not np.isfinite(values).all():
+    numbers = [*header["box_min"], *header["box_max"], *header["steps"].values()]
+    whole = (
+        header["contraction"] in CONTRACTIONS
+        and values.ndim == 4
+        and values.shape[3] == 4
+        and min(values.shape[:3]) >= 2
+        and values.dtype == np.float32
+        and free.ndim == 3
+        and free.size > 0
+        and free.dtype == np.uint8
+        and 0.0 <= header["border"] <= 1.0
+        and header["steps"]["step"] > 0.0
+        and np.isfinite(numbers).all()
+        and np.isfinite(values).all()
+    )
+    if not whole:
         raise InputError(f"{path} holds values that cannot be rendered; train again.")
     grid = VoxelGrid(
         values=wp.array(values.reshape(-1, 4), dtype=vec4, device=workers.device),

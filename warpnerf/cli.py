@@ -87,7 +87,7 @@ def eval_command(
 
     Args:
         folder: Output folder of a training run.
-        scene: Other photographs in the same coordinates.
+        scene: Other photographs in the same coordinates, reduced as those of the training were.
         split: Which views.
         json: Also write the figures to this file.
         device: cpu, cuda, cuda:1, ...
@@ -95,13 +95,16 @@ def eval_command(
     """
     from warpnerf.checkpoint import write_atomically
     from warpnerf.data import load_scene
-    from warpnerf.evaluation import evaluate
+    from warpnerf.evaluation import evaluate, require_measurable
     from warpnerf.run import Run
 
+    if json is not None and not json.parent.is_dir():
+        raise InputError(f"--json {json}: its folder does not exist; make it first.")
     run = Run(folder)
     config = run.read_config()
     field = run.load_field(device, threads)
     views = load_scene(scene or config["scene"], downscale=config["downscale"])
+    require_measurable(views, split)
     result = evaluate(field, views, split)
     print(result)
     if json is not None:
@@ -115,7 +118,7 @@ def eval_command(
 def _train(source: str, output: Path, downscale: int, config: TrainConfig, overwrite: bool) -> int:
     from warpnerf.data import load_scene
     from warpnerf.evaluation import require_measurable
-    from warpnerf.run import Run, depth_range
+    from warpnerf.run import Run
     from warpnerf.training import Trainer
 
     Run.require_free(output, overwrite)
@@ -149,14 +152,14 @@ def _train(source: str, output: Path, downscale: int, config: TrainConfig, overw
         return INTERRUPTED
     print("rendering the test views", flush=True)
     try:
-        print(run.evaluate(field, scene, "test"))
+        far = 2.0 * trainer.content_distance
+        print(run.evaluate(field, scene, "test", far))
     except KeyboardInterrupt:
         print(f"stopped; the trained field is in {output}, for warpnerf eval", file=sys.stderr)
         return INTERRUPTED
-    near, far = depth_range(field)
     print(
         f"wrote {output}: field.safetensors, metrics.json, log.jsonl, config.json, and test/*.png "
-        f"(truth, rendering, depth from {near:.3g} red to {far:.3g} violet)"
+        f"(truth, rendering, depth from 0 red to {far:.3g} violet)"
     )
     return 0
 
@@ -269,6 +272,11 @@ def main(arguments: list[str] | None = None) -> int:
         )
     except InputError as error:
         print(f"warpnerf: error: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except MemoryError:
+        print(
+            "warpnerf: error: out of memory; use --downscale, or a smaller preset.", file=sys.stderr
+        )
         return BAD_INPUT
     except OSError as error:
         print(f"warpnerf: error: {error}", file=sys.stderr)

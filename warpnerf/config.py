@@ -65,8 +65,11 @@ class MarchConfig:
         require_positive("march.step_voxels", self.step_voxels)
         require_at_least("march.near", self.near, 0.0)
         require_at_least("march.growth", self.growth, 0.0)
-        if self.far is not None and not self.far > self.near:
-            raise InputError(f"march.far must lie beyond march.near, not at {self.far}.")
+        if self.far is not None and not self.near < self.far < math.inf:
+            raise InputError(
+                f"march.far must be finite and beyond march.near, not {self.far}; leave it out for "
+                "no limit."
+            )
         if not 0 <= self.transmittance_min < 1:
             raise InputError(
                 f"march.transmittance_min must lie in [0, 1), not {self.transmittance_min}."
@@ -134,7 +137,7 @@ class TrainConfig:
     occupancy_every: int = 100
     """Steps between two looks for free space."""
     alpha_min: float = 1e-2
-    """A cell counts as free where no step would be more opaque than this."""
+    """A cell is free where a step of ``march.step_voxels`` would be less opaque than this."""
     seed: int = 0
     """Same seed, same number of threads: same bits on the CPU."""
     threads: int | None = None

@@ -151,6 +151,8 @@ def grid_size(extent: np.ndarray, voxels: int) -> tuple[int, int, int]:
 
 def require_memory(size: tuple[int, int, int], arrays: int) -> None:
     """Raise InputError if that many arrays of 16 bytes a node do not fit this machine's memory."""
+    if math.prod(size) >= 2**31:
+        raise InputError(f"grid.voxels must give fewer than 2^31 nodes, not {math.prod(size)}.")
     needed = math.prod(size) * 16 * arrays
     total = _total_memory()
     if total is not None and needed > total:

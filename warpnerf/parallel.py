@@ -14,7 +14,7 @@ from typing import Any
 
 import warp as wp
 
-from warpnerf.checks import InputError
+from warpnerf.checks import InputError, require_at_least
 
 NODES = 1 << 20
 RAYS = 1 << 13
@@ -35,6 +35,8 @@ class Workers:
         Raises:
             InputError: The device does not exist on this machine.
         """
+        if threads is not None:
+            require_at_least("threads", threads, 1)
         wp.config.log_level = wp.LOG_ERROR  # no banner, and no warning about a missing CUDA driver
         wp.init()
         try:
@@ -67,15 +69,18 @@ class Workers:
         """Run kernel(first, worker, *arguments) likewise: it writes to rows that a worker owns."""
         self._launch(kernel, n, lambda worker: (worker, *arguments), chunk)
 
+    def load(self, kernel: wp.Kernel) -> None:
+        """Compile a kernel, or fetch it from the cache, once: else every thread would."""
+        if kernel not in self._loaded:
+            kernel.module.load(self.device, block_dim=256 if self.device.is_cuda else 1)
+            self._loaded.add(kernel)
+
     def _launch(
         self, kernel: wp.Kernel, n: int, arguments: Callable[[int], tuple[Any, ...]], chunk: int
     ) -> None:
         if n == 0:
             return
-        if kernel not in self._loaded:
-            # Loaded here once: else every thread would compile it.
-            kernel.module.load(self.device, block_dim=256 if self.device.is_cuda else 1)
-            self._loaded.add(kernel)
+        self.load(kernel)
         if self.device.is_cuda:
             wp.launch(kernel, n, inputs=[0, *arguments(0)], device=self.device)
             return

@@ -11,6 +11,7 @@ from warpnerf_kernels import camera as kernels
 from warpnerf_kernels.types import mat33, real, vec2, vec3
 
 from warpnerf.camera import Camera
+from warpnerf.checks import InputError
 from warpnerf.parallel import Workers
 from warpnerf.scene import View
 
@@ -95,6 +96,10 @@ class PixelSampler:
         self._background = vec3(*(background or (0.0, 0.0, 0.0)))
         self._jitter = jitter
         firsts = np.cumsum([0] + [v.camera.width * v.camera.height for v in views])
+        if firsts[-1] >= 2**31:
+            raise InputError(
+                f"the training views have {firsts[-1]} pixels, 2^31 or more; use --downscale."
+            )
         self._views = wp.array(
             [
                 view_struct(v.camera, int(first))

@@ -47,8 +47,10 @@ class Run:
             raise InputError(f"--output {path} is a file; name a folder.")
         if not path.exists() or not any(path.iterdir()):
             return
-        if not (path / "config.json").exists():
-            raise InputError(f"--output {path} holds other files; name a new folder.")
+        try:
+            Run(path).read_config()
+        except InputError:
+            raise InputError(f"--output {path} holds other files; name a new folder.") from None
         if not overwrite:
             raise InputError(
                 f"--output {path} holds a run already; name another folder, or add --overwrite."
@@ -99,6 +101,7 @@ class Run:
         path = self.folder / "config.json"
         try:
             config = json.loads(path.read_text())
+            _ = config["train"], config["content_distance"]
             return {"scene": str(config["scene"]), "downscale": int(config["downscale"])}
         except OSError as error:
             raise InputError(
@@ -120,14 +123,13 @@ class Run:
         """Read the field; see ``warpnerf.load_field``."""
         return load_field(self.folder / "field.safetensors", device, threads)
 
-    def evaluate(self, field: Field, scene: Scene, split: str) -> Evaluation:
-        """Measure a split, and write metrics.json and the pictures."""
-        near, far = depth_range(field)
+    def evaluate(self, field: Field, scene: Scene, split: str, far: float) -> Evaluation:
+        """Measure a split, and write metrics.json and the pictures, depth in colour up to far."""
 
         def picture(view: View, target: np.ndarray, rendering: Rendering) -> None:
             name = view.name.replace("/", "_").replace("\\", "_").removesuffix(".png")
             path = self.folder / "test" / f"{name}.png"
-            write_png(path, comparison(target, rendering, near, far))
+            write_png(path, comparison(target, rendering, 0.0, far))
 
         result = evaluate(field, scene, split, picture)
         write_atomically(self.folder / "metrics.json", result.to_json().encode())
@@ -135,8 +137,3 @@ class Run:
 
     def _write_json(self, name: str, content: dict[str, Any]) -> None:
         write_atomically(self.folder / name, (json.dumps(content, indent=2) + "\n").encode())
-
-
-def depth_range(field: Field) -> tuple[float, float]:
-    """Depths that get the first and the last colour: from the camera to across the box."""
-    return 0.0, float(np.linalg.norm(field.grid.box_max - field.grid.box_min))

@@ -19,6 +19,9 @@ from warpnerf.grid import free_struct, grid_struct
 from warpnerf.parallel import RAYS, Workers
 from warpnerf.render import SCALINGS, Steps
 
+MAX_STEPS = 1e9
+"""Steps that a ray can count, from its origin on."""
+
 _PRECISIONS = {torch.float32: "float32", torch.float64: "float64"}
 
 
@@ -173,6 +176,17 @@ def render_rays(
     if len(length) and not bool(((length - 1.0).abs() < 1e-3).all()):
         raise InputError(
             "directions must be unit vectors, so that t is a distance; divide them by their length."
+        )
+    reach = (
+        float((rays[0] - rays[0].new_tensor((corners[0] + corners[1]) / 2)).norm(dim=1).max())
+        if len(rays[0])
+        else 0.0
+    )
+    reach += float(np.linalg.norm(corners[1] - corners[0]))
+    if reach / step > MAX_STEPS:
+        raise InputError(
+            f"step {step:g} is too short for rays that reach {reach:g} scene units: more than "
+            f"{MAX_STEPS:g} steps; use a longer step, or scale the scene."
         )
     behind = torch.as_tensor(background, dtype=raw.dtype, device=raw.device).detach()
     if behind.shape not in ((3,), (len(rays[0]), 3)) or not bool(behind.isfinite().all()):

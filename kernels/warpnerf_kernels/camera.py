@@ -45,10 +45,14 @@ def distort(view: View, p: vec2) -> vec2:
 
 @wp.func
 def undistort(view: View, distorted: vec2) -> vec2:
-    """Inverse of distort, by Newton's method on the two equations."""
-    p = distorted
+    """Inverse of distort, by Newton's method on the two equations.
+
+    The target moves out from the principal point in eight strides, so that each start is close.
+    """
+    p = vec2()
     two = real(2.0)
-    for _ in range(10):
+    for iteration in range(32):
+        target = distorted * wp.min(real(1.0), real(iteration // 3 + 1) / real(8.0))
         x = p[0]
         y = p[1]
         r2 = x * x + y * y
@@ -60,7 +64,7 @@ def undistort(view: View, distorted: vec2) -> vec2:
         a = radial + two * x * x * slope + two * p1 * y + real(6.0) * p2 * x
         b = two * x * y * slope + two * p1 * x + two * p2 * y
         d = radial + two * y * y * slope + real(6.0) * p1 * y + two * p2 * x
-        residual = distort(view, p) - distorted
+        residual = distort(view, p) - target
         det = a * d - b * b
         p = p - vec2(d * residual[0] - b * residual[1], a * residual[1] - b * residual[0]) / det
     return p

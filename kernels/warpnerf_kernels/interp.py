@@ -21,9 +21,9 @@ def tile_of(node: int) -> int:
 def lowest_node(u: vec3, size: wp.vec3i) -> wp.vec3i:
     """Lowest corner of the cell that holds grid coordinates u; u on the far face counts inside."""
     return wp.vec3i(
-        wp.min(int(u[0]), size[0] - 2),
-        wp.min(int(u[1]), size[1] - 2),
-        wp.min(int(u[2]), size[2] - 2),
+        wp.clamp(int(u[0]), 0, size[0] - 2),
+        wp.clamp(int(u[1]), 0, size[1] - 2),
+        wp.clamp(int(u[2]), 0, size[2] - 2),
     )
 
 

@@ -21,6 +21,14 @@ def step_edge(march: March, k: int) -> real:
 
 
 @wp.func
+def step_length(march: March, k: int) -> real:
+    """Length of step k; an equal step's own, not a difference of edges, which would lose digits."""
+    if k < march.n_linear or march.growth == real(0.0):
+        return march.step
+    return step_edge(march, k + 1) - step_edge(march, k)
+
+
+@wp.func
 def steps_before(march: March, t: real) -> real:
     """The (fractional) number of steps from near to distance t; inverse of step_edge."""
     k = (t - march.near) / march.step
@@ -68,8 +76,9 @@ def prepare_ray(
     ray.begin = int(0)
     ray.end = int(0)
     if interval[0] <= interval[1]:
-        ray.begin = wp.max(0, int(steps_before(march, interval[0])) - 1)
-        ray.end = int(steps_before(march, interval[1])) + 2
+        most = real(1.0e9)  # counts stay within int
+        ray.begin = wp.max(0, int(wp.min(steps_before(march, interval[0]), most)) - 1)
+        ray.end = int(wp.min(steps_before(march, interval[1]), most)) + 2
     return ray
 
 

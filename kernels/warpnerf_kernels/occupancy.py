@@ -47,10 +47,10 @@ def mark_occupied(
                 raw = grid.values[(i * grid.size[1] + j) * grid.size[2] + k]
                 highest = wp.max(highest, raw[0])
     alpha = real(1.0) - wp.exp(-step * grid.density_scale * softplus(highest + grid.density_shift))
-    if alpha > alpha_min:
-        out_distance[n] = wp.uint8(0)
-    else:
+    if alpha <= alpha_min:
         out_distance[n] = wp.uint8(FAR + 1)
+    else:  # NaN as well: it must be seen to be noticed
+        out_distance[n] = wp.uint8(0)
 
 
 @wp.kernel

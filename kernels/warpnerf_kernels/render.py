@@ -25,7 +25,14 @@ from .contraction import NONE, contract, det_jacobian_of
 from .gradscale import distance_scale
 from .interp import adj_gather, flat_index, gather, lowest_node
 from .loss import adj_squared_error, squared_error
-from .march import free_distance, free_length, prepare_ray, step_after, step_edge
+from .march import (
+    free_distance,
+    free_length,
+    prepare_ray,
+    step_after,
+    step_edge,
+    step_length,
+)
 from .types import FreeSpace, Grid, Integral, March, Ray, Sample, real, vec3, vec4
 
 
@@ -91,7 +98,7 @@ def next_sample(
     step = int(first)
     while step < ray.end:
         t0 = step_edge(march, step)
-        dt = step_edge(march, step + 1) - t0
+        dt = step_length(march, step)
         t = t0 + ray.offset * dt
         if t >= march.far:
             return sample

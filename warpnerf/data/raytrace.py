@@ -7,7 +7,7 @@ covers every face, and interpolated linearly, so that all views see the same rad
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ from warpnerf.camera import Camera
 Vec3 = tuple[float, float, float]
 
 _CHUNK = 1 << 16  # rays per batch of `first_hit`: small enough to stay in cache
-_LIFT = 1e-3  # scene units by which rays to lights start above a surface
+_LIFT = 1e-3  # scene units by which rays to lights start above a surface and off its edges
 _REACH = 0.7  # scene units: what is farther away leaves the ambient light alone
 _OPEN_RAYS = 24  # directions that sample the ambient light
 
@@ -250,7 +250,9 @@ class Tracer:
             spacing: Largest distance between neighbouring nodes of baked light, scene units.
         """
         self.solids = tuple(solids)
-        self._blockers = [solid for solid in self.solids if solid.glow == 0.0]
+        self._lo = np.array([solid.lo for solid in self.solids])  # [solid, 3]
+        self._hi = np.array([solid.hi for solid in self.solids])
+        self._opaque = np.array([solid.glow == 0.0 for solid in self.solids])  # [solid]
         self._patch = np.zeros((len(self.solids), 6), np.int32)  # [solid, face] -> column below
         patches: list[tuple[float, ...]] = []
         baked: list[np.ndarray] = []
@@ -258,7 +260,9 @@ class Tracer:
         for index, solid in enumerate(self.solids):
             for face, (u0, u1, v0, v1) in solid.faces().items():
                 nu, nv = (2 + int(length / spacing) for length in (u1 - u0, v1 - v0))
-                u, v = np.meshgrid(np.linspace(u0, u1, nu), np.linspace(v0, v1, nv))
+                u, v = np.meshgrid(
+                    np.linspace(u0 + _LIFT, u1 - _LIFT, nu), np.linspace(v0 + _LIFT, v1 - _LIFT, nv)
+                )
                 light = np.full((3, nv, nu), solid.glow)
                 if solid.glow == 0.0:
                     nodes = solid.place(face, u.ravel(), v.ravel())
@@ -276,7 +280,7 @@ class Tracer:
         """Light [3, n] that reaches points [3, n] with normals [3, n]."""
         origins = (points + _LIFT * normals).astype(np.float32)[:, None]
         towards = _hemispheres(normals).astype(np.float32)
-        open_t = self._nearest(origins, _REACH * towards, self._blockers)
+        open_t = self._nearest(origins, _REACH * towards)
         total = np.array(ambient)[:, None] * np.minimum(open_t, 1.0).mean(axis=0)
         for light in lights:
             way = light.points[:, :, None].astype(np.float32) - origins
@@ -286,22 +290,20 @@ class Tracer:
                 ahead = -(way * np.array(light.facing)[:, None, None]).sum(axis=0) / far
                 cosine *= np.maximum(ahead, 0.0)
             if cosine.any():
-                seen = self._nearest(origins, way, self._blockers[1:]) >= 1.0
+                seen = self._nearest(origins, way) >= 1.0
                 total += np.array(light.power)[:, None] * (seen * cosine / far**2).mean(axis=0)
         return total
 
-    def _nearest(
-        self, origins: np.ndarray, directions: np.ndarray, solids: Sequence[Box]
-    ) -> np.ndarray:
+    def _nearest(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Least ``t`` in [0, 1] at which rays [3, m, n] meet a solid; 1 where they meet none."""
         rays = make_rays(origins, directions)
         ends = origins + directions
         lo = np.minimum(ends, origins).min(axis=(1, 2))
         hi = np.maximum(ends, origins).max(axis=(1, 2))
         nearest = np.ones(directions.shape[1:], np.float32)
-        for solid in solids:
-            if np.all(lo <= solid.hi) and np.all(hi >= solid.lo):
-                np.minimum(nearest, solid.hit(rays), out=nearest)
+        close = self._opaque & ((lo <= self._hi) & (hi >= self._lo)).all(axis=1)
+        for index in np.flatnonzero(close):
+            np.minimum(nearest, self.solids[index].hit(rays), out=nearest)
         return nearest
 
     def _baked_light(self, index: int, at: Surface) -> np.ndarray:
@@ -326,15 +328,37 @@ class Tracer:
         rays = make_rays(position[:, None, None], (right * x + up * y[:, None] - back).astype(kind))
         nearest: np.ndarray = np.full(rays.directions.shape[1:], np.inf, kind)
         which = np.zeros(nearest.shape, np.uint8)
-        for index, solid in enumerate(self.solids):
-            part = _footprint(solid, camera, samples)
-            if part is not None:
-                rows, columns = part
-                t = solid.hit(Rays(rays.origins, *(a[:, rows, columns] for a in rays[1:])))
-                closer = t < nearest[part]
-                np.copyto(nearest[part], t, where=closer)
-                np.copyto(which[part], np.uint8(index), where=closer)
+        for index, part in self._footprints(camera, samples):
+            rows, columns = part
+            t = self.solids[index].hit(Rays(rays.origins, *(a[:, rows, columns] for a in rays[1:])))
+            closer = t < nearest[part]
+            np.copyto(nearest[part], t, where=closer)
+            np.copyto(which[part], np.uint8(index), where=closer)
         return rays.directions, nearest, which
+
+    def _footprints(
+        self, camera: Camera, samples: int
+    ) -> Iterator[tuple[int, tuple[slice, slice]]]:
+        """Solids that may be in sight, each with the rows and columns of samples it may cover."""
+        corner = np.indices((2, 2, 2)).reshape(3, 8).T == 1
+        corners = np.where(corner, self._hi[:, None], self._lo[:, None])  # [solid, 8, 3]
+        x, y, z = np.moveaxis((corners - camera.position) @ camera.c2w[:, :3], 2, 0)
+        ahead = z.max(axis=1) < -1e-3  # entirely; else its outline may be anywhere
+        z = np.minimum(z, -1e-3)
+        outline = []
+        for at, count in (
+            (camera.cy + camera.fy * y / z, camera.height),
+            (camera.cx - camera.fx * x / z, camera.width),
+        ):
+            low, high = at.min(axis=1) * samples - 1, at.max(axis=1) * samples + 2
+            low, high = np.where(ahead, low, 0), np.where(ahead, high, count * samples)
+            outline += [np.clip(edge, 0, count * samples).astype(int) for edge in (low, high)]
+        top, bottom, left, right = outline
+        for index in np.flatnonzero((top < bottom) & (left < right) & (z.min(axis=1) < -1e-3)):
+            yield (
+                int(index),
+                (slice(top[index], bottom[index]), slice(left[index], right[index])),
+            )
 
     def depth(self, camera: Camera) -> np.ndarray:
         """Distance to the first surface along the ray through each pixel's centre.
@@ -385,24 +409,6 @@ class Tracer:
             )
             nearest[part] = np.min([solid.hit(rays) for solid in self.solids], axis=0)
         return nearest
-
-
-def _footprint(solid: Box, camera: Camera, samples: int) -> tuple[slice, slice] | None:
-    """Rows and columns of samples that may show a solid; None: it is behind the camera."""
-    choice = np.indices((2, 2, 2)).reshape(3, 8)
-    corners = np.where(choice == 1, np.array(solid.hi)[:, None], np.array(solid.lo)[:, None])
-    x, y, z = camera.c2w[:, :3].T @ (corners - camera.position[:, None])
-    if z.min() > 0.0:
-        return None
-    if z.max() > -1e-3:
-        return slice(0, camera.height * samples), slice(0, camera.width * samples)
-    u = (camera.cx - camera.fx * x / z) * samples
-    v = (camera.cy + camera.fy * y / z) * samples
-    spans = []
-    for at, count in ((v, camera.height), (u, camera.width)):
-        low, high = np.clip([at.min() - 1, at.max() + 2], 0, count * samples).astype(int)
-        spans.append(slice(low, high))
-    return spans[0], spans[1]
 
 
 def _hemispheres(normals: np.ndarray) -> np.ndarray:
