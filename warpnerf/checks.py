@@ -16,25 +16,25 @@ class InputError(ValueError):
 
 
 def require_positive(field: str, value: float) -> None:
-    """Raise ValueError unless value is a finite number above zero; NaN is refused as well."""
+    """Raise InputError unless value is a finite number above zero; NaN is refused as well."""
     if not (value > 0 and math.isfinite(value)):
         raise InputError(f"{field} must be a finite number above 0, not {value}.")
 
 
 def require_at_least(field: str, value: float, least: float) -> None:
-    """Raise ValueError unless value is a finite number of at least `least`."""
+    """Raise InputError unless value is a finite number of at least `least`."""
     if not (value >= least and math.isfinite(value)):
         raise InputError(f"{field} must be a finite number of at least {least:g}, not {value}.")
 
 
 def require_one_of(field: str, value: str, choices: Iterable[str]) -> None:
-    """Raise ValueError unless value is one of the choices."""
+    """Raise InputError unless value is one of the choices."""
     if value not in choices:
         raise InputError(f"{field} must be one of {', '.join(choices)}, not {value!r}.")
 
 
 def require_rays(origins: np.ndarray, directions: np.ndarray) -> None:
-    """Raise ValueError unless both are [n_rays, 3], finite, and directions of unit length."""
+    """Raise InputError unless both are [n_rays, 3], finite, and directions of unit length."""
     for name, array in (("origins", origins), ("directions", directions)):
         if array.ndim != 2 or array.shape[1] != 3:
             raise InputError(f"{name} must have shape [n_rays, 3], not {list(array.shape)}.")

@@ -136,7 +136,6 @@ class Trainer:
         )
         self._grown = 0
         self._reach = _reach(scene)
-        self._unbounded = scene.unbounded
         self.grid = self._first_grid(scene)
         self.moments = Moments.zeros(self.grid, self.workers)
         self.free = FreeCells.none(self.workers)
