@@ -34,7 +34,7 @@ import warp as wp
 from torch_pipeline import Choices, ScaleGradient, TorchPipeline, fastest_by_threads
 from warpnerf_kernels import contraction
 from warpnerf_kernels import render as kernels
-from warpnerf_kernels.types import Sample, real, vec3
+from warpnerf_kernels.types import real, vec3
 from workload import (
     Stopwatch,
     Workload,
@@ -47,7 +47,7 @@ from workload import (
 from warpnerf.config import Scaling
 from warpnerf.grid import FreeCells
 from warpnerf.parallel import Workers
-from warpnerf.render import JACOBIANS, SCALINGS, Gradients, TrainingPass, render_rays
+from warpnerf.render import JACOBIANS, SCALINGS, Gradients, TrainingPass, render_rays, scratch
 
 N_RAYS = 1500
 N_STEPS = 200
@@ -84,7 +84,6 @@ class WarpAdjoint:
             2.0 / len(rgb) * (rgb - work.target_rgb), dtype=vec3, device=workers.device
         )
         self._nothing = wp.zeros(len(rgb), dtype=real, device=workers.device)
-        self._kept = wp.empty(0, dtype=Sample, device=workers.device)
         self._passes = {scaling: self._training_pass(scaling) for scaling in ("none", "clamped")}
         vars(self._passes["clamped"]).update(
             {
@@ -110,9 +109,13 @@ class WarpAdjoint:
 
     def backward(self, scaling: Scaling) -> Call:
         """The adjoint launch."""
-        kernel = kernels.render_backward_kernel(
-            kernels.Variant(contraction.NONE, SCALINGS[scaling], JACOBIANS["none"])
+        variant = kernels.Variant(
+            contraction.NONE,
+            SCALINGS[scaling],
+            JACOBIANS["none"],
+            packed=not self._workers.device.is_cuda,
         )
+        kernel = kernels.render_backward_kernel(variant)
         batch, out = self._batch, self._out
         arguments = (
             self._grid.struct(),
@@ -130,7 +133,7 @@ class WarpAdjoint:
             self._adj_rgb,
             self._nothing,
             self._nothing,
-            self._kept,
+            *scratch(kernels, variant, 1, self._workers),
             self.gradients.rows,
             self.gradients.touched,
         )

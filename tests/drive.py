@@ -102,9 +102,10 @@ class Rendered:
 class Kernels:
     """The rendering kernels in one precision, on one device."""
 
-    def __init__(self, name: str, device: str, threads: int = 1) -> None:
+    def __init__(self, name: str, device: str, threads: int = 1, packed: bool = False) -> None:
         self.workers = Workers(device, threads)
         self.device = self.workers.device
+        self.packed = packed
         self.precision = name
         self.render = precision.load(name, "render")
         self.types = precision.load(name, "types")
@@ -152,11 +153,18 @@ class Kernels:
 
     def variant(self, p: Problem, scaling: str = "none", jacobian: str = "none") -> Any:
         return self.render.Variant(
-            CONTRACTIONS[p.contraction], SCALINGS[scaling], JACOBIANS[jacobian]
+            CONTRACTIONS[p.contraction], SCALINGS[scaling], JACOBIANS[jacobian], self.packed
         )
 
-    def kept(self, n: int) -> wp.array:
-        return wp.empty(n, dtype=self.types.Sample, device=self.device)
+    def scratch(self, variant: Any, capacity: int) -> tuple[int, wp.array]:
+        """Room for `capacity` samples or packs of a ray; of packs there must be one."""
+        capacity = 0 if self.device.is_cuda else max(capacity, int(self.packed))
+        kept = wp.empty(
+            self.workers.count * capacity,
+            dtype=self.render.kept_type(variant),
+            device=self.device,
+        )
+        return capacity, kept
 
     def _forward(self, p: Problem) -> tuple[wp.array, ...]:
         n = p.n_rays
@@ -166,8 +174,15 @@ class Kernels:
             self.zeros(n),
             self.zeros(n, wp.int32),
         )
-        kernel = self.render.render_forward_kernel(self.variant(p))
-        self.workers.launch(kernel, n, *self._scene(p), *self._rays(p), self.kept(0), *out)
+        variant = self.variant(p)
+        self.workers.launch_owned(
+            self.render.render_forward_kernel(variant),
+            n,
+            *self._scene(p),
+            *self._rays(p),
+            *self.scratch(variant, 0),
+            *out,
+        )
         return out
 
     def forward(self, p: Problem) -> Rendered:
@@ -184,8 +199,9 @@ class Kernels:
         """The gradient [X, Y, Z, 4] of the outputs' product with the problem's adjoints."""
         gradients = self.zeros((self.workers.count, p.raw[..., 0].size), self.types.vec4)
         touched = self.touched(gradients.shape[1])
+        variant = self.variant(p, scaling, jacobian)
         self.workers.launch_owned(
-            self.render.render_backward_kernel(self.variant(p, scaling, jacobian)),
+            self.render.render_backward_kernel(variant),
             p.n_rays,
             *self._scene(p),
             *self._rays(p),
@@ -194,7 +210,7 @@ class Kernels:
             self.array(p.adj_rgb, self.types.vec3),
             self.array(p.adj_opacity),
             self.array(p.adj_depth),
-            self.kept(0),
+            *self.scratch(variant, 0),
             gradients,
             touched,
         )
@@ -213,17 +229,16 @@ class Kernels:
         error, n_samples = self.zeros(p.n_rays), self.zeros(p.n_rays, wp.int32)
         gradients = self.zeros((workers.count, p.raw[..., 0].size), self.types.vec4)
         touched = self.touched(gradients.shape[1])
-        capacity = 0 if self.device.is_cuda else capacity
+        variant = self.variant(p, scaling, jacobian)
         workers.launch_owned(
-            self.render.render_train_kernel(self.variant(p, scaling, jacobian)),
+            self.render.render_train_kernel(variant),
             p.n_rays,
             *self._scene(p),
             *self._rays(p),
             self.array(p.content_distance),
             self.array(p.target, self.types.vec3),
             1.0 / p.n_rays,
-            capacity,
-            self.kept(workers.count * capacity),
+            *self.scratch(variant, capacity),
             error,
             n_samples,
             gradients,
@@ -236,7 +251,8 @@ def total_gradient(gradients: wp.array, touched: wp.array) -> Float64:
     """The sum over workers [n_nodes, 4]; every tile that holds some of it must be flagged."""
     rows = gradients.numpy()
     nodes = np.flatnonzero(rows.any(axis=(0, 2)))
-    assert touched.numpy()[nodes // interp.TILE].all()
+    flags = np.append(touched.numpy(), 0)
+    assert (flags[nodes // interp.TILE] | flags[nodes // interp.TILE - 1]).all()
     return np.asarray(rows.sum(axis=0))
 
 

@@ -47,9 +47,9 @@ def test_against_the_oracle(scaling: str, jacobian: str, kernels64: Kernels) -> 
             assert (found == 1.0).any() and (found < 1.0).any()
 
 
-@pytest.mark.parametrize("name", ["kernels32", "kernels64"])
-def test_limits_are_exact(name: str, request: pytest.FixtureRequest) -> None:
-    kernels = request.getfixturevalue(name)
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_limits_are_exact(precision: str, device: str) -> None:
+    kernels = Kernels(precision, device)
     rng = np.random.default_rng(0)
     t = rng.uniform(0.0, 5.0, 2000).astype(np.float32)
     one = np.ones_like(t)

@@ -77,17 +77,17 @@ def test_adjoint_against_central_differences(kernels64: Kernels) -> None:
         assert_close(found, expected, 1e-9)
 
 
-@pytest.mark.parametrize("name", ["kernels64", "kernels32"])
-def test_transpose(name: str, request: pytest.FixtureRequest) -> None:
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+def test_transpose(precision: str, device: str) -> None:
     """<gather(x), y> == <x, adj_gather(y)>."""
-    kernels = request.getfixturevalue(name)
+    kernels = Kernels(precision, device)
     for seed in range(N_SEEDS):
         values, u, adj = problem(seed)
         forward = float((gather(kernels, values, u).astype(np.float64) * adj).sum())
         backward = float((values * adj_gather(kernels, values.shape, u, adj)).sum())
         scale = float(np.abs(values).max() * np.abs(adj).sum())
         assert abs(forward) > 1e-3 * scale / 40
-        assert abs(forward - backward) <= (1e-15 if name == "kernels64" else 1e-6) * scale
+        assert abs(forward - backward) <= (1e-15 if precision == "float64" else 1e-6) * scale
 
 
 def test_gather_reproduces_linear_functions(kernels64: Kernels) -> None:
@@ -117,7 +117,8 @@ def test_only_tiles_around_the_point_are_flagged(kernels64: Kernels) -> None:
         )
         nodes = np.flatnonzero(out.numpy()[0].any(axis=-1))
         assert len(nodes) == 8
-        assert np.array_equal(np.flatnonzero(touched.numpy()), np.unique(nodes // TILE))
+        # A pair of nodes along z flags the tile that it begins in.
+        assert np.array_equal(np.flatnonzero(touched.numpy()), np.unique(nodes[::2] // TILE))
 
 
 def test_activations_against_the_oracle(kernels64: Kernels) -> None:

@@ -9,11 +9,11 @@ from typing import Any
 import warp as wp
 from warpnerf_kernels import gradscale, interp, types
 from warpnerf_kernels import render as kernels
-from warpnerf_kernels.types import Sample, real, vec3, vec4
+from warpnerf_kernels.types import real, vec3, vec4
 
 from warpnerf.config import Jacobian, Scaling
 from warpnerf.grid import CONTRACTIONS, FreeCells, VoxelGrid
-from warpnerf.parallel import RAYS, Workers
+from warpnerf.parallel import Workers
 from warpnerf.rays import RayBatch
 
 SCALINGS = {
@@ -27,8 +27,9 @@ JACOBIANS = {
     "paper": gradscale.JACOBIAN_PAPER,
 }
 
-KEPT_SAMPLES = 1024
-"""Samples of a ray that a CPU worker keeps between the two passes; later ones are read again."""
+KEPT_PACKS = 128
+"""Packs of eight steps that a CPU worker keeps of a ray between the two passes; later ones are
+made again."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,9 +108,13 @@ def render_rays(
         n_samples=wp.empty(n, dtype=wp.int32, device=workers.device),
     )
     variant = kernels.Variant(
-        CONTRACTIONS[grid.contraction], gradscale.NONE, gradscale.JACOBIAN_NONE
+        CONTRACTIONS[grid.contraction],
+        gradscale.NONE,
+        gradscale.JACOBIAN_NONE,
+        packed=not workers.device.is_cuda,
     )
-    workers.launch(
+    capacity, kept = scratch(kernels, variant, 1, workers)
+    workers.launch_owned(
         kernels.render_forward_kernel(variant),
         n,
         grid.struct(),
@@ -119,14 +124,36 @@ def render_rays(
         directions,
         offsets,
         background,
-        wp.empty(0, dtype=Sample, device=workers.device),
+        capacity,
+        kept,
         out.rgb,
         out.transmittance,
         out.depth,
         out.n_samples,
-        chunk=RAYS,
     )
     return out
+
+
+def scratch(
+    kernels: ModuleType, variant: kernels.Variant, n_packs: int, workers: Workers
+) -> tuple[int, wp.array]:
+    """Where the workers of a launch keep a ray's samples.
+
+    Args:
+        kernels: ``warpnerf_kernels.render`` in some precision.
+        variant: Of the kernel to launch.
+        n_packs: What each worker keeps, if in packs. Plain kernels, which CUDA runs, keep nothing:
+            with all rays under way at once, reading a sample again is the cheaper way.
+        workers: Where to work.
+
+    Returns:
+        The kernel's arguments `capacity` and `kept`.
+    """
+    capacity = n_packs if variant.packed else 0
+    kept = wp.empty(
+        workers.count * capacity, dtype=kernels.kept_type(variant), device=workers.device
+    )
+    return capacity, kept
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -136,7 +163,7 @@ class Gradients:
     rows: wp.array
     """[n_workers, n_nodes] vec4; their sum over the workers is the gradient."""
     touched: wp.array
-    """[n_tiles] uint8, 0 where a tile of nodes has no gradient."""
+    """[n_tiles] uint8, 0 where neither a tile of nodes nor the next one's first has a gradient."""
 
     @staticmethod
     def zeros(n_nodes: int, workers: Workers) -> Gradients:
@@ -166,12 +193,14 @@ class TrainingPass:
         """Allocate what a batch of n_rays into a grid of n_nodes needs, whatever its samples."""
         device = workers.device
         self._workers = workers
-        self._kernel = kernels.render_train_kernel(
-            kernels.Variant(CONTRACTIONS[contraction], SCALINGS[scaling], JACOBIANS[jacobian])
+        variant = kernels.Variant(
+            CONTRACTIONS[contraction],
+            SCALINGS[scaling],
+            JACOBIANS[jacobian],
+            packed=not device.is_cuda,
         )
-        # On CUDA all rays are under way at once: there, reading a sample again is the cheaper way.
-        self._capacity = 0 if device.is_cuda else KEPT_SAMPLES
-        self._kept = wp.empty(workers.count * self._capacity, dtype=Sample, device=device)
+        self._kernel = kernels.render_train_kernel(variant)
+        self._capacity, self._kept = scratch(kernels, variant, KEPT_PACKS, workers)
         self.error = wp.zeros(n_rays, dtype=real, device=device)
         """[n_rays] squared error of the last batch."""
         self.n_samples = wp.zeros(n_rays, dtype=wp.int32, device=device)

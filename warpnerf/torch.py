@@ -16,8 +16,8 @@ from warpnerf_kernels import contraction, gradscale, interp, precision
 from warpnerf.checks import InputError, require_at_least, require_one_of, require_positive
 from warpnerf.config import Scaling
 from warpnerf.grid import free_struct, grid_struct
-from warpnerf.parallel import RAYS, Workers
-from warpnerf.render import SCALINGS, Steps
+from warpnerf.parallel import Workers
+from warpnerf.render import SCALINGS, Steps, scratch
 
 MAX_STEPS = 1e9
 """Steps that a ray can count, from its origin on."""
@@ -236,15 +236,15 @@ class _Render(torch.autograd.Function):
         n_samples = torch.empty(n, dtype=torch.int32, device=raw.device)
         workers = _workers(str(raw.device))
         outputs = _array(rgb, types.vec3), _array(transmittance), _array(depth), _array(n_samples)
+        variant = _variant(raw, kernels, "none")
         with _stream(raw):
-            workers.launch(
-                kernels.render_forward_kernel(_variant(kernels, "none")),
+            workers.launch_owned(
+                kernels.render_forward_kernel(variant),
                 n,
                 *_scene(raw, call, types),
                 *_ray_arrays(raw, origins, directions, call, types),
-                wp.empty(0, dtype=types.Sample, device=workers.device),
+                *scratch(kernels, variant, 1, workers),
                 *outputs,
-                chunk=RAYS,
             )
         ctx.call = call
         ctx.save_for_backward(raw, origins, directions, rgb, transmittance, depth, n_samples)
@@ -261,9 +261,10 @@ class _Render(torch.autograd.Function):
         n_nodes = raw.shape[:3].numel()
         adj_raw = raw.new_zeros(workers.count, n_nodes, 4)
         touched = torch.zeros(-(-n_nodes // interp.TILE), dtype=torch.uint8, device=raw.device)
+        variant = _variant(raw, kernels, call.scaling)
         with _stream(raw):
             workers.launch_owned(
-                kernels.render_backward_kernel(_variant(kernels, call.scaling)),
+                kernels.render_backward_kernel(variant),
                 len(origins),
                 *_scene(raw, call, types),
                 *_ray_arrays(raw, origins, directions, call, types),
@@ -275,7 +276,7 @@ class _Render(torch.autograd.Function):
                 _array(adj_rgb, types.vec3),
                 _array(adj_opacity),
                 _array(adj_depth),
-                wp.empty(0, dtype=types.Sample, device=workers.device),
+                *scratch(kernels, variant, 1, workers),
                 _array(adj_raw, types.vec4),
                 _array(touched),
             )
@@ -293,8 +294,13 @@ def _device_code(raw: torch.Tensor) -> tuple[ModuleType, ModuleType]:
     return precision.load(name, "render"), precision.load(name, "types")
 
 
-def _variant(kernels: ModuleType, scaling: Scaling) -> Any:
-    return kernels.Variant(contraction.NONE, SCALINGS[scaling], gradscale.JACOBIAN_NONE)
+def _variant(raw: torch.Tensor, kernels: ModuleType, scaling: Scaling) -> Any:
+    return kernels.Variant(
+        contraction.NONE,
+        SCALINGS[scaling],
+        gradscale.JACOBIAN_NONE,
+        packed=raw.dtype == torch.float32 and not raw.is_cuda,
+    )
 
 
 def _stream(raw: torch.Tensor) -> Any:

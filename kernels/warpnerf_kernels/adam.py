@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from .interp import tile_of
+from .interp import has_gradient, tile_of
 from .types import real, vec4
 
 wp.set_module_options({"enable_backward": False})
@@ -18,7 +18,7 @@ def adam_step(
     epsilon: real,
     correction1: real,  # 1 / (1 - beta1^step)
     correction2: real,  # 1 / (1 - beta2^step)
-    touched: wp.array(dtype=wp.uint8),  # [n_tiles] 0 where no gradient is
+    touched: wp.array(dtype=wp.uint8),  # [n_tiles] as adj_gather left it
     gradients: wp.array2d(dtype=vec4),  # [n_workers, n_nodes] summed in order, then zeroed
     values: wp.array(dtype=vec4),  # [n_nodes] updated
     mean: wp.array(dtype=vec4),  # [n_nodes] first moment, updated
@@ -26,7 +26,7 @@ def adam_step(
 ):
     """One step. An entry whose gradient is exactly zero keeps its value and its moments."""
     start = (first + wp.tid()) * span
-    if touched[tile_of(start)] == wp.uint8(0):
+    if not has_gradient(touched, tile_of(start)):
         return
     zero = vec4()
     for i in range(start, wp.min(start + span, values.shape[0])):

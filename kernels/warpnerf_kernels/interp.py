@@ -18,6 +18,16 @@ def tile_of(node: int) -> int:
 
 
 @wp.func
+def has_gradient(touched: wp.array(dtype=wp.uint8), tile: int) -> bool:  # [n_tiles]
+    """Whether nodes of a tile may have been added to: from itself, or from the one before."""
+    if touched[tile] != wp.uint8(0):
+        return True
+    if tile > 0:
+        return touched[tile - 1] != wp.uint8(0)
+    return False
+
+
+@wp.func
 def lowest_node(u: vec3, size: wp.vec3i) -> wp.vec3i:
     """Lowest corner of the cell that holds grid coordinates u; u on the far face counts inside."""
     return wp.vec3i(
@@ -70,7 +80,7 @@ def adj_gather(
     adj_value: vec4,
     worker: int,
     adj_values: wp.array2d(dtype=vec4),  # [n_workers, X * Y * Z], added to
-    touched: wp.array(dtype=wp.uint8),  # [n_tiles] set to 1 where a node of the tile is added to
+    touched: wp.array(dtype=wp.uint8),  # [n_tiles] set to 1 where a pair of nodes along z begins
 ):
     """Transpose of gather: hands adj_value to the eight nodes with the weights it was made with."""
     stride_y = size[2]
@@ -88,13 +98,9 @@ def adj_gather(
     # Workers share these flags: whoever comes first, the value is the same.
     yes = wp.uint8(1)
     touched[tile_of(n00)] = yes
-    touched[tile_of(n00 + 1)] = yes
     touched[tile_of(n01)] = yes
-    touched[tile_of(n01 + 1)] = yes
     touched[tile_of(n10)] = yes
-    touched[tile_of(n10 + 1)] = yes
     touched[tile_of(n11)] = yes
-    touched[tile_of(n11 + 1)] = yes
     low = gx * gy * adj_value
     wp.atomic_add(adj_values, worker, n00, gz * low)
     wp.atomic_add(adj_values, worker, n00 + 1, fz * low)

@@ -22,10 +22,10 @@ def step_edge(march: March, k: int) -> real:
 
 @wp.func
 def step_length(march: March, k: int) -> real:
-    """Length of step k; an equal step's own, not a difference of edges, which would lose digits."""
+    """Length of step k, not by a difference of edges, which would lose digits."""
     if k < march.n_linear or march.growth == real(0.0):
         return march.step
-    return step_edge(march, k + 1) - step_edge(march, k)
+    return step_edge(march, k) * march.growth
 
 
 @wp.func

@@ -6,7 +6,7 @@ huber(d) = d^2 / 2 for |d| <= 1, |d| - 1/2 beyond: an edge costs its height, not
 
 import warp as wp
 
-from .interp import flat_index, tile_of
+from .interp import flat_index, has_gradient, tile_of
 from .types import real, vec4
 
 wp.set_module_options({"enable_backward": False})
@@ -110,12 +110,12 @@ def total_variation_backward(
     values: wp.array(dtype=vec4),  # [X * Y * Z]
     size: wp.vec3i,
     weight: vec4,  # per channel
-    touched: wp.array(dtype=wp.uint8),  # [n_tiles] 0 where no gradient is
+    touched: wp.array(dtype=wp.uint8),  # [n_tiles] as adj_gather left it
     adj_values: wp.array2d(dtype=vec4),  # [n_workers, X * Y * Z], row 0 is added to
 ):
     """d TV / d x at the nodes that already have a gradient; unseen ones stay as they are."""
     start = (first + wp.tid()) * span
-    if touched[tile_of(start)] == wp.uint8(0):
+    if not has_gradient(touched, tile_of(start)):
         return
     for n in range(start, wp.min(start + span, values.shape[0])):
         seen = int(0)

@@ -1,11 +1,8 @@
-"""Rendering a ray and its adjoint: one walk, two passes, three kernels made of them.
-
-The forward pass composites samples front to back; the backward pass walks the same samples and
-needs of the rest of the ray only what lies behind: it starts with that, and sheds it on its way.
-Both get their samples from ``next_sample``, the one place that decides where a ray is sampled.
+"""The three kernels that render: forward, backward, and both with the loss between, for training.
 
 What selects a variant (``scaling``, ``jacobian``, ``contraction``) is a constant in each kernel, so
-the compiler drops what a variant does not use.
+the compiler drops what a variant does not use. So is the choice between the plain integral, a
+sample at a time, and the packed one, eight at a time, which is for the CPU.
 """
 
 from functools import cache
@@ -13,27 +10,10 @@ from typing import NamedTuple
 
 import warp as wp
 
-from .activation import (
-    adj_sigmoid,
-    adj_softplus,
-    opacity_of,
-    sigmoid,
-    softplus,
-    softplus_slope,
-)
-from .contraction import NONE, contract, det_jacobian_of
-from .gradscale import distance_scale
-from .interp import adj_gather, flat_index, gather, lowest_node
+from . import integral, packs
 from .loss import adj_squared_error, squared_error
-from .march import (
-    free_distance,
-    free_length,
-    prepare_ray,
-    step_after,
-    step_edge,
-    step_length,
-)
-from .types import FreeSpace, Grid, Integral, March, Ray, Sample, real, vec3, vec4
+from .march import prepare_ray
+from .types import FreeSpace, Grid, Integral, March, Sample, real, vec3, vec4
 
 
 class Variant(NamedTuple):
@@ -42,176 +22,12 @@ class Variant(NamedTuple):
     contraction: int
     scaling: int
     jacobian: int
+    packed: bool  # eight samples at a time; float32 on the CPU only
 
 
-@wp.func
-def shade(grid: Grid, sample: Sample) -> Sample:
-    """Read the grid at a sample: density and colour."""
-    raw = gather(grid.values, grid.size, sample.base, sample.fraction)
-    raw_density = raw[0] + grid.density_shift
-    sample.sigma = grid.density_scale * softplus(raw_density)
-    sample.sigma_slope = grid.density_scale * softplus_slope(raw_density)
-    sample.attenuation = wp.exp(-sample.sigma * sample.dt)
-    sample.rgb = sigmoid(vec3(raw[1], raw[2], raw[3]))
-    return sample
-
-
-@wp.func
-def adj_shade(
-    grid: Grid,
-    sample: Sample,
-    adj_sigma: real,
-    adj_rgb: vec3,
-    worker: int,
-    adj_values: wp.array2d(dtype=vec4),  # [n_workers, X * Y * Z], added to
-    touched: wp.array(dtype=wp.uint8),  # [n_tiles] set to 1 where adj_values was added to
-):
-    """Hand the gradients of a sample's density and colour to the nodes around it."""
-    adj_density = adj_softplus(sample.sigma_slope, adj_sigma)
-    adj_raw = adj_sigmoid(sample.rgb, adj_rgb)
-    adj_gather(
-        grid.size,
-        sample.base,
-        sample.fraction,
-        vec4(adj_density, adj_raw[0], adj_raw[1], adj_raw[2]),
-        worker,
-        adj_values,
-        touched,
-    )
-
-
-@wp.func
-def next_sample(
-    grid: Grid,
-    free: FreeSpace,
-    march: March,
-    ray: Ray,
-    first: int,  # step to begin looking at
-    contraction: int,
-) -> Sample:
-    """The first sample at or after step `first` that is in the box and not in free space.
-
-    Its step is ray.end where there is none.
-    """
-    sample = Sample()
-    sample.step = ray.end
-    step = int(first)
-    while step < ray.end:
-        t0 = step_edge(march, step)
-        dt = step_length(march, step)
-        t = t0 + ray.offset * dt
-        if t >= march.far:
-            return sample
-        q = ray.q_origin + t * ray.q_direction
-        inside = (
-            wp.abs(q[0]) <= real(1.0) and wp.abs(q[1]) <= real(1.0) and wp.abs(q[2]) <= real(1.0)
-        )
-        if inside or contraction != NONE:
-            c = contract(q, grid.border, contraction)
-            m = wp.cw_mul(c, free.to_cells) + real(0.5) * vec3(
-                real(free.size[0]), real(free.size[1]), real(free.size[2])
-            )
-            distance = free_distance(free, m)
-            if distance == 0:
-                u = wp.cw_mul(c, grid.to_nodes) + grid.middle
-                node = lowest_node(u, grid.size)
-                sample.step = step
-                sample.t = t
-                sample.dt = dt
-                sample.det_jacobian = det_jacobian_of(q, grid.border, contraction)
-                sample.base = flat_index(node[0], node[1], node[2], grid.size)
-                sample.fraction = u - vec3(real(node[0]), real(node[1]), real(node[2]))
-                return shade(grid, sample)
-            step = step_after(
-                march, ray, t + free_length(free, ray, m, distance, contraction), step
-            )
-        else:
-            step += 1
-    return sample
-
-
-@wp.func
-def integrate(
-    grid: Grid,
-    free: FreeSpace,
-    march: March,
-    ray: Ray,
-    row: int,  # first entry of this ray's samples in `kept`
-    capacity: int,  # how many samples of a ray are kept
-    contraction: int,
-    kept: wp.array(dtype=Sample),  # written
-) -> Integral:
-    """Composite a ray's samples front to back: rgb = sum_i T_i alpha_i c_i."""
-    total = Integral()
-    total.transmittance = real(1.0)
-    step = int(ray.begin)
-    while step < ray.end:
-        sample = next_sample(grid, free, march, ray, step, contraction)
-        step = sample.step + 1
-        if sample.step < ray.end:
-            if total.n_samples < capacity:
-                kept[row + total.n_samples] = sample
-            total.n_samples += 1
-            weight = total.transmittance * opacity_of(sample.sigma * sample.dt, sample.attenuation)
-            total.rgb += weight * sample.rgb
-            total.depth += weight * sample.t
-            total.transmittance *= sample.attenuation
-            if total.transmittance < march.transmittance_min:
-                step = ray.end
-    return total
-
-
-@wp.func
-def adj_integrate(
-    grid: Grid,
-    free: FreeSpace,
-    march: March,
-    ray: Ray,
-    total: Integral,
-    background: vec3,
-    adj_rgb: vec3,  # of the colour, background included
-    adj_opacity: real,
-    adj_depth: real,
-    content_distance: real,
-    row: int,
-    capacity: int,
-    contraction: int,
-    scaling: int,
-    jacobian: int,
-    kept: wp.array(dtype=Sample),  # read, as integrate left it
-    worker: int,
-    adj_values: wp.array2d(dtype=vec4),  # [n_workers, X * Y * Z], added to
-    touched: wp.array(dtype=wp.uint8),  # [n_tiles] set to 1 where adj_values was added to
-):
-    """Adjoint of integrate. With G_i = dL/dw_i = <adj_rgb, c_i> + adj_depth t_i,
-
-    dL/dsigma_i = dt_i (T_{i+1} G_i - sum_{j>i} w_j G_j - T_end dL/dT_end),   dL/dc_i = w_i adj_rgb,
-
-    both multiplied by the distance scaling. The two sums are what lies behind sample i.
-    """
-    adj_transmittance = wp.dot(adj_rgb, background) - adj_opacity
-    behind = (
-        wp.dot(adj_rgb, total.rgb)
-        + adj_depth * total.depth
-        + adj_transmittance * total.transmittance
-    )
-    transmittance = real(1.0)
-    step = int(ray.begin)
-    for n in range(total.n_samples):
-        sample = Sample()
-        if n < capacity:
-            sample = kept[row + n]
-        else:
-            sample = next_sample(grid, free, march, ray, step, contraction)
-        step = sample.step + 1
-        weight = transmittance * opacity_of(sample.sigma * sample.dt, sample.attenuation)
-        transmittance *= sample.attenuation
-        adj_weight = wp.dot(adj_rgb, sample.rgb) + adj_depth * sample.t
-        behind -= weight * adj_weight
-        scale = distance_scale(sample.t, content_distance, sample.det_jacobian, scaling, jacobian)
-        adj_sigma = scale * (sample.dt * (transmittance * adj_weight - behind))
-        adj_sample_rgb = scale * (weight * adj_rgb)
-        adj_shade(grid, sample, adj_sigma, adj_sample_rgb, worker, adj_values, touched)
+def kept_type(variant: Variant) -> type:
+    """What these kernels keep of a ray between the passes: samples or packs of eight."""
+    return packs.Pack if variant.packed else Sample
 
 
 @wp.func
@@ -230,10 +46,14 @@ def ray_value(values: wp.array(dtype=real), ray: int) -> real:  # noqa: F811 (an
 def render_forward_kernel(variant: Variant) -> wp.Kernel:
     """Render rays; what it depends on of the variant is the contraction."""
     contraction = variant.contraction
+    walk = packs if variant.packed else integral
+    integrate = walk.integrate
+    Kept = kept_type(variant)
 
     @wp.kernel(module="unique", enable_backward=False)
     def render_forward(
         first: int,  # this launch works on rays first, first + 1, ...
+        worker: int,  # row of kept
         # scene
         grid: Grid,
         free: FreeSpace,
@@ -244,7 +64,8 @@ def render_forward_kernel(variant: Variant) -> wp.Kernel:
         offsets: wp.array(dtype=real),  # [n_rays] or [1], in [0, 1)
         background: wp.array(dtype=vec3),  # [n_rays] or [1], rgb in [0, 1]
         # scratch
-        kept: wp.array(dtype=Sample),  # untouched
+        capacity: int,  # of kept, for each worker
+        kept: wp.array(dtype=Kept),  # [n_workers * capacity]
         # out
         out_rgb: wp.array(dtype=vec3),  # [n_rays] with background
         out_transmittance: wp.array(dtype=real),  # [n_rays]
@@ -255,7 +76,7 @@ def render_forward_kernel(variant: Variant) -> wp.Kernel:
         ray = prepare_ray(
             grid, march, origins[i], directions[i], ray_value(offsets, i), contraction
         )
-        total = integrate(grid, free, march, ray, 0, 0, contraction, kept)
+        total = integrate(grid, free, march, ray, worker * capacity, capacity, contraction, kept)
         out_rgb[i] = total.rgb + total.transmittance * ray_value(background, i)
         out_transmittance[i] = total.transmittance
         out_depth[i] = total.depth
@@ -268,13 +89,16 @@ def render_forward_kernel(variant: Variant) -> wp.Kernel:
 def render_backward_kernel(variant: Variant) -> wp.Kernel:
     """Adjoint of render_forward, replaying its rays; gradients of samples are scaled."""
     contraction = variant.contraction
+    walk = packs if variant.packed else integral
+    adj_integrate = walk.adj_integrate
+    Kept = kept_type(variant)
     scaling = variant.scaling
     jacobian = variant.jacobian
 
     @wp.kernel(module="unique", enable_backward=False)
     def render_backward(
         first: int,  # this launch works on rays first, first + 1, ...
-        worker: int,  # row of adj_values
+        worker: int,  # row of adj_values and of kept
         # scene
         grid: Grid,
         free: FreeSpace,
@@ -295,10 +119,11 @@ def render_backward_kernel(variant: Variant) -> wp.Kernel:
         adj_opacity: wp.array(dtype=real),  # [n_rays]
         adj_depth: wp.array(dtype=real),  # [n_rays]
         # scratch
-        kept: wp.array(dtype=Sample),  # untouched
+        capacity: int,  # of kept, for each worker
+        kept: wp.array(dtype=Kept),  # [n_workers * capacity]
         # out
         adj_values: wp.array2d(dtype=vec4),  # [n_workers, X * Y * Z], added to
-        touched: wp.array(dtype=wp.uint8),  # [n_tiles] set to 1 where adj_values was added to
+        touched: wp.array(dtype=wp.uint8),  # [n_tiles] as in interp.adj_gather
     ):
         i = first + wp.tid()
         ray = prepare_ray(
@@ -320,8 +145,8 @@ def render_backward_kernel(variant: Variant) -> wp.Kernel:
             adj_opacity[i],
             adj_depth[i],
             ray_value(content_distance, i),
-            0,
-            0,
+            worker * capacity,
+            capacity,
             contraction,
             scaling,
             jacobian,
@@ -338,6 +163,9 @@ def render_backward_kernel(variant: Variant) -> wp.Kernel:
 def render_train_kernel(variant: Variant) -> wp.Kernel:
     """Forward, loss and adjoint of a batch in one launch."""
     contraction = variant.contraction
+    walk = packs if variant.packed else integral
+    integrate, adj_integrate = walk.integrate, walk.adj_integrate
+    Kept = kept_type(variant)
     scaling = variant.scaling
     jacobian = variant.jacobian
 
@@ -358,13 +186,13 @@ def render_train_kernel(variant: Variant) -> wp.Kernel:
         target_rgb: wp.array(dtype=vec3),  # [n_rays] in [0, 1]
         loss_weight: real,  # of one ray
         # scratch
-        capacity: int,  # samples of a ray that are kept between the passes
-        kept: wp.array(dtype=Sample),  # [n_workers * capacity]
+        capacity: int,  # of kept, for each worker: what of a ray is kept between the passes
+        kept: wp.array(dtype=Kept),  # [n_workers * capacity]
         # out
         out_error: wp.array(dtype=real),  # [n_rays] squared error
         out_n_samples: wp.array(dtype=wp.int32),  # [n_rays]
         adj_values: wp.array2d(dtype=vec4),  # [n_workers, X * Y * Z], added to
-        touched: wp.array(dtype=wp.uint8),  # [n_tiles] set to 1 where adj_values was added to
+        touched: wp.array(dtype=wp.uint8),  # [n_tiles] as in interp.adj_gather
     ):
         i = first + wp.tid()
         row = worker * capacity

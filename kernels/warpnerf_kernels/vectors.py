@@ -1,0 +1,127 @@
+"""The words that packs.py is written in: vectors of eight lanes, in C++ for Clang."""
+
+import warp as wp
+
+from .interp import TILE
+
+LANES = 8
+"""Steps in a pack, and numbers in a vector."""
+
+lanes = wp.types.vector(LANES, wp.float32)
+lanes_int = wp.types.vector(LANES, wp.int32)
+float3 = wp.types.vector(3, wp.float32)
+float4 = wp.types.vector(4, wp.float32)
+
+VECTORS = (
+    f"constexpr int TILE = {TILE};"
+    r"""
+// Eight lanes; four channels of a node; and both where they lie in memory.
+typedef float vec __attribute__((ext_vector_type(8)));
+typedef int ivec __attribute__((ext_vector_type(8)));
+typedef float quad __attribute__((ext_vector_type(4)));
+typedef float vec_at __attribute__((ext_vector_type(8), aligned(4), may_alias));
+typedef int ivec_at __attribute__((ext_vector_type(8), aligned(4), may_alias));
+typedef float quad_at __attribute__((ext_vector_type(4), aligned(4), may_alias));
+
+auto load = [&](const auto& x) -> vec { return *(const vec_at*)&x; };
+auto load_int = [&](const auto& x) -> ivec { return *(const ivec_at*)&x; };
+auto store = [&](auto& x, vec v) { *(vec_at*)&x = v; };
+auto store_int = [&](auto& x, ivec v) { *(ivec_at*)&x = v; };
+
+auto all = [&](float x) -> vec { return vec(x); };
+auto least = [&](auto a, auto b) { return __builtin_elementwise_min(a, b); };
+auto most = [&](auto a, auto b) { return __builtin_elementwise_max(a, b); };
+auto magnitude = [&](vec x) -> vec { return __builtin_elementwise_abs(x); };
+auto truncate = [&](vec x) -> ivec { return __builtin_convertvector(x, ivec); };
+auto to_float = [&](ivec x) -> vec { return __builtin_convertvector(x, vec); };
+auto clamp = [&](ivec x, int size) -> ivec { return least(most(x, ivec(0)), ivec(size - 1)); };
+auto fma = [&](auto a, auto b, auto c) {
+#if defined(__FMA__) || defined(__ARM_FEATURE_FMA)
+    return __builtin_elementwise_fma(a, b, c);
+#else
+    return a * b + c;
+#endif
+};
+
+// exp(x) = 2^n exp(r), r = x - n log 2 in two parts, |r| <= log(2) / 2.
+// The polynomial is (exp(r) - 1 - r) / r^2 at five Chebyshev points; relative error 7e-8.
+auto exponential = [&](vec x) -> vec {
+    x = least(most(x, all(-87.0f)), all(88.0f));
+    vec n = __builtin_elementwise_rint(x * 1.44269504f);
+    vec r = fma(n, all(2.12194440e-4f), fma(n, all(-0.693359375f), x));
+    vec p = fma(all(1.39261840e-3f), r, all(8.36317893e-3f));
+    p = fma(p, r, all(4.16665561e-2f));
+    p = fma(p, r, all(1.66665763e-1f));
+    p = fma(p, r, all(0.5f));
+    p = fma(p, r * r, r) + 1.0f;
+    return __builtin_bit_cast(vec, __builtin_bit_cast(ivec, p) + (truncate(n) << 23));
+};
+// log(1 + y) = 2 artanh(z), z = y / (2 + y), for y in [0, 1]; precise for small y as well.
+// The polynomial is 2 artanh(z) / z at five Chebyshev points of z^2; relative error 1e-7.
+auto log1p = [&](vec y) -> vec {
+    vec z = y / (2.0f + y);
+    vec z2 = z * z;
+    vec p = fma(all(0.281577796f), z2, all(0.279651582f));
+    p = fma(p, z2, all(0.400245965f));
+    p = fma(p, z2, all(0.666663229f));
+    return z * fma(p, z2, all(2.0f));
+};
+auto sigmoid = [&](vec x) -> vec { return 1.0f / (1.0f + exponential(-x)); };
+
+auto sum = [&](vec x) -> float {
+    quad h = x.lo + x.hi;
+    return (h[0] + h[2]) + (h[1] + h[3]);
+};
+auto count = [&](ivec x) -> int { return -__builtin_reduce_add(x); };
+// In lane i the sum, or product, of lanes 0 to i.
+auto running_sum = [&](vec x) -> vec {
+    vec zero = all(0.0f);
+    x += __builtin_shufflevector(x, zero, 8, 0, 1, 2, 3, 4, 5, 6);
+    x += __builtin_shufflevector(x, zero, 8, 8, 0, 1, 2, 3, 4, 5);
+    return x + __builtin_shufflevector(x, zero, 8, 8, 8, 8, 0, 1, 2, 3);
+};
+auto running_product = [&](vec x) -> vec {
+    vec one = all(1.0f);
+    x *= __builtin_shufflevector(x, one, 8, 0, 1, 2, 3, 4, 5, 6);
+    x *= __builtin_shufflevector(x, one, 8, 8, 0, 1, 2, 3, 4, 5);
+    return x * __builtin_shufflevector(x, one, 8, 8, 8, 8, 0, 1, 2, 3);
+};
+// Eight quads as four vectors, one a channel, and back.
+auto to_lanes = [&](const quad* q, vec& a, vec& b, vec& c, vec& d) {
+    vec q04 = __builtin_shufflevector(q[0], q[4], 0, 1, 2, 3, 4, 5, 6, 7);
+    vec q15 = __builtin_shufflevector(q[1], q[5], 0, 1, 2, 3, 4, 5, 6, 7);
+    vec q26 = __builtin_shufflevector(q[2], q[6], 0, 1, 2, 3, 4, 5, 6, 7);
+    vec q37 = __builtin_shufflevector(q[3], q[7], 0, 1, 2, 3, 4, 5, 6, 7);
+    vec ab0145 = __builtin_shufflevector(q04, q15, 0, 8, 1, 9, 4, 12, 5, 13);
+    vec ab2367 = __builtin_shufflevector(q26, q37, 0, 8, 1, 9, 4, 12, 5, 13);
+    vec cd0145 = __builtin_shufflevector(q04, q15, 2, 10, 3, 11, 6, 14, 7, 15);
+    vec cd2367 = __builtin_shufflevector(q26, q37, 2, 10, 3, 11, 6, 14, 7, 15);
+    a = __builtin_shufflevector(ab0145, ab2367, 0, 1, 8, 9, 4, 5, 12, 13);
+    b = __builtin_shufflevector(ab0145, ab2367, 2, 3, 10, 11, 6, 7, 14, 15);
+    c = __builtin_shufflevector(cd0145, cd2367, 0, 1, 8, 9, 4, 5, 12, 13);
+    d = __builtin_shufflevector(cd0145, cd2367, 2, 3, 10, 11, 6, 7, 14, 15);
+};
+auto to_quads = [&](vec a, vec b, vec c, vec d, quad* q) {
+    vec ab0145 = __builtin_shufflevector(a, b, 0, 8, 1, 9, 4, 12, 5, 13);
+    vec ab2367 = __builtin_shufflevector(a, b, 2, 10, 3, 11, 6, 14, 7, 15);
+    vec cd0145 = __builtin_shufflevector(c, d, 0, 8, 1, 9, 4, 12, 5, 13);
+    vec cd2367 = __builtin_shufflevector(c, d, 2, 10, 3, 11, 6, 14, 7, 15);
+    vec q04 = __builtin_shufflevector(ab0145, cd0145, 0, 1, 8, 9, 4, 5, 12, 13);
+    vec q15 = __builtin_shufflevector(ab0145, cd0145, 2, 3, 10, 11, 6, 7, 14, 15);
+    vec q26 = __builtin_shufflevector(ab2367, cd2367, 0, 1, 8, 9, 4, 5, 12, 13);
+    vec q37 = __builtin_shufflevector(ab2367, cd2367, 2, 3, 10, 11, 6, 7, 14, 15);
+    q[0] = q04.lo; q[1] = q15.lo; q[2] = q26.lo; q[3] = q37.lo;
+    q[4] = q04.hi; q[5] = q15.hi; q[6] = q26.hi; q[7] = q37.hi;
+};
+// Bring the four columns of nodes around a sample into the cache, ahead of their use.
+auto fetch = [&](const auto* node, const auto& size) {
+    const size_t stride_y = size.c[2], stride_x = stride_y * size.c[1];
+    __builtin_prefetch(node);
+    __builtin_prefetch(node + stride_y);
+    __builtin_prefetch(node + stride_x);
+    __builtin_prefetch(node + stride_x + stride_y);
+};
+"""
+)
+"""What a native function of packs.py begins with. vec and ivec hold a number for each of eight
+steps, quad the four channels of a node; names with _at are the same where they lie in memory."""
