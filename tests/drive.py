@@ -9,7 +9,7 @@ import reference
 import torch
 import warp as wp
 from numpy.typing import NDArray
-from warpnerf_kernels import interp, precision
+from warpnerf_kernels import precision, tiles
 
 from warpnerf.grid import CONTRACTIONS, free_struct, grid_struct
 from warpnerf.parallel import Workers
@@ -218,7 +218,7 @@ class Kernels:
 
     def touched(self, n_nodes: int, value: int = 0) -> wp.array:
         """Flags of the tiles of nodes that have a gradient."""
-        n_tiles = -(-n_nodes // interp.TILE)
+        n_tiles = -(-n_nodes // tiles.TILE)
         return wp.full(n_tiles, value, dtype=wp.uint8, device=self.device)
 
     def train(
@@ -252,7 +252,7 @@ def total_gradient(gradients: wp.array, touched: wp.array) -> Float64:
     rows = gradients.numpy()
     nodes = np.flatnonzero(rows.any(axis=(0, 2)))
     flags = np.append(touched.numpy(), 0)
-    assert (flags[nodes // interp.TILE] | flags[nodes // interp.TILE - 1]).all()
+    assert (flags[nodes // tiles.TILE] | flags[nodes // tiles.TILE - 1]).all()
     return np.asarray(rows.sum(axis=0))
 
 

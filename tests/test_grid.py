@@ -14,7 +14,9 @@ from warpnerf_kernels.types import vec4
 from warpnerf.checks import InputError
 from warpnerf.grid import FreeCells, VoxelGrid, grid_size, require_memory
 from warpnerf.parallel import Workers
+from warpnerf.render import Steps
 
+MARCH = Steps(near=0.0, far=10.0, step=0.05).struct()
 BOX_MIN, BOX_MAX = np.array([-1.0, 0.5, 2.0]), np.array([1.4, 2.0, 4.5])
 
 
@@ -98,7 +100,7 @@ def test_free_cells_of_a_grid(workers: Workers) -> None:
     """Occupied around what is dense, and elsewhere the distance to it, in cells."""
     values = np.full((33, 21, 25, 4), -9.0)
     values[4:6, 10, 12] = 4.0
-    free = FreeCells.of(grid_of(values, workers), workers, step=0.05, alpha_min=1e-3)
+    free = FreeCells.of(grid_of(values, workers), workers, MARCH, alpha_min=1e-3)
     assert free.size == (16, 10, 12)
     distance = free.distance.numpy().reshape(free.size)
     occupied = np.argwhere(distance == 0)
@@ -114,7 +116,7 @@ def test_free_cells_of_a_grid(workers: Workers) -> None:
 
 def test_free_cells_at_the_limits(workers: Workers) -> None:
     empty = grid_of(np.full((9, 9, 9, 4), -20.0), workers)
-    free = FreeCells.of(empty, workers, step=0.05, alpha_min=1e-3)
+    free = FreeCells.of(empty, workers, MARCH, alpha_min=1e-3)
     assert free.share() == 0.0 and free.occupied_range() is None
     assert (free.distance.numpy() == 9).all()
     assert FreeCells.none(workers).share() == 1.0

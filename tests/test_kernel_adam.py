@@ -6,7 +6,7 @@ import numpy as np
 import reference
 import torch
 from drive import N_SEEDS, Kernels
-from warpnerf_kernels.interp import TILE
+from warpnerf_kernels.tiles import STRETCH, TILE
 
 RATE = np.array([0.2, 0.1, 0.05, 0.02])
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-4
@@ -19,7 +19,7 @@ def step(
     values: Any,
     mean: Any,
     square: Any,
-    span: int = TILE,
+    span: int = STRETCH,
     flags: Any = None,
 ) -> tuple[Any, Any, Any, Any]:
     vec4 = kernels.types.vec4
@@ -81,10 +81,10 @@ def test_tiles_that_are_not_flagged_are_passed_over(kernels64: Kernels) -> None:
     rng = np.random.default_rng(4)
     gradients, values = rng.normal(size=(2, 100, 4)), rng.normal(size=(100, 4))
     full = step(kernels64, 1, gradients, values, 0 * values, 0 * values)
-    flags = np.arange(7) % 4 == 0
+    flags = np.arange(100 // TILE) % 4 == 0
     # The first node of the next tile may have been added to as well.
     flagged = np.repeat(flags | np.roll(flags, 1), TILE)[:100]
-    for span in (1, TILE):
+    for span in (1, TILE, 48):
         found = step(kernels64, 1, gradients, values, 0 * values, 0 * values, span, flags)
         assert np.array_equal(found[1][flagged], full[1][flagged])
         assert np.array_equal(found[1][~flagged], values[~flagged])

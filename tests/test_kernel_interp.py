@@ -9,7 +9,7 @@ import reference
 import torch
 import warp as wp
 from drive import N_SEEDS, Kernels, assert_close, directional_differences
-from warpnerf_kernels.interp import TILE
+from warpnerf_kernels.tiles import TILE
 
 
 def problem(seed: int) -> tuple[Any, Any, Any]:

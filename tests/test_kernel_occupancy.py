@@ -18,6 +18,7 @@ from drive import (
     unbounded,
 )
 
+from warpnerf.grid import CONTRACTIONS
 from warpnerf.render import Steps
 
 FAR = 8
@@ -124,7 +125,7 @@ def test_skipping_in_float32_changes_no_bit(contraction: str, kernels32: Kernels
         assert np.array_equal(short.rgb, leaping.rgb)
 
 
-def mark(kernels: Kernels, p: Problem, cells: Any, step: float, alpha_min: float) -> Any:
+def mark(kernels: Kernels, p: Problem, cells: Any, steps: Steps, alpha_min: float) -> Any:
     n = int(np.prod(cells))
     out = wp.zeros(n, dtype=wp.uint8, device=kernels.device)
     kernels.workers.launch(
@@ -132,7 +133,8 @@ def mark(kernels: Kernels, p: Problem, cells: Any, step: float, alpha_min: float
         n,
         kernels.grid(p),
         wp.vec3i(*cells),
-        step,
+        steps.struct(kernels.types),
+        CONTRACTIONS[p.contraction],
         alpha_min,
         out,
     )
@@ -147,7 +149,7 @@ def test_marked_cells(kernels64: Kernels) -> None:
         raw = np.full((*size, 4), -12.0)
         raw[tuple(rng.integers(0, size))] = 3.0
         p = make_problem(seed, raw=raw, density_scale=2.0)
-        marked = mark(kernels64, p, cells, 0.1, 1e-3)
+        marked = mark(kernels64, p, cells, replace(p.steps, step=0.1), 1e-3)
         assert set(np.unique(marked)) <= {0, FAR + 1}
         node = np.argwhere(raw[..., 0] > 0)[0]
         for cell in np.ndindex(*cells):
@@ -162,8 +164,9 @@ def test_threshold_is_of_alpha(kernels64: Kernels) -> None:
     raw = np.full((3, 3, 3, 4), -1.0)
     p = make_problem(0, raw=raw, density_shift=shift, density_scale=factor)
     alpha = 1.0 - np.exp(-factor * np.log1p(np.exp(-1.0 + shift)) * step)
-    assert (mark(kernels64, p, (2, 2, 2), step, alpha * (1.0 - 1e-6)) == 0).all()
-    assert (mark(kernels64, p, (2, 2, 2), step, alpha * (1.0 + 1e-6)) == FAR + 1).all()
+    steps = replace(p.steps, step=step)
+    assert (mark(kernels64, p, (2, 2, 2), steps, alpha * (1.0 - 1e-6)) == 0).all()
+    assert (mark(kernels64, p, (2, 2, 2), steps, alpha * (1.0 + 1e-6)) == FAR + 1).all()
 
 
 def test_what_free_space_hides_is_below_the_threshold(kernels64: Kernels) -> None:
@@ -173,11 +176,36 @@ def test_what_free_space_hides_is_below_the_threshold(kernels64: Kernels) -> Non
         raw = p.raw - [9.0, 0.0, 0.0, 0.0]
         raw[tuple(np.random.default_rng(seed).integers(4, 12, size=(3, 9)))] += 12.0
         p = replace(p, raw=raw)
-        step, alpha_min = p.steps.step, 0.01
-        marked = mark(kernels64, p, (8, 7, 8), step, alpha_min) == 0
+        alpha_min = 0.01
+        marked = mark(kernels64, p, (8, 7, 8), p.steps, alpha_min) == 0
         assert 0 < marked.sum() < marked.size
         skipped = kernels64.forward(replace(p, free=spread(kernels64, marked)))
         full = kernels64.forward(p)
         hidden = full.n_samples - skipped.n_samples
         assert hidden.sum() > 0
         assert (np.abs(full.opacity - skipped.opacity) <= hidden * alpha_min).all()
+
+
+@pytest.mark.parametrize(("contraction", "border"), [("linf", 0.2), ("l2", 0.8)])
+def test_alpha_is_judged_over_the_longer_steps_of_folded_space(
+    contraction: str, border: float, kernels64: Kernels
+) -> None:
+    """Of thin matter all around, what is hidden is below the threshold even where steps grow."""
+    hidden, visible_outside = 0, 0
+    for seed in range(N_SEEDS):
+        p = unbounded(make_problem(seed, size=(25, 26, 24), n_rays=60), contraction, border)
+        p = replace(p, steps=Steps(near=0.0, far=60.0, step=0.05, n_linear=80, growth=0.06))
+        p = replace(p, raw=p.raw - [7.0, 0.0, 0.0, 0.0])
+        alpha_min = 1e-3
+        marked = mark(kernels64, p, (12, 12, 12), p.steps, alpha_min) == 0
+        plain = mark(kernels64, p, (12, 12, 12), replace(p.steps, growth=0.0), alpha_min) == 0
+        assert marked[plain].all() and not plain[marked].all()
+        skipped = kernels64.forward(replace(p, free=spread(kernels64, marked)))
+        full = kernels64.forward(p)
+        assert (
+            np.abs(full.opacity - skipped.opacity)
+            <= (full.n_samples - skipped.n_samples) * alpha_min
+        ).all()
+        hidden += int((full.n_samples - skipped.n_samples).sum())
+        visible_outside += int((marked & ~plain).sum())
+    assert hidden > 0 and visible_outside > 0

@@ -7,7 +7,7 @@ import reference
 import torch
 import warp as wp
 from drive import N_SEEDS, Kernels, assert_close, directional_differences
-from warpnerf_kernels.interp import TILE
+from warpnerf_kernels.tiles import STRETCH, TILE
 
 
 def problem(seed: int) -> tuple[Any, Any]:
@@ -32,7 +32,12 @@ def variation(kernels: Kernels, values: Any, weight: Any) -> float:
 
 
 def adj_variation(
-    kernels: Kernels, values: Any, weight: Any, gradients: Any, span: int = TILE, flags: Any = None
+    kernels: Kernels,
+    values: Any,
+    weight: Any,
+    gradients: Any,
+    span: int = STRETCH,
+    flags: Any = None,
 ) -> Any:
     """gradients [n_workers, n_nodes, 4], with the gradient of total variation added."""
     n = values[..., 0].size
@@ -103,10 +108,10 @@ def test_tiles_that_are_not_flagged_are_passed_over(kernels64: Kernels) -> None:
     values, weight = rng.normal(size=(4, 5, 7, 4)), np.ones(4)
     ones = np.ones((1, 140, 4))
     full = adj_variation(kernels64, values, weight, ones)[0]
-    flags = np.arange(9) % 4 == 0
+    flags = np.arange(140 // TILE) % 4 == 0
     # The first node of the next tile may have been added to as well.
     flagged = np.repeat(flags | np.roll(flags, 1), TILE)[:140]
-    for span in (1, TILE):
+    for span in (1, TILE, 48):
         after = adj_variation(kernels64, values, weight, ones, span, flags)[0]
         assert np.array_equal(after[flagged], full[flagged])
         assert (after[~flagged] == 1.0).all()

@@ -41,7 +41,7 @@ def tiny_field(*, density: float = 3.0, contraction: str = "none") -> Field:
     )
     return Field(
         grid=grid,
-        free=FreeCells.of(grid, workers, steps.step, 1e-3),
+        free=FreeCells.of(grid, workers, steps.struct(), 1e-3),
         steps=steps,
         background=(0.1, 0.6, 0.9),
         workers=workers,

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 from warpnerf_kernels import contraction, interp, occupancy, types
-from warpnerf_kernels.types import FreeSpace, Grid, vec3, vec4
+from warpnerf_kernels.types import FreeSpace, Grid, March, vec3, vec4
 
 from warpnerf.checks import InputError
 from warpnerf.config import Contraction
@@ -187,13 +187,13 @@ class FreeCells:
         )
 
     @staticmethod
-    def of(grid: VoxelGrid, workers: Workers, step: float, alpha_min: float) -> FreeCells:
+    def of(grid: VoxelGrid, workers: Workers, march: March, alpha_min: float) -> FreeCells:
         """Look a grid over.
 
         Args:
             grid: The grid.
             workers: Where to work.
-            step: Length over which opacity is judged, scene units.
+            march: How rays are stepped: opacity is judged over the longest step there can be.
             alpha_min: The least opacity that counts as visible.
         """
         size = tuple(max(1, (n - 1) // 2) for n in grid.size)
@@ -201,7 +201,16 @@ class FreeCells:
         distance = wp.empty(n, dtype=wp.uint8, device=workers.device)
         spread = wp.empty_like(distance)
         cells = wp.vec3i(*size)
-        workers.launch(occupancy.mark_occupied, n, grid.struct(), cells, step, alpha_min, distance)
+        workers.launch(
+            occupancy.mark_occupied,
+            n,
+            grid.struct(),
+            cells,
+            march,
+            CONTRACTIONS[grid.contraction],
+            alpha_min,
+            distance,
+        )
         for axis in range(3):
             workers.launch(occupancy.spread_distance, n, cells, axis, distance, spread)
             distance, spread = spread, distance

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 import warp as wp
-from warpnerf_kernels import adam, interp, regularize
+from warpnerf_kernels import adam, regularize, tiles
 from warpnerf_kernels.types import vec4
 
 from warpnerf.config import OptimConfig
@@ -99,6 +99,6 @@ def add_total_variation(
 
 
 def _shares(grid: VoxelGrid, workers: Workers) -> tuple[int, int]:
-    """How many threads work on the nodes, and on how many each: a core takes a tile at a time."""
-    span = 1 if workers.device.is_cuda else interp.TILE
+    """How many threads work on the nodes, and on how many each: a core takes a stretch."""
+    span = 1 if workers.device.is_cuda else tiles.STRETCH
     return -(-math.prod(grid.size) // span), span

@@ -7,7 +7,7 @@ from types import ModuleType
 from typing import Any
 
 import warp as wp
-from warpnerf_kernels import gradscale, interp, types
+from warpnerf_kernels import gradscale, tiles, types
 from warpnerf_kernels import render as kernels
 from warpnerf_kernels.types import real, vec3, vec4
 
@@ -168,7 +168,7 @@ class Gradients:
     @staticmethod
     def zeros(n_nodes: int, workers: Workers) -> Gradients:
         """No gradient yet."""
-        n_tiles = -(-n_nodes // interp.TILE)
+        n_tiles = -(-n_nodes // tiles.TILE)
         return Gradients(
             rows=wp.zeros((workers.count, n_nodes), dtype=vec4, device=workers.device),
             touched=wp.zeros(n_tiles, dtype=wp.uint8, device=workers.device),

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, get_args
 import numpy as np
 import torch
 import warp as wp
-from warpnerf_kernels import contraction, gradscale, interp, precision
+from warpnerf_kernels import contraction, gradscale, precision, tiles
 
 from warpnerf.checks import InputError, require_at_least, require_one_of, require_positive
 from warpnerf.config import Scaling
@@ -260,7 +260,7 @@ class _Render(torch.autograd.Function):
         adj_rgb, adj_opacity, adj_depth = (grad.contiguous() for grad in grads)
         n_nodes = raw.shape[:3].numel()
         adj_raw = raw.new_zeros(workers.count, n_nodes, 4)
-        touched = torch.zeros(-(-n_nodes // interp.TILE), dtype=torch.uint8, device=raw.device)
+        touched = torch.zeros(-(-n_nodes // tiles.TILE), dtype=torch.uint8, device=raw.device)
         variant = _variant(raw, kernels, call.scaling)
         with _stream(raw):
             workers.launch_owned(

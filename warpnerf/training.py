@@ -308,7 +308,7 @@ class Trainer:
         if self.steps_done < FIRST_LOOK:
             return
         self.free = FreeCells.of(
-            self.grid, self.workers, self.march_steps().step, self.config.alpha_min
+            self.grid, self.workers, self.march_steps().struct(), self.config.alpha_min
         )
         self._occupied = self.free.share()
 

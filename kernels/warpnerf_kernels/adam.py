@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from .interp import has_gradient, tile_of
+from .tiles import TILE, next_tile, prefetch, prefetch_row, tile_of
 from .types import real, vec4
 
 wp.set_module_options({"enable_backward": False})
@@ -11,7 +11,7 @@ wp.set_module_options({"enable_backward": False})
 @wp.kernel
 def adam_step(
     first: int,
-    span: int,  # nodes per thread: 1, or a tile
+    span: int,  # nodes per thread
     learning_rate: vec4,  # per channel
     beta1: real,
     beta2: real,
@@ -26,28 +26,41 @@ def adam_step(
 ):
     """One step. An entry whose gradient is exactly zero keeps its value and its moments."""
     start = (first + wp.tid()) * span
-    if not has_gradient(touched, tile_of(start)):
-        return
-    zero = vec4()
-    for i in range(start, wp.min(start + span, values.shape[0])):
-        gradient = vec4()
+    end = wp.min(start + span, values.shape[0])
+    last = tile_of(end - 1) + 1
+    tile = next_tile(touched, tile_of(start), last)
+    while tile < last:
+        node = tile * wp.static(TILE)
         for worker in range(gradients.shape[0]):
-            row = gradients[worker, i]
-            if not (row == zero):
-                gradient += row
-                gradients[worker, i] = zero
-        if not (gradient == zero):
-            value = values[i]
-            m = mean[i]
-            v = square[i]
-            for channel in range(4):
-                g = gradient[channel]
-                if g != real(0.0):
-                    m[channel] = beta1 * m[channel] + (real(1.0) - beta1) * g
-                    v[channel] = beta2 * v[channel] + (real(1.0) - beta2) * g * g
-                    value[channel] = value[channel] - learning_rate[channel] * (
-                        correction1 * m[channel]
-                    ) / (wp.sqrt(correction2 * v[channel]) + epsilon)
-            values[i] = value
-            mean[i] = m
-            square[i] = v
+            prefetch_row(gradients, worker, node)
+        prefetch(values, node)
+        prefetch(mean, node)
+        prefetch(square, node)
+        tile = next_tile(touched, tile + 1, last)
+    zero = vec4()
+    tile = next_tile(touched, tile_of(start), last)
+    while tile < last:
+        node = tile * wp.static(TILE)
+        for i in range(wp.max(start, node), wp.min(end, node + wp.static(TILE))):
+            gradient = vec4()
+            for worker in range(gradients.shape[0]):
+                row = gradients[worker, i]
+                if not (row == zero):
+                    gradient += row
+                    gradients[worker, i] = zero
+            if not (gradient == zero):
+                value = values[i]
+                m = mean[i]
+                v = square[i]
+                for channel in range(4):
+                    g = gradient[channel]
+                    if g != real(0.0):
+                        m[channel] = beta1 * m[channel] + (real(1.0) - beta1) * g
+                        v[channel] = beta2 * v[channel] + (real(1.0) - beta2) * g * g
+                        value[channel] = value[channel] - learning_rate[channel] * (
+                            correction1 * m[channel]
+                        ) / (wp.sqrt(correction2 * v[channel]) + epsilon)
+                values[i] = value
+                mean[i] = m
+                square[i] = v
+        tile = next_tile(touched, tile + 1, last)

@@ -2,29 +2,10 @@
 
 import warp as wp
 
+from .tiles import tile_of
 from .types import real, vec3, vec4
 
 wp.set_module_options({"enable_backward": False})
-
-
-TILE = 16
-"""Nodes in a tile, a run along z: what an optimiser step can pass over as a whole."""
-
-
-@wp.func
-def tile_of(node: int) -> int:
-    """The tile that holds a node, given by its flat index."""
-    return node // wp.static(TILE)
-
-
-@wp.func
-def has_gradient(touched: wp.array(dtype=wp.uint8), tile: int) -> bool:  # [n_tiles]
-    """Whether nodes of a tile may have been added to: from itself, or from the one before."""
-    if touched[tile] != wp.uint8(0):
-        return True
-    if tile > 0:
-        return touched[tile - 1] != wp.uint8(0)
-    return False
 
 
 @wp.func

@@ -3,7 +3,9 @@
 import warp as wp
 
 from .activation import softplus
-from .types import Grid, real
+from .contraction import norm_of
+from .march import step_edge
+from .types import Grid, March, real, vec3
 
 wp.set_module_options({"enable_backward": False})
 
@@ -22,12 +24,30 @@ def last_node(cell: int, n_cells: int, n_nodes: int) -> int:
     return wp.min(n_nodes - 1, ((cell + 1) * (n_nodes - 1) + n_cells - 1) // n_cells + 1)
 
 
+@wp.func
+def longest_step(grid: Grid, march: March, c: vec3, contraction: int) -> real:
+    """How long steps can be where contracted coordinates are no larger than c, on each axis.
+
+    A point n boxes out is at most n times as far from a camera as equal steps reach: these go to
+    the farthest corner of the box.
+    """
+    norm = norm_of(c, contraction)
+    if norm <= real(1.0) or march.growth == real(0.0):
+        return march.step
+    t = march.far
+    if norm < real(1.0) + grid.border:
+        n = grid.border / (real(1.0) + grid.border - norm)
+        t = wp.min(t, n * step_edge(march, march.n_linear))
+    return wp.max(march.step, march.growth * t)
+
+
 @wp.kernel
 def mark_occupied(
     first: int,
     grid: Grid,
     size: wp.vec3i,  # cells
-    step: real,  # the length over which alpha is judged, scene units
+    march: March,
+    contraction: int,
     alpha_min: real,  # what counts as visible
     out_distance: wp.array(dtype=wp.uint8),  # [MX * MY * MZ] 0 where occupied, else FAR + 1
 ):
@@ -46,6 +66,14 @@ def mark_occupied(
             ):
                 raw = grid.values[(i * grid.size[1] + j) * grid.size[2] + k]
                 highest = wp.max(highest, raw[0])
+    half = vec3(real(size[0]), real(size[1]), real(size[2])) / real(2.0)
+    middle = vec3(real(ci), real(cj), real(ck)) + vec3(real(0.5)) - half
+    outermost = vec3(
+        (wp.abs(middle[0]) + real(0.5)) / half[0],
+        (wp.abs(middle[1]) + real(0.5)) / half[1],
+        (wp.abs(middle[2]) + real(0.5)) / half[2],
+    )
+    step = longest_step(grid, march, (real(1.0) + grid.border) * outermost, contraction)
     alpha = real(1.0) - wp.exp(-step * grid.density_scale * softplus(highest + grid.density_shift))
     if alpha <= alpha_min:
         out_distance[n] = wp.uint8(FAR + 1)

@@ -6,7 +6,8 @@ huber(d) = d^2 / 2 for |d| <= 1, |d| - 1/2 beyond: an edge costs its height, not
 
 import warp as wp
 
-from .interp import flat_index, has_gradient, tile_of
+from .interp import flat_index
+from .tiles import TILE, next_tile, prefetch, prefetch_row, tile_of
 from .types import real, vec4
 
 wp.set_module_options({"enable_backward": False})
@@ -106,7 +107,7 @@ def total_variation_forward(
 @wp.kernel
 def total_variation_backward(
     first: int,
-    span: int,  # nodes per thread: 1, or a tile
+    span: int,  # nodes per thread
     values: wp.array(dtype=vec4),  # [X * Y * Z]
     size: wp.vec3i,
     weight: vec4,  # per channel
@@ -115,12 +116,29 @@ def total_variation_backward(
 ):
     """d TV / d x at the nodes that already have a gradient; unseen ones stay as they are."""
     start = (first + wp.tid()) * span
-    if not has_gradient(touched, tile_of(start)):
-        return
-    for n in range(start, wp.min(start + span, values.shape[0])):
-        seen = int(0)
+    end = wp.min(start + span, values.shape[0])
+    last = tile_of(end - 1) + 1
+    stride_y = size[2]
+    stride_x = size[1] * size[2]
+    tile = next_tile(touched, tile_of(start), last)
+    while tile < last:
+        node = tile * wp.static(TILE)
         for worker in range(adj_values.shape[0]):
-            if not (adj_values[worker, n] == vec4()):
-                seen = 1
-        if seen == 1:
-            adj_values[0, n] = adj_values[0, n] + adj_node_variation(values, size, weight, n)
+            prefetch_row(adj_values, worker, node)
+        prefetch(values, node)
+        prefetch(values, node - stride_y)
+        prefetch(values, node + stride_y)
+        prefetch(values, node - stride_x)
+        prefetch(values, node + stride_x)
+        tile = next_tile(touched, tile + 1, last)
+    tile = next_tile(touched, tile_of(start), last)
+    while tile < last:
+        node = tile * wp.static(TILE)
+        for n in range(wp.max(start, node), wp.min(end, node + wp.static(TILE))):
+            seen = int(0)
+            for worker in range(adj_values.shape[0]):
+                if not (adj_values[worker, n] == vec4()):
+                    seen = 1
+            if seen == 1:
+                adj_values[0, n] = adj_values[0, n] + adj_node_variation(values, size, weight, n)
+        tile = next_tile(touched, tile + 1, last)

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from .interp import TILE
+from .tiles import TILE
 
 LANES = 8
 """Steps in a pack, and numbers in a vector."""
