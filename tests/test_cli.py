@@ -259,9 +259,7 @@ def reports(folder: Path) -> list[tuple[int, float]]:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGINT for one process there")
-def test_asked_twice_it_ends_at_once_and_the_checkpoint_stays(
-    trained: tuple[Path, str], tmp_path: Path
-) -> None:
+def test_asked_twice_it_ends_at_once_and_the_checkpoint_stays(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     code, out, err = begun(folder, signal.SIGINT, signal.SIGTERM, signal.SIGINT)
     assert code in (130, 143)

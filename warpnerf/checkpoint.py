@@ -11,7 +11,6 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NoReturn
@@ -233,11 +232,11 @@ def _write(path: str | Path, header: dict[str, Any], tensors: dict[str, np.ndarr
 
 def _safetensors(
     metadata: dict[str, str], tensors: dict[str, np.ndarray]
-) -> Iterable[bytes | memoryview]:
-    """The pieces of a safetensors file, the tensors not copied, which the package's ``save`` does.
+) -> list[bytes | memoryview]:
+    """The pieces of a safetensors file, without the copies of all tensors that ``save`` makes.
 
-    Source: https://github.com/huggingface/safetensors#format. Largest types first, so that all
-    are aligned.
+    Format: https://github.com/huggingface/safetensors#format. Wide types come first, so that all
+    tensors are aligned.
     """
     dtypes = {np.dtype(np.float32): "F32", np.dtype(np.uint8): "U8"}
     table: dict[str, Any] = {"__metadata__": metadata}
@@ -252,7 +251,7 @@ def _safetensors(
         pieces.append(np.ascontiguousarray(tensor).data.cast("B"))
     text = json.dumps(table).encode()
     text += b" " * (-len(text) % 8)
-    return (len(text).to_bytes(8, "little"), text, *pieces)
+    return [len(text).to_bytes(8, "little"), text, *pieces]
 
 
 def _read(path: Path) -> tuple[_Header, dict[str, np.ndarray]]:

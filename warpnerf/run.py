@@ -191,8 +191,8 @@ class Run:
         config = self.read_config().train
         if not self.checkpoints:
             raise InputError(
-                f"{self.folder} holds no checkpoint: nothing was saved; train anew with "
-                f"--output {self.folder} --overwrite."
+                f"{self.folder} holds no checkpoint to go on from; train anew with --output "
+                f"{self.folder} --overwrite."
             )
         path, state, notes = _first_whole(self.checkpoints, load_checkpoint)
         for name, here, there in differences(config, state.config):
