@@ -5,6 +5,7 @@ import os
 import pytest
 import warp as wp
 from drive import Kernels
+from watched_command import assert_trained, make_scene, train
 
 if "WARP_CACHE_PATH" in os.environ:
     wp.config.kernel_cache_dir = os.environ["WARP_CACHE_PATH"]
@@ -34,3 +35,10 @@ def kernels64(device: str) -> Kernels:
 @pytest.fixture(scope="session")
 def kernels32(device: str) -> Kernels:
     return Kernels("float32", device)
+
+
+@pytest.fixture(scope="session")
+def compiled_kernels(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """What a run compiles is in the cache, so that commands under test take their usual time."""
+    folder = tmp_path_factory.mktemp("compiled")
+    assert_trained(train(make_scene(folder), folder=folder, limit=None))

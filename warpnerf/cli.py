@@ -33,6 +33,7 @@ def train_command(
     time_limit: float | None = None,
     scaling: Scaling | None = None,
     content_distance: float | Literal["auto"] | None = None,
+    voxels: int | None = None,
     near: float | None = None,
     downscale: int = 1,
     device: str | None = None,
@@ -50,6 +51,7 @@ def train_command(
         time_limit: Seconds of training; the schedule is squeezed to fit.
         scaling: How a sample's gradient depends on its distance from the camera.
         content_distance: Where gradients reach full strength, in the scene's units.
+        voxels: Nodes of the final grid, in all; memory goes with their number.
         near: Nothing is sampled nearer to the camera than this, in the scene's units.
         downscale: Average blocks of so many pixels squared.
         device: cpu, cuda, cuda:1, ...
@@ -69,6 +71,8 @@ def train_command(
     }
     given = {name: value for name, value in chosen.items() if value is not None}
     config = dataclasses.replace(config, **given)
+    if voxels is not None:
+        config = dataclasses.replace(config, grid=dataclasses.replace(config.grid, voxels=voxels))
     if near is not None:
         config = dataclasses.replace(config, march=dataclasses.replace(config.march, near=near))
     return _train(scene, output, downscale, config, overwrite)
@@ -187,6 +191,8 @@ def _describe(scene: Scene, content_distance: float, config: TrainConfig) -> Non
     shown = ", ".join(f"{w} x {h}" for w, h in sizes[:3]) + (", ..." if len(sizes) > 3 else "")
     extent = scene.box_max - scene.box_min
     print(f"{scene.name}: {train} training and {test} test views, {shown} pixels")
+    for warning in scene.warnings:
+        print(f"  warning: {warning}")
     for note in scene.notes:
         print(f"  note: {note}")
     print(f"  content distance {content_distance:.4g} scene units, scaling {config.scaling}")

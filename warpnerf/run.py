@@ -83,7 +83,7 @@ class Run:
                     "content_distance": content_distance,
                     "box_min": scene.box_min.tolist(),
                     "box_max": scene.box_max.tolist(),
-                    "notes": list(scene.notes),
+                    "notes": [*scene.warnings, *scene.notes],
                     "train": asdict(config),
                 },
             )
