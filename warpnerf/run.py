@@ -21,8 +21,8 @@ from warpnerf.checks import InputError
 from warpnerf.config import TrainConfig
 from warpnerf.evaluation import Evaluation, evaluate
 from warpnerf.field import Field, Rendering
-from warpnerf.pictures import comparison, write_png
-from warpnerf.scene import Scene, View
+from warpnerf.pictures import comparison, picture_files, write_png
+from warpnerf.scene import Scene, View, require_split
 from warpnerf.training import Progress
 
 _OWN = ("config.json", "log.jsonl", "field.safetensors", "metrics.json")
@@ -125,10 +125,10 @@ class Run:
 
     def evaluate(self, field: Field, scene: Scene, split: str, far: float) -> Evaluation:
         """Measure a split, and write metrics.json and the pictures, depth in colour up to far."""
+        files = picture_files([scene.views[index].name for index in require_split(scene, split)])
 
         def picture(view: View, target: np.ndarray, rendering: Rendering) -> None:
-            name = view.name.replace("/", "_").replace("\\", "_").removesuffix(".png")
-            path = self.folder / "test" / f"{name}.png"
+            path = self.folder / "test" / files[view.name]
             write_png(path, comparison(target, rendering, 0.0, far))
 
         result = evaluate(field, scene, split, picture)
