@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -14,7 +15,11 @@ from warpnerf.checks import InputError
 from warpnerf.data.files import find_image
 from warpnerf.data.images import read_image
 from warpnerf.data.lens import Lens
+from warpnerf.memory import usable_memory
 from warpnerf.scene import Scene, View, estimate_extent
+
+COPIED_BYTES = 8
+"""Per pixel: with alpha for the device, and on the way there once more."""
 
 HOLD_OUT = 8
 """Without a split in the file every 8th image is for testing, as in LLFF and Mip-NeRF 360."""
@@ -106,9 +111,11 @@ def assemble(
     used = set().union(*complete.values())
     frames = [frame for frame in frames if frame.name in used]
 
+    first = _read_view(frames[0], downscale)
+    _require_memory(file, first, len(frames), downscale)
     # Decoders release the interpreter lock. The first error cancels what is not yet read.
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        views = list(pool.map(lambda frame: _read_view(frame, downscale), frames))
+        views = [first, *pool.map(lambda frame: _read_view(frame, downscale), frames[1:])]
 
     index = {view.name: i for i, view in enumerate(views)}
     indices = {
@@ -167,6 +174,23 @@ def complete_splits(
             f"in no split and not used: {len(unused)} of {len(names)} images (first: {min(unused)})"
         )
     return complete, notes
+
+
+def _require_memory(file: Path, first: View, n_images: int, downscale: int) -> None:
+    """Raise InputError if images like the first would not fit: they are kept, and copied to train.
+
+    Without this, a system that promises more memory than it has ends the process without a word.
+    """
+    height, width, channels = first.image.shape
+    needed = n_images * height * width * (channels + COPIED_BYTES)
+    usable = usable_memory()
+    if usable is not None and needed > usable:
+        factor = math.ceil(downscale * math.sqrt(needed / usable))
+        raise InputError(
+            f"{file}: $.frames: {n_images} images of {width}x{height} pixels need "
+            f"{needed / 2**30:.1f} GiB, but there is {usable / 2**30:.1f} GiB of memory; use "
+            f"--downscale {factor}, or fewer images."
+        )
 
 
 def _oddities(views: Sequence[View], splits: Mapping[str, set[str]]) -> list[str]:
