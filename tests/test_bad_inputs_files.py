@@ -262,6 +262,27 @@ def test_path(tmp_path: Path, make: Callable[[Path], Path], says: list[str]) -> 
     assert str(scene) in outcome.err
 
 
+def test_name_that_is_not_UTF_8(tmp_path: Path) -> None:
+    """Read like any other, and shown as well as the terminal can."""
+    name = os.fsdecode(b"images/\xff.png")
+
+    def change(content: dict[str, Any]) -> None:
+        content["frames"][0]["file_path"] = name
+        content["test_filenames"] = [name]
+
+    scene = make_scene(tmp_path, change)
+    (scene / "images/000.png").rename(scene / name)
+    outcome = train(scene, folder=tmp_path)
+    assert_trained(outcome)
+    assert "images/\\udcff.png" in outcome.out
+
+
+@pytest.mark.parametrize("name", ["images/\x1b[2J.png", "images/a\nb.png"])
+def test_name_that_would_steer_the_terminal(tmp_path: Path, name: str) -> None:
+    outcome = train(named(name)(tmp_path), folder=tmp_path)
+    assert_refused(outcome, "$.frames[1].file_path: ", "is not a path")
+
+
 def test_34_backslashes(tmp_path: Path) -> None:
     def change(content: dict[str, Any]) -> None:
         for frame in content["frames"]:

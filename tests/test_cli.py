@@ -44,7 +44,7 @@ def test_help_names_every_option() -> None:
     code, out, _ = run("train", "--help")
     assert code == 0
     options = ["output", "steps", "time-limit", "scaling", "content-distance", "near", "downscale"]
-    for option in [*options, "device", "threads", "seed", "preset"]:
+    for option in [*options, "device", "threads", "seed", "preset", "voxels"]:
         assert f"--{option}" in out
     code, out, _ = run("eval", "--help")
     assert code == 0

@@ -181,6 +181,7 @@ def test_a_photograph_of_another_camera_is_refused(changes: dict[str, Any], mess
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
+        ({"views": [view_of(), view_of()]}, "two views have one name"),
         ({"content_distance": 0.0}, "content_distance must be a finite number above 0"),
         ({"splits": {"train": (0, 2)}}, r"splits\['train'\] must be indices of 2 views"),
         ({"splits": {"train": (0,), "test": (-1,)}}, r"splits\['test'\] must be indices"),

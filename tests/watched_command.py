@@ -46,23 +46,32 @@ def command(
     folder: Path,
     env: Mapping[str, str] | None = None,
     limit: float | None = LIMIT,
-    before: Callable[[], None] | None = None,
+    prelude: str = "",
 ) -> Outcome:
     """Run the command in a folder, in which nothing may change but its subfolder "run".
 
     Temporary files go there too, so that what is left of them shows.
+
+    Args:
+        arguments: Of the command.
+        folder: Where to run it.
+        env: Variables besides those of this process.
+        limit: Seconds; None: as long as it takes.
+        prelude: Python that is run first, in the command's process.
     """
     (folder / "tmp").mkdir(exist_ok=True)
     found = _listing(folder)
+    program = ["-m", "warpnerf"]
+    if prelude:
+        program = ["-c", f"{prelude}\nimport sys, warpnerf.cli\nsys.exit(warpnerf.cli.main())"]
     done = subprocess.run(
-        [sys.executable, "-m", "warpnerf", *map(str, arguments)],
+        [sys.executable, *program, *map(str, arguments)],
         cwd=folder,
         env={**os.environ, "TMPDIR": str(folder / "tmp"), **(env or {})},
         stdin=subprocess.DEVNULL,
         capture_output=True,
         text=True,
         timeout=limit,
-        preexec_fn=before,
     )
     assert _listing(folder) == found, "wrote outside its output folder"
     return Outcome(code=done.returncode, out=done.stdout, err=done.stderr, run=folder / "run")

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import io
+import logging
+import re
 import signal
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -22,6 +26,9 @@ if TYPE_CHECKING:
 FAILED = 1
 BAD_INPUT = 2
 INTERRUPTED = 130
+
+OUT_OF_MEMORY = re.compile("failed to allocate|can't start new thread", re.IGNORECASE)
+"""What Warp and the standard library say in a RuntimeError where a MemoryError is meant."""
 
 
 def train_command(
@@ -121,14 +128,21 @@ def eval_command(
 
 def _train(source: str, output: Path, downscale: int, config: TrainConfig, overwrite: bool) -> int:
     from warpnerf.data import load_scene
+    from warpnerf.data.files import exists
     from warpnerf.evaluation import require_measurable
-    from warpnerf.run import Run
-    from warpnerf.training import Trainer
 
-    Run.require_free(output, overwrite)
+    if exists(output):
+        from warpnerf.run import Run
+
+        Run.require_free(output, overwrite)
     print(f"reading {source}", flush=True)
     scene = load_scene(source, downscale=downscale)
     require_measurable(scene, "test")
+
+    # Not before: these load Warp, and bad input is refused at once.
+    from warpnerf.run import Run
+    from warpnerf.training import Trainer
+
     trainer = Trainer(scene, config)
     _describe(scene, trainer.content_distance, config)
     run = Run(output)
@@ -269,6 +283,11 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"warpnerf {__version__}")
         return 0
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    warnings.filterwarnings("ignore", module="PIL")  # what matters in an image is refused
+    logging.getLogger("PIL").setLevel(logging.CRITICAL)
+    warnings.formatwarning = lambda message, *_: f"warpnerf: warning: {message}.\n"
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # file names may hold anything
     try:
         return tyro.extras.subcommand_cli_from_dict(
             {"train": train_command, "eval": eval_command},
@@ -279,9 +298,13 @@ def main(arguments: list[str] | None = None) -> int:
     except InputError as error:
         print(f"warpnerf: error: {error}", file=sys.stderr)
         return BAD_INPUT
-    except MemoryError:
+    except (MemoryError, RuntimeError) as error:
+        if not isinstance(error, MemoryError) and not OUT_OF_MEMORY.search(str(error)):
+            raise
+        why = f" ({error})" if str(error) else ""
         print(
-            "warpnerf: error: out of memory; use --downscale, or a smaller preset.", file=sys.stderr
+            f"warpnerf: error: out of memory{why}; use fewer --voxels, or a larger --downscale.",
+            file=sys.stderr,
         )
         return BAD_INPUT
     except OSError as error:

@@ -96,6 +96,8 @@ class Scene:
                 f"{self.box_min} and {self.box_max}."
             )
         require_positive(f"{self.name}: content_distance", self.content_distance)
+        if len({view.name for view in self.views}) < len(self.views):
+            raise InputError(f"{self.name}: two views have one name; give each its own.")
         for split, indices in self.splits.items():
             if not all(0 <= index < len(self.views) for index in indices):
                 raise InputError(

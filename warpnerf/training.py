@@ -12,6 +12,7 @@ import warp as wp
 from warpnerf_kernels import interp, occupancy
 from warpnerf_kernels.types import vec4
 
+from warpnerf.checks import InputError
 from warpnerf.config import Contraction, TrainConfig
 from warpnerf.field import Field
 from warpnerf.grid import FreeCells, VoxelGrid, grid_size, require_memory
@@ -135,6 +136,7 @@ class Trainer:
             self.workers,
         )
         self._grown = 0
+        _require_samples(scene, config)
         self._reach = _reach(scene)
         self.grid = self._first_grid(scene)
         self.moments = Moments.zeros(self.grid, self.workers)
@@ -237,11 +239,7 @@ class Trainer:
 
     def _first_grid(self, scene: Scene) -> VoxelGrid:
         config = self.config.grid
-        contraction: Contraction = (
-            ("linf" if scene.unbounded else "none")
-            if config.contraction == "auto"
-            else config.contraction
-        )
+        contraction = _contraction(scene, self.config)
         border = 0.0 if contraction == "none" else config.border
         extent = (scene.box_max - scene.box_min) * (1.0 + border)
         final = grid_size(extent, config.voxels)
@@ -314,6 +312,34 @@ class Trainer:
 
 
 _COLOURS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "random": (1.0, 1.0, 1.0)}
+
+
+def _contraction(scene: Scene, config: TrainConfig) -> Contraction:
+    if config.grid.contraction == "auto":
+        return "linf" if scene.unbounded else "none"
+    return config.grid.contraction
+
+
+def _require_samples(scene: Scene, config: TrainConfig) -> None:
+    """Raise InputError where march.near and march.far leave no sample inside the box to any ray."""
+    positions = np.array([camera.position for camera in scene.training_cameras])
+    outside = np.maximum(0.0, np.maximum(scene.box_min - positions, positions - scene.box_max))
+    across = np.maximum(np.abs(scene.box_min - positions), np.abs(scene.box_max - positions))
+    begin = float(np.linalg.norm(outside, axis=1).min())
+    end = float(np.linalg.norm(across, axis=1).max())
+    march = config.march
+    if _contraction(scene, config) != "none":
+        begin = 0.0  # space outside the box is sampled too
+    if march.near >= end:
+        raise InputError(
+            f"march.near is {march.near:g}, but the scene's box ends {end:.4g} scene units from "
+            "the farthest camera, so nothing of it would be sampled; use a smaller --near."
+        )
+    if march.far is not None and march.far <= begin:
+        raise InputError(
+            f"march.far is {march.far:g}, but the scene's box begins {begin:.4g} scene units from "
+            "the nearest camera, so nothing of it would be sampled; use a larger one."
+        )
 
 
 def _reach(scene: Scene) -> float:

@@ -89,10 +89,12 @@ class Lens:
         for key, size in (("w", width), ("h", height)):
             if key in values and values[key] != size:
                 stated = f"{values.get('w', width):g}x{values.get('h', height):g}"
+                turned = (values.get("w"), values.get("h")) == (height, width)
                 raise InputError(
                     f"{self.file}: {self.fields[key]}: the file is for images of {stated} pixels, "
-                    f"but {image} has {width}x{height}; use the original images, or scale w, h, "
-                    "fl_x, fl_y, cx and cy with them."
+                    f"but {image} has {width}x{height}"
+                    + (" as stored, without its EXIF rotation" if turned else "")
+                    + "; use the original images, or change w, h, fl_x, fl_y, cx and cy with them."
                 )
         fx, fy = self._focal_lengths(width, height)
         camera = Camera(
