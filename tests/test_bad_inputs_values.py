@@ -174,15 +174,16 @@ def test_clip_distances_that_leave_no_sample(march: dict[str, float], message: s
 def test_62_NaN_in_a_grid(tmp_path: Path, value: float) -> None:
     outcome = train(make_scene(tmp_path), folder=tmp_path)
     assert_trained(outcome)
-    file = outcome.run / "field.safetensors"
-    field = wn.load_field(file, threads=1)
+    field = wn.load_field(outcome.run / "field.safetensors", threads=1)
     values = field.grid.values.numpy()
     values[10, 2] = value
     bad = replace(field.grid, values=wp.array(values, dtype=vec4, device="cpu"))
-    wn.save_field(file, replace(field, grid=bad))
-    shutil.copytree(outcome.run, tmp_path / "damaged")
-    outcome = command("eval", tmp_path / "damaged", "--threads", "1", folder=tmp_path)
-    assert_refused(replace(outcome, run=tmp_path / "none"), "damaged/field.safetensors", "holds")
+    (tmp_path / "bad").mkdir()
+    shutil.copy(outcome.run / "config.json", tmp_path / "bad")
+    wn.save_field(tmp_path / "bad/field.safetensors", replace(field, grid=bad))
+    outcome = command("eval", tmp_path / "bad", "--threads", "1", folder=tmp_path)
+    says = "bad/field.safetensors", "holds values that cannot be rendered"
+    assert_refused(replace(outcome, run=tmp_path / "none"), *says)
 
 
 # --- 63: tensors --------------------------------------------------------------------------------

@@ -1,17 +1,29 @@
-"""A field comes back as it was, or not at all."""
+"""A field, and a training, comes back as it was, or not at all."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from safetensors.numpy import save_file
-from tiny_fields import tiny_field
+from safetensors import safe_open
+from safetensors.numpy import load_file, save_file
+from tiny_fields import assert_same_state, tiny_field, tiny_state
 from tiny_scenes import camera_at, ring
 
-from warpnerf.checkpoint import load_field, save_field
+from warpnerf import checkpoint
+from warpnerf.checkpoint import (
+    DamagedFileError,
+    load_checkpoint,
+    load_field,
+    save_checkpoint,
+    save_field,
+    write_atomically,
+)
 from warpnerf.checks import InputError
+from warpnerf.config import GridConfig, MarchConfig, OptimConfig, TrainConfig
 
 
 @pytest.fixture
@@ -19,6 +31,16 @@ def file(tmp_path: Path) -> Path:
     path = tmp_path / "field.safetensors"
     save_field(path, tiny_field())
     return path
+
+
+def rewrite(path: Path, header: Any = None, **tensors: np.ndarray) -> None:
+    """Forge a file whose digest is right: other header text, or tensors added or replaced."""
+    with safe_open(path, framework="numpy") as file:
+        text = file.metadata()["header"]
+    contents = load_file(path) | tensors
+    text = text if header is None else header(text)
+    digest = checkpoint._digest(text, contents)
+    save_file(contents, path, metadata={"header": text, "sha256": digest})
 
 
 @pytest.mark.parametrize("contraction", ["none", "linf", "l2"])
@@ -102,3 +124,133 @@ def test_a_field_with_nan_is_refused(tmp_path: Path) -> None:
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"none\.safetensors"):
         load_field(tmp_path / "none.safetensors")
+
+
+EVERYTHING_SET = TrainConfig(
+    steps=7,
+    time_limit=1.0 / 3.0,
+    scaling="quadratic",
+    content_distance=0.1,
+    jacobian="paper",
+    background=(0.1, 0.2, 0.3),
+    seed=2**62 + 1,
+    threads=3,
+    device="cuda:1",
+    checkpoint_every=0.7,
+    grid=GridConfig(voxels=1000, grow_at=(0.1, 0.2, 1.0 / 3.0)),
+    march=MarchConfig(far=1e9 / 3.0, jitter=False),
+    optim=OptimConfig(epsilon=1e-300),
+)
+
+
+@pytest.mark.parametrize("config", [TrainConfig(), EVERYTHING_SET], ids=["defaults", "all set"])
+def test_a_training_comes_back_bit_for_bit(tmp_path: Path, config: TrainConfig) -> None:
+    state = tiny_state(300, config)
+    save_checkpoint(tmp_path / "training", state)
+    assert_same_state(load_checkpoint(tmp_path / "training"), state)
+
+
+def test_rendering_reads_either_file(tmp_path: Path, file: Path) -> None:
+    state = tiny_state(3)
+    save_checkpoint(tmp_path / "training", state)
+    save_field(file, state.field)
+    camera = camera_at(ring(3)[1])
+    expected = state.field.render(camera).rgb
+    for path in (file, tmp_path / "training"):
+        np.testing.assert_array_equal(load_field(path, threads=1).render(camera).rgb, expected)
+
+
+def test_a_field_is_nothing_to_go_on_with(file: Path) -> None:
+    with pytest.raises(InputError, match=r"field\.safetensors holds a field but no training"):
+        load_checkpoint(file)
+
+
+def test_metadata_tell_what_a_file_is(tmp_path: Path) -> None:
+    save_checkpoint(tmp_path / "training", tiny_state(3))
+    with safe_open(tmp_path / "training", framework="numpy") as file:
+        metadata = file.metadata()
+    header = json.loads(metadata["header"])
+    assert header["format"] == "warpnerf-training-1"
+    assert header["training"]["progress"]["step"] == 3
+    assert header["training"]["config"]["grid"]["voxels"] == TrainConfig().grid.voxels
+    assert len(metadata["sha256"]) == 64
+
+
+def test_the_file_is_as_the_package_writes_it(tmp_path: Path, file: Path) -> None:
+    """Tensors one after another from an aligned start, and none left out."""
+    save_file(load_file(file), tmp_path / "theirs")
+    for path in (file, tmp_path / "theirs"):
+        content = path.read_bytes()
+        start = 8 + int.from_bytes(content[:8], "little")
+        assert start % 8 == 0
+        if path == file:
+            ours = content[start:]
+    assert ours == content[start:]
+
+
+def test_a_short_write_is_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write = checkpoint.os.write
+    monkeypatch.setattr("os.write", lambda file, data: write(file, data[:3]))
+    write_atomically(tmp_path / "file", b"abcdefgh", b"", memoryview(b"ijk"))
+    assert (tmp_path / "file").read_bytes() == b"abcdefghijk"
+
+
+@pytest.mark.parametrize(
+    ("header", "tensors", "says"),
+    [
+        (lambda text: text.replace("training-1", "training-2"), {}, "training-2"),
+        (lambda text: text[:-1], {}, "header"),
+        (lambda text: "[" * 100_000, {}, "header"),
+        (lambda text: "[]", {}, "header"),
+        (lambda text: text[:-1] + ', "border": 0.0}', {}, "'border' is given twice"),
+        (lambda text: text.replace('"border": 0.0', '"border": NaN'), {}, "finite"),
+        (lambda text: text.replace('"border": 0.0', '"border": 1e999'), {}, "finite"),
+        (lambda text: text.replace('"border": 0.0', '"border": "wide"'), {}, "border"),
+        (lambda text: text.replace('"border": 0.0', '"border": 7.0'), {}, "rendered"),
+        (lambda text: text.replace('"grown": 2', '"grown": 9'), {}, "9 times"),
+        (lambda text: text.replace('"seed": 0', '"seed": -1'), {}, "seed"),
+        (lambda text: text.replace('"step": 5', '"step": "five"'), {}, "step"),
+        (None, {"extra": np.zeros(3, np.float32)}, "extra"),
+        (None, {"mean": np.zeros((5, 6, 6, 4), np.float32)}, "'mean'"),
+        (None, {"square": np.zeros((5, 6, 7, 4), np.float64)}, "'square'"),
+        (None, {"square": np.full((5, 6, 7, 4), np.nan, np.float32)}, "'square'"),
+        (None, {"values": np.zeros((5, 6, 7, 3), np.float32)}, "values"),
+        (None, {"free_distance": np.zeros((0, 2, 2), np.uint8)}, "rendered"),
+    ],
+)
+def test_a_forged_training_is_refused(
+    tmp_path: Path, header: Any, tensors: dict[str, np.ndarray], says: str
+) -> None:
+    path = tmp_path / "training.safetensors"
+    save_checkpoint(path, tiny_state(5))
+    rewrite(path, header, **tensors)
+    with pytest.raises(InputError, match=r"training\.safetensors") as caught:
+        load_checkpoint(path)
+    assert says in str(caught.value)
+
+
+def test_a_key_given_twice_is_refused(file: Path) -> None:
+    """Readers differ on which of the two they take."""
+    content = file.read_bytes()
+    length = int.from_bytes(content[:8], "little")
+    text = content[8 : 8 + length].rstrip()
+    digest = json.loads(text)["__metadata__"]["sha256"]
+    twice = text.replace(b'"sha256":', b'"sha256": "%s", "sha256":' % digest.encode(), 1)
+    assert len(twice) > len(text)
+    file.write_bytes(len(twice).to_bytes(8, "little") + twice + content[8 + length :])
+    with pytest.raises(DamagedFileError, match="'sha256' is given twice"):
+        load_field(file)
+
+
+def test_another_version_is_not_called_damage(file: Path) -> None:
+    """Else a newer checkpoint would be passed over for an older one, and in the end removed."""
+    rewrite(file, lambda text: text.replace("field-1", "field-9"))
+    with pytest.raises(InputError, match="field-9") as caught:
+        load_field(file)
+    assert not isinstance(caught.value, DamagedFileError)
+
+
+def test_a_pipe_is_refused_unopened(tmp_path: Path) -> None:
+    checkpoint.os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(InputError, match="pipe is not a file"):
+        load_field(tmp_path / "pipe")

@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import json
+import shlex
+import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_scenes import save, write_transforms
+from PIL import Image
+from tiny_fields import assert_same_state
+from tiny_scenes import picture, save, write_transforms
+
+from warpnerf.checkpoint import load_checkpoint
+from warpnerf.run import Run
 
 TINY = ("builtin:room", "--downscale", "8", "--threads", "1")
 
@@ -44,7 +52,8 @@ def test_help_names_every_option() -> None:
     code, out, _ = run("train", "--help")
     assert code == 0
     options = ["output", "steps", "time-limit", "scaling", "content-distance", "near", "downscale"]
-    for option in [*options, "device", "threads", "seed", "preset", "voxels"]:
+    more = ["device", "threads", "seed", "preset", "voxels", "resume", "checkpoint-every"]
+    for option in [*options, *more]:
         assert f"--{option}" in out
     code, out, _ = run("eval", "--help")
     assert code == 0
@@ -64,6 +73,7 @@ def test_training_leaves_a_whole_run(trained: tuple[Path, str]) -> None:
     assert {path.name for path in folder.iterdir()} == {
         "config.json",
         "log.jsonl",
+        "checkpoint-00000030.safetensors",
         "field.safetensors",
         "metrics.json",
         "test",
@@ -106,6 +116,7 @@ def test_a_run_is_not_written_over_unasked(trained: tuple[Path, str]) -> None:
     code, _, err = run("train", *TINY, "--steps", "1", "--output", folder)
     assert code == 2
     assert "--overwrite" in err
+    assert f"--resume {folder}" in err
     assert before == {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
@@ -180,21 +191,175 @@ def test_eval_of_a_bad_run(trained: tuple[Path, str], tmp_path: Path, damage: st
     assert "Traceback" not in err
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="no SIGINT for one process there")
-def test_ctrl_c_keeps_the_field(tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    process = start("train", *TINY, "--steps", "100000", "--output", folder)
+GROWING = (*TINY, "--steps", "203")
+"""Grows at step 200, and trains on for a few steps."""
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "whole"
+    code, _, err = run("train", *GROWING, "--output", folder)
+    assert code == 0, err
+    return folder
+
+
+def begun(folder: Path, *signals: int) -> tuple[int, str, str]:
+    """A training that is sent signals when it is under way: how it ended."""
+    process = start("train", *GROWING, "--output", folder)
     try:
         assert process.stdout is not None
         for line in process.stdout:  # a progress report: training is under way
             if "step " in line and "loss" in line:
                 break
-        process.send_signal(signal.SIGINT)
+        for number in signals:
+            process.send_signal(number)
         out, err = process.communicate(timeout=60)
     finally:
         process.kill()
-    assert process.returncode == 130
-    assert "field.safetensors" in out + err
+    return process.returncode, out, err
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no SIGINT for one process there")
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_stopped_it_saves_and_says_how_to_go_on(tmp_path: Path, number: int, code: int) -> None:
+    folder = tmp_path / "my run"
+    returned, out, err = begun(folder, number)
+    assert returned == code
     assert "Traceback" not in err
-    code, _, err = run("eval", folder, "--threads", "1")
+    assert len(out.splitlines()) == 1
+    state = load_checkpoint(Run(folder).checkpoints[0])
+    step = state.progress.step
+    assert out == f"stopped and saved after step {step}; go on with: {Run(folder).resume_command}\n"
+    code, _, err = run("eval", folder, "--threads", "1")  # the field so far
     assert code == 0, err
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no SIGINT for one process there")
+def test_stopped_and_resumed_a_run_ends_as_if_it_had_not_been(
+    uninterrupted: Path, tmp_path: Path, on_cpu: None
+) -> None:
+    folder = tmp_path / "my run"
+    _, out, _ = begun(folder, signal.SIGINT)
+    assert load_checkpoint(Run(folder).checkpoints[0]).grown == 0
+    command = shlex.split(out.strip().partition("go on with: ")[2])
+    code, out, err = run(*command[1:])
+    assert code == 0, err
+    assert "going on after step" in out
+    for name in ("field.safetensors", "metrics.json"):
+        assert (folder / name).read_bytes() == (uninterrupted / name).read_bytes()
+    resumed, whole = (load_checkpoint(Run(f).checkpoints[0]) for f in (folder, uninterrupted))
+    assert resumed.grown == 4
+    same = replace(whole.progress, seconds=resumed.progress.seconds)
+    assert_same_state(resumed, replace(whole, progress=same))
+    assert reports(folder) == reports(uninterrupted)
+
+
+def reports(folder: Path) -> list[tuple[int, float]]:
+    lines = (folder / "log.jsonl").read_text().splitlines()
+    return [(line["step"], line["loss"]) for line in map(json.loads, lines)]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no SIGINT for one process there")
+def test_asked_twice_it_ends_at_once_and_the_checkpoint_stays(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    code, out, err = begun(folder, signal.SIGINT, signal.SIGTERM, signal.SIGINT)
+    assert code in (130, 143)
+    assert "Traceback" not in out + err
+    for path in Run(folder).checkpoints:
+        load_checkpoint(path)
+    assert not list(folder.glob(".*"))
+
+
+def test_a_finished_run_is_resumed_to_its_figures(
+    trained: tuple[Path, str], tmp_path: Path
+) -> None:
+    folder = shutil.copytree(trained[0], tmp_path / "run")
+    before = (folder / "checkpoint-00000030.safetensors").stat().st_mtime_ns
+    for name in ("metrics.json", "field.safetensors"):
+        (folder / name).unlink()
+    code, _, err = run("train", "--resume", folder)
+    assert code == 0, err
+    for name in ("metrics.json", "field.safetensors"):
+        assert (folder / name).read_bytes() == (trained[0] / name).read_bytes()
+    assert (folder / "checkpoint-00000030.safetensors").stat().st_mtime_ns == before
+
+
+def test_other_threads_are_allowed_and_noted(trained: tuple[Path, str]) -> None:
+    code, out, err = run("train", "--resume", trained[0], "--threads", "2")
+    assert code == 0, err
+    assert "threads 2 instead of 1" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("--steps", "31"), "steps is 31"),
+        (("--time-limit", "5"), "time_limit is 5.0"),
+        (("--near", "0.1"), "march.near is 0.1"),
+        (("--seed", "1"), "seed is 1"),
+        (("--downscale", "8"), "--downscale does not go with --resume"),
+        (("--preset", "fast"), "--preset does not go with --resume"),
+        (("--overwrite",), "--overwrite does not go with --resume"),
+        (("--output", "elsewhere"), "--output does not go with --resume"),
+    ],
+)
+def test_what_would_change_a_resumed_run_is_refused(
+    trained: tuple[Path, str], arguments: tuple[str, ...], says: str
+) -> None:
+    before = {path: path.stat().st_mtime_ns for path in trained[0].rglob("*")}
+    code, _, err = run("train", "--resume", trained[0], *arguments)
+    assert code == 2
+    assert says in err
+    assert "Traceback" not in err
+    assert {path: path.stat().st_mtime_ns for path in trained[0].rglob("*")} == before
+
+
+def test_another_scene_is_refused(trained: tuple[Path, str], tmp_path: Path) -> None:
+    content = write_transforms(tmp_path / "scene")
+    for i, frame in enumerate(content["frames"]):
+        Image.fromarray(picture(i, width=96, height=96)).save(
+            tmp_path / "scene" / frame["file_path"]
+        )
+    content |= {"w": 96, "h": 96}
+    save(tmp_path / "scene" / "transforms.json", content)
+    code, _, err = run("train", tmp_path / "scene", "--resume", trained[0])
+    assert code == 2
+    assert "scene is not what the training to be resumed has seen" in err
+
+
+def test_a_new_run_wants_scene_and_output(tmp_path: Path) -> None:
+    for arguments in ((), ("builtin:room",), ("--output", tmp_path / "run")):
+        code, _, err = run("train", *arguments)
+        assert code == 2
+        assert "SCENE" in err and "--output" in err and "--resume" in err
+
+
+SPOIL = """
+import sys
+from warpnerf import cli, training
+step = training.Trainer.step
+def spoiled(self):
+    step(self)
+    if self.steps_done == int(sys.argv[1]):
+        self.grid.values.fill_(float("nan"))
+training.Trainer.step = spoiled
+sys.exit(cli.main(sys.argv[2:]))
+"""
+
+
+@pytest.mark.parametrize(("bad_step", "kept"), [(1, "Nothing was saved"), (4, "Step 3 is saved")])
+def test_what_is_not_finite_ends_the_run(tmp_path: Path, bad_step: int, kept: str) -> None:
+    folder = tmp_path / "run"
+    arguments = ("train", *TINY, "--output", str(folder), "--checkpoint-every", "1e-9")
+    process = subprocess.run(
+        [sys.executable, "-c", SPOIL, str(bad_step), *arguments],
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert process.returncode == 1
+    assert f"not finite after step {bad_step}" in process.stderr
+    assert kept in process.stderr
+    assert "Traceback" not in process.stderr
+    for path in Run(folder).checkpoints:
+        assert load_checkpoint(path).progress.step < bad_step

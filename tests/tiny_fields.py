@@ -1,4 +1,4 @@
-"""A small field with everything in it, for tests that need one but no training."""
+"""A small field, and a training that holds it, for tests that need one but no training."""
 
 from __future__ import annotations
 
@@ -8,10 +8,13 @@ import numpy as np
 import warp as wp
 from warpnerf_kernels.types import vec4
 
+from warpnerf.config import TrainConfig
 from warpnerf.field import Field
 from warpnerf.grid import FreeCells, VoxelGrid
+from warpnerf.optim import Moments
 from warpnerf.parallel import Workers
 from warpnerf.render import Steps
+from warpnerf.state import Progress, TrainingState
 
 
 def tiny_field(*, density: float = 3.0, contraction: str = "none") -> Field:
@@ -46,3 +49,53 @@ def tiny_field(*, density: float = 3.0, contraction: str = "none") -> Field:
         background=(0.1, 0.6, 0.9),
         workers=workers,
     )
+
+
+def tiny_state(step: int, config: TrainConfig | None = None) -> TrainingState:
+    """A training after so many steps, whose arrays differ from those after any other number."""
+    field = tiny_field(density=float(step))
+    moments = np.random.default_rng(step).normal(size=(2, math.prod(field.grid.size), 4))
+    mean, square = (wp.array(m, dtype=vec4, device=field.workers.device) for m in moments)
+    progress = Progress(
+        step=step,
+        fraction=0.25,
+        seconds=1.0 / 3.0,
+        loss=0.1,
+        psnr=10.0,
+        samples_per_ray=12.5,
+        size=field.grid.size,
+        occupied=0.75,
+    )
+    return TrainingState(
+        config=config or TrainConfig(threads=1),
+        scene_digest="of a scene",
+        content_distance=2.0 / 3.0,
+        reach=math.pi,
+        grown=2,
+        progress=progress,
+        field=field,
+        moments=Moments(mean=mean, square=square),
+    )
+
+
+def assert_same_state(state: TrainingState, expected: TrainingState) -> None:
+    """All of it, bit for bit."""
+    for name in ("config", "scene_digest", "content_distance", "reach", "grown", "progress"):
+        assert getattr(state, name) == getattr(expected, name)
+    grid, other = state.field.grid, expected.field.grid
+    for name in ("size", "contraction", "border", "density_shift", "density_scale"):
+        assert getattr(grid, name) == getattr(other, name)
+    assert (state.field.steps, state.field.background) == (
+        expected.field.steps,
+        expected.field.background,
+    )
+    assert state.field.free.size == expected.field.free.size
+    for array, wanted in (
+        (grid.box_min, other.box_min),
+        (grid.box_max, other.box_max),
+        (grid.values.numpy(), other.values.numpy()),
+        (state.moments.mean.numpy(), expected.moments.mean.numpy()),
+        (state.moments.square.numpy(), expected.moments.square.numpy()),
+        (state.field.free.distance.numpy(), expected.field.free.distance.numpy()),
+    ):
+        np.testing.assert_array_equal(array.view(np.uint8), wanted.view(np.uint8))

@@ -14,20 +14,23 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from warpnerf.camera import Camera
-    from warpnerf.checkpoint import load_field, save_field
+    from warpnerf.checkpoint import load_checkpoint, load_field, save_checkpoint, save_field
     from warpnerf.checks import InputError
     from warpnerf.config import PRESETS, GridConfig, MarchConfig, OptimConfig, TrainConfig
     from warpnerf.data import load_scene
     from warpnerf.evaluation import Evaluation, evaluate
     from warpnerf.field import Field, Rendering
     from warpnerf.scene import Scene, View
-    from warpnerf.training import Progress, TrainResult, train
+    from warpnerf.state import Progress, TrainingState
+    from warpnerf.training import TrainResult, train
 
 __version__ = "0.1.0"
 
 _HOMES = {
     "Camera": "camera",
+    "load_checkpoint": "checkpoint",
     "load_field": "checkpoint",
+    "save_checkpoint": "checkpoint",
     "save_field": "checkpoint",
     "InputError": "checks",
     "PRESETS": "config",
@@ -42,14 +45,17 @@ _HOMES = {
     "Rendering": "field",
     "Scene": "scene",
     "View": "scene",
-    "Progress": "training",
+    "Progress": "state",
+    "TrainingState": "state",
     "TrainResult": "training",
     "train": "training",
 }
 
 __all__ = [  # noqa: RUF022 (grouped by home, as above)
     "Camera",
+    "load_checkpoint",
     "load_field",
+    "save_checkpoint",
     "save_field",
     "InputError",
     "PRESETS",
@@ -65,6 +71,7 @@ __all__ = [  # noqa: RUF022 (grouped by home, as above)
     "Scene",
     "View",
     "Progress",
+    "TrainingState",
     "TrainResult",
     "train",
 ]

@@ -6,46 +6,49 @@ import dataclasses
 import io
 import logging
 import re
-import signal
 import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from warpnerf import __version__
 from warpnerf.checks import InputError
 from warpnerf.config import PRESETS, Scaling, TrainConfig
+from warpnerf.stop import Stopped, StopRequest, raise_when_asked
 
 if TYPE_CHECKING:
+    from warpnerf.run import Run
     from warpnerf.scene import Scene
-    from warpnerf.training import Progress
+    from warpnerf.state import Progress
+    from warpnerf.training import Trainer
 
 FAILED = 1
 BAD_INPUT = 2
-INTERRUPTED = 130
 
 OUT_OF_MEMORY = re.compile("failed to allocate|can't start new thread", re.IGNORECASE)
 """What Warp and the standard library say in a RuntimeError where a MemoryError is meant."""
 
 
 def train_command(
-    scene: tyro.conf.Positional[str],
+    scene: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[SCENE]")] = None,
     /,
-    output: Path,
-    preset: Literal["fast", "quality"] = "fast",
+    output: Path | None = None,
+    resume: Path | None = None,
+    preset: Literal["fast", "quality"] | None = None,
     steps: int | None = None,
     time_limit: float | None = None,
     scaling: Scaling | None = None,
     content_distance: float | Literal["auto"] | None = None,
     voxels: int | None = None,
     near: float | None = None,
-    downscale: int = 1,
+    downscale: int | None = None,
     device: str | None = None,
     threads: int | None = None,
     seed: int | None = None,
+    checkpoint_every: float | None = None,
     overwrite: bool = False,
 ) -> int:
     """Train a voxel grid on a scene, and look at its test views.
@@ -53,20 +56,21 @@ def train_command(
     Args:
         scene: Folder with transforms.json or transforms_train.json, or builtin:room.
         output: Folder for the configuration, the field, the log, the figures and the pictures.
-        preset: Starting point; the options below replace its values.
+        resume: Go on with the run in this folder, as it was begun; scene only if it has moved.
+        preset: Starting point, by default fast; the options below replace its values.
         steps: Optimiser steps.
         time_limit: Seconds of training; the schedule is squeezed to fit.
         scaling: How a sample's gradient depends on its distance from the camera.
         content_distance: Where gradients reach full strength, in the scene's units.
         voxels: Nodes of the final grid, in all; memory goes with their number.
         near: Nothing is sampled nearer to the camera than this, in the scene's units.
-        downscale: Average blocks of so many pixels squared.
+        downscale: Average blocks of so many pixels squared; by default 1, as they are.
         device: cpu, cuda, cuda:1, ...
-        threads: CPU threads; by default one per core.
+        threads: CPU threads; by default one per core, or as many as the run to be resumed had.
         seed: Same seed and threads: same result on the CPU.
+        checkpoint_every: Seconds between two checkpoints to resume from; by default 300.
         overwrite: Replace the run that the output folder holds.
     """
-    config = PRESETS[preset]
     chosen: dict[str, Any] = {
         "steps": steps,
         "time_limit": time_limit,
@@ -75,14 +79,35 @@ def train_command(
         "device": device,
         "threads": threads,
         "seed": seed,
+        "checkpoint_every": checkpoint_every,
     }
     given = {name: value for name, value in chosen.items() if value is not None}
-    config = dataclasses.replace(config, **given)
-    if voxels is not None:
-        config = dataclasses.replace(config, grid=dataclasses.replace(config.grid, voxels=voxels))
-    if near is not None:
-        config = dataclasses.replace(config, march=dataclasses.replace(config.march, near=near))
-    return _train(scene, output, downscale, config, overwrite)
+
+    def changed(config: TrainConfig) -> TrainConfig:
+        config = dataclasses.replace(config, **given)
+        if voxels is not None:
+            grid = dataclasses.replace(config.grid, voxels=voxels)
+            config = dataclasses.replace(config, grid=grid)
+        if near is not None:
+            march = dataclasses.replace(config.march, near=near)
+            config = dataclasses.replace(config, march=march)
+        return config
+
+    if resume is not None:
+        fixed = {"output": output, "preset": preset, "downscale": downscale, "overwrite": overwrite}
+        for name, value in fixed.items():
+            if value:
+                raise InputError(
+                    f"--{name} does not go with --resume: the run in {resume} goes on as it was "
+                    "begun; leave it out."
+                )
+        return _resume(resume, scene, changed)
+    if scene is None or output is None:
+        raise InputError(
+            "train wants a SCENE and --output DIR for a new run, or --resume DIR to go on with one."
+        )
+    config = changed(PRESETS[preset or "fast"])
+    return _begin(scene, output, 1 if downscale is None else downscale, config, overwrite)
 
 
 def eval_command(
@@ -113,8 +138,10 @@ def eval_command(
         raise InputError(f"--json {json}: its folder does not exist; make it first.")
     run = Run(folder)
     config = run.read_config()
-    field = run.load_field(device, threads)
-    views = load_scene(scene or config["scene"], downscale=config["downscale"])
+    field, notes = run.load_field(device, threads)
+    for note in notes:
+        print(f"warpnerf: note: {note}", file=sys.stderr)
+    views = load_scene(scene or config.scene, downscale=config.downscale)
     require_measurable(views, split)
     result = evaluate(field, views, split)
     print(result)
@@ -126,18 +153,15 @@ def eval_command(
     return 0
 
 
-def _train(source: str, output: Path, downscale: int, config: TrainConfig, overwrite: bool) -> int:
-    from warpnerf.data import load_scene
+def _begin(source: str, output: Path, downscale: int, config: TrainConfig, overwrite: bool) -> int:
+    """Train from the first step on."""
     from warpnerf.data.files import exists
-    from warpnerf.evaluation import require_measurable
 
     if exists(output):
         from warpnerf.run import Run
 
         Run.require_free(output, overwrite)
-    print(f"reading {source}", flush=True)
-    scene = load_scene(source, downscale=downscale)
-    require_measurable(scene, "test")
+    scene = _read(source, downscale)
 
     # Not before: these load Warp, and bad input is refused at once.
     from warpnerf.run import Run
@@ -147,55 +171,84 @@ def _train(source: str, output: Path, downscale: int, config: TrainConfig, overw
     _describe(scene, trainer.content_distance, config)
     run = Run(output)
     run.create(scene, _absolute(source), downscale, trainer.content_distance, config)
-    print("compiling kernels (once; later runs start at once)", flush=True)
-    with _StopRequest() as stop:
+    return _train(run, scene, trainer)
+
+
+def _resume(folder: Path, moved: str | None, changed: Callable[[TrainConfig], TrainConfig]) -> int:
+    """Train from the last checkpoint on."""
+    from warpnerf.run import Run
+    from warpnerf.training import Trainer
+
+    run = Run(folder)
+    begun = run.read_config()
+    state, notes = run.load_state()
+    config = changed(state.config)
+    state.require_same_config(config)
+    scene = _read(moved or begun.scene, begun.downscale)
+    trainer = Trainer(scene, config, state)
+    _describe(scene, trainer.content_distance, config)
+    for note in notes:
+        print(f"  note: {note}")
+    for name in ("device", "threads"):
+        old, new = getattr(state.config, name), getattr(config, name)
+        if new != old:
+            print(f"  note: {name} {new} instead of {old}: sums are rounded in another order")
+    print(f"  going on after step {trainer.steps_done}")
+    run.rewind_log(trainer.steps_done)
+    del state  # the trainer has copies
+    return _train(run, scene, trainer)
+
+
+def _read(source: str, downscale: int) -> Scene:
+    from warpnerf.data import load_scene
+    from warpnerf.evaluation import require_measurable
+
+    print(f"reading {source}", flush=True)
+    scene = load_scene(source, downscale=downscale)
+    require_measurable(scene, "test")
+    return scene
+
+
+def _train(run: Run, scene: Scene, trainer: Trainer) -> int:
+    """Train to the end, or until asked to stop; look at the test views."""
+    if trainer.fraction < 1.0:
+        print("compiling kernels (once; later runs start at once)", flush=True)
+    with StopRequest() as stop:
         try:
-            with _reporter(config) as report:
-                while trainer.fraction < 1.0 and not stop.asked:
-                    trainer.step()
-                    if trainer.report_due:
-                        progress = trainer.report()
-                        run.log(progress)
-                        report(progress)
+            with _reporter(trainer.config) as report:
+
+                def on_progress(progress: Progress) -> None:
+                    run.log(progress)
+                    report(progress)
+
+                trainer.run(on_progress, run.save_checkpoint, lambda: stop.asked)
         except FloatingPointError as error:
-            print(f"warpnerf: error: {error}", file=sys.stderr)
+            kept = "Nothing was saved before."
+            if run.last_step is not None:
+                kept = f"Step {run.last_step} is saved: warpnerf eval {run.folder} looks at it."
+            print(f"warpnerf: error: {error} {kept}", file=sys.stderr)
             return FAILED
-        field = trainer.field()
-        run.save_field(field)
-    if stop.asked:
-        where = output / "field.safetensors"
-        print(
-            f"stopped after step {trainer.steps_done}; the field so far is in {where}", flush=True
-        )
-        return INTERRUPTED
+        except Stopped as stopped:  # asked a second time
+            print(f"stopped; {run.way_on()}", flush=True)
+            return stopped.exit_code
+        if trainer.fraction >= 1.0:
+            run.save_field(trainer.field())
+    if stop.exit_code is not None:
+        step = trainer.steps_done
+        print(f"stopped and saved after step {step}; go on with: {run.resume_command}", flush=True)
+        return stop.exit_code
     print("rendering the test views", flush=True)
+    far = 2.0 * trainer.content_distance
     try:
-        far = 2.0 * trainer.content_distance
-        print(run.evaluate(field, scene, "test", far))
-    except KeyboardInterrupt:
-        print(f"stopped; the trained field is in {output}, for warpnerf eval", file=sys.stderr)
-        return INTERRUPTED
+        print(run.evaluate(trainer.field(), scene, "test", far))
+    except Stopped as stopped:
+        print(f"stopped; the field is saved. Go on with: {run.resume_command}", flush=True)
+        return stopped.exit_code
     print(
-        f"wrote {output}: field.safetensors, metrics.json, log.jsonl, config.json, and test/*.png "
-        f"(truth, rendering, depth from 0 red to {far:.3g} violet)"
+        f"wrote {run.folder}: field.safetensors, metrics.json, log.jsonl, config.json, and "
+        f"test/*.png (truth, rendering, depth from 0 red to {far:.3g} violet)"
     )
     return 0
-
-
-class _StopRequest:
-    """Ctrl-C and SIGTERM noted while training, so that a run stops between two steps."""
-
-    def __enter__(self) -> _StopRequest:
-        self.asked = False
-        self._before = {s: signal.signal(s, self._note) for s in (signal.SIGINT, signal.SIGTERM)}
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def _note(self, number: int, frame: object) -> None:
-        self.asked = True
 
 
 def _describe(scene: Scene, content_distance: float, config: TrainConfig) -> None:
@@ -276,13 +329,13 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command.
 
     Returns:
-        0; 2 for bad input; 1 where training failed; 130 where it was interrupted.
+        0; 2 for bad input; 1 where training failed; 130 after Ctrl-C, 143 after SIGTERM.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     if arguments == ["--version"]:
         print(f"warpnerf {__version__}")
         return 0
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    raise_when_asked()
     warnings.filterwarnings("ignore", module="PIL")  # what matters in an image is refused
     logging.getLogger("PIL").setLevel(logging.CRITICAL)
     warnings.formatwarning = lambda message, *_: f"warpnerf: warning: {message}.\n"
@@ -310,6 +363,6 @@ def main(arguments: list[str] | None = None) -> int:
     except OSError as error:
         print(f"warpnerf: error: {error}", file=sys.stderr)
         return FAILED
-    except KeyboardInterrupt:
+    except Stopped as stopped:
         print("stopped", file=sys.stderr)
-        return INTERRUPTED
+        return stopped.exit_code

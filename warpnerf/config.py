@@ -158,6 +158,8 @@ class TrainConfig:
     """CPU threads; None: one per core."""
     device: str = "cpu"
     """Where to train: cpu, cuda, cuda:1, ..."""
+    checkpoint_every: float = 300.0
+    """Seconds from one checkpoint to the next, at least; there is one at the end besides."""
     grid: GridConfig = field(default_factory=GridConfig)
     """The voxel grid."""
     march: MarchConfig = field(default_factory=MarchConfig)
@@ -176,6 +178,7 @@ class TrainConfig:
             raise InputError(f"seed must be at least 0 and below 2^63, not {self.seed}.")
         require_one_of("scaling", self.scaling, get_args(Scaling))
         require_one_of("jacobian", self.jacobian, get_args(Jacobian))
+        require_positive("checkpoint_every", self.checkpoint_every)
         if self.time_limit is not None:
             require_positive("time_limit", self.time_limit)
         if self.threads is not None:

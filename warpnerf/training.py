@@ -21,6 +21,7 @@ from warpnerf.parallel import Workers
 from warpnerf.rays import PixelSampler
 from warpnerf.render import Steps, TrainingPass
 from warpnerf.scene import Scene
+from warpnerf.state import Progress, TrainingState, scene_digest
 
 FAR_BOXES = 64.0
 """How far an unbounded scene is sampled, in half edges of its box; beyond lies the background."""
@@ -31,28 +32,6 @@ REPORT_EVERY = 25
 FIRST_LOOK = 200
 """Steps before the first look for free space and the first growth: what is left out then stays out,
 so densities must have had time to show."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Progress:
-    """Where training stands."""
-
-    step: int
-    """Steps done."""
-    fraction: float
-    """Of the whole training, [0, 1]."""
-    seconds: float
-    """Since the first step, which may have had to compile."""
-    loss: float
-    """Of the last batch: mean over rays of the squared error, summed over channels."""
-    psnr: float
-    """Of the last batch, dB."""
-    samples_per_ray: float
-    """Visited steps per ray of the last batch."""
-    size: tuple[int, int, int]
-    """Nodes of the grid."""
-    occupied: float
-    """Share of cells that are not free, [0, 1]."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -72,6 +51,8 @@ def train(
     config: TrainConfig | None = None,
     *,
     on_progress: Callable[[Progress], None] | None = None,
+    on_checkpoint: Callable[[TrainingState], None] | None = None,
+    resume: TrainingState | None = None,
 ) -> TrainResult:
     """Train a voxel grid on a scene's training views.
 
@@ -81,23 +62,26 @@ def train(
 
     Args:
         scene: From ``load_scene``.
-        config: How to train; None: the defaults, which are the preset "fast".
+        config: How to train; None: as the training to be resumed, or else the defaults, which are
+            the preset "fast".
         on_progress: Called every ``REPORT_EVERY`` steps and at the end.
+        on_checkpoint: Called every ``config.checkpoint_every`` seconds and at the end with what
+            ``save_checkpoint`` takes, whose arrays the next step changes.
+        resume: Where to go on, from ``load_checkpoint``. On the CPU and with the same number of
+            threads, the result is that of a training that was never interrupted, bit for bit.
 
     Returns:
         The field, and how training ended.
 
     Raises:
-        InputError: The device is missing, or the grid would not fit the memory.
-        FloatingPointError: The loss is no longer a finite number.
+        InputError: The device is missing, the grid would not fit the memory, or scene or
+            configuration are not those of the training to be resumed.
+        FloatingPointError: The loss, or a value in the grid, is no longer a finite number.
     """
-    trainer = Trainer(scene, config or TrainConfig())
-    while trainer.fraction < 1.0:
-        trainer.step()
-        if trainer.report_due:
-            progress = trainer.report()
-            if on_progress is not None:
-                on_progress(progress)
+    if config is None:
+        config = TrainConfig() if resume is None else resume.config
+    trainer = Trainer(scene, config, resume)
+    progress = trainer.run(on_progress, on_checkpoint)
     return TrainResult(
         field=trainer.field(), content_distance=trainer.content_distance, progress=progress
     )
@@ -106,12 +90,17 @@ def train(
 class Trainer:
     """A training run between two steps: the grid, its optimiser, and what comes next."""
 
-    def __init__(self, scene: Scene, config: TrainConfig) -> None:
-        """Set up the first step.
+    def __init__(
+        self, scene: Scene, config: TrainConfig, resume: TrainingState | None = None
+    ) -> None:
+        """Set up the first step, or the next one of a training to be resumed.
 
         Raises:
-            InputError: The device is missing, or the grid would not fit the memory.
+            InputError: The device is missing, the grid would not fit the memory, or scene or
+                configuration are not those of the training to be resumed.
         """
+        if resume is not None:
+            resume.require_same(scene, config)
         self.config = config
         self.workers = Workers(config.device, config.threads)
         self.steps_done = 0
@@ -120,6 +109,11 @@ class Trainer:
             if config.content_distance == "auto"
             else float(config.content_distance)
         )
+        _require_samples(scene, config)
+        self._reach = _reach(scene)
+        if resume is not None:  # estimates anew may be rounded otherwise
+            self.content_distance, self._reach = resume.content_distance, resume.reach
+        self._scene_digest = scene_digest(scene)
         views = [scene.views[i] for i in scene.splits["train"]]
         has_alpha = any(view.image.shape[2] == 4 for view in views)
         behind = config.background
@@ -136,17 +130,44 @@ class Trainer:
             self.workers,
         )
         self._grown = 0
-        _require_samples(scene, config)
-        self._reach = _reach(scene)
         self.grid = self._first_grid(scene)
         self.moments = Moments.zeros(self.grid, self.workers)
         self.free = FreeCells.none(self.workers)
-        self._occupied = 1.0
+        self._started: float | None = None
+        self._seconds = 0.0
+        self._progress: Progress | None = None
+        if resume is not None:
+            self._restore(resume)
+        self._occupied = self.free.share()
         self._pass = self._training_pass()
         for kernel in (occupancy.mark_occupied, interp.resample):  # of later steps; not timed then
             self.workers.load(kernel)
-        self._started = 0.0
-        self._seconds = 0.0
+
+    def run(
+        self,
+        on_progress: Callable[[Progress], None] | None = None,
+        on_checkpoint: Callable[[TrainingState], None] | None = None,
+        stop: Callable[[], bool] = lambda: False,
+    ) -> Progress:
+        """Step until the training is done, or ``stop`` says so; callbacks are those of ``train``.
+
+        Raises:
+            FloatingPointError: The loss, or a value in the grid, is no longer a finite number.
+        """
+        saved_step, saved_at = self.steps_done, time.monotonic()
+        while self.fraction < 1.0 and not stop():
+            self.step()
+            if self.report_due:
+                progress = self.report()
+                if on_progress is not None:
+                    on_progress(progress)
+            late = time.monotonic() - saved_at >= self.config.checkpoint_every
+            if on_checkpoint is not None and late:
+                on_checkpoint(self.state())
+                saved_step, saved_at = self.steps_done, time.monotonic()
+        if on_checkpoint is not None and self.steps_done > saved_step:
+            on_checkpoint(self.state())
+        return self.report()
 
     @property
     def fraction(self) -> float:
@@ -182,8 +203,8 @@ class Trainer:
             config.optim,
             self.workers,
         )
-        if self.steps_done == 1:
-            self._started = time.perf_counter()  # compiling is not training
+        if self._started is None:  # compiling is not training
+            self._started = time.perf_counter() - self._seconds
         self._seconds = time.perf_counter() - self._started
 
     def report(self) -> Progress:
@@ -192,12 +213,12 @@ class Trainer:
         Raises:
             FloatingPointError: The loss is not finite.
         """
+        if self._progress is not None and self._progress.step == self.steps_done:
+            return self._progress
         loss = float(self._pass.error.numpy().mean())
         if not math.isfinite(loss):
-            raise FloatingPointError(
-                f"the loss is not finite after step {self.steps_done}; lower the learning rates."
-            )
-        return Progress(
+            raise self._not_finite("the loss is")
+        self._progress = Progress(
             step=self.steps_done,
             fraction=self.fraction,
             seconds=self._seconds,
@@ -207,6 +228,50 @@ class Trainer:
             size=self.grid.size,
             occupied=self._occupied,
         )
+        return self._progress
+
+    def state(self) -> TrainingState:
+        """All that it takes to go on. Its arrays are the trainer's own: the next step changes them.
+
+        Raises:
+            FloatingPointError: The loss, or a value in the grid, is not finite: nothing to go on
+                from.
+        """
+        progress = self.report()
+        if not np.isfinite(self.grid.values.numpy()).all():
+            raise self._not_finite("values of the grid are")
+        threads = self.config.threads if self.workers.device.is_cuda else self.workers.count
+        return TrainingState(
+            config=replace(self.config, threads=threads),
+            scene_digest=self._scene_digest,
+            content_distance=self.content_distance,
+            reach=self._reach,
+            grown=self._grown,
+            progress=progress,
+            field=self.field(),
+            moments=self.moments,
+        )
+
+    def _not_finite(self, what: str) -> FloatingPointError:
+        return FloatingPointError(
+            f"{what} not finite after step {self.steps_done}; choose a content distance that fits "
+            "the scene, the clamped scaling, or lower learning rates."
+        )
+
+    def _restore(self, state: TrainingState) -> None:
+        """Take over copies of a state's arrays, and where it stands."""
+
+        def copy(array: wp.array) -> wp.array:
+            return wp.clone(array, device=self.workers.device)
+
+        field = state.field
+        self.grid = replace(field.grid, values=copy(field.grid.values))
+        self.free = replace(field.free, distance=copy(field.free.distance))
+        self.moments = Moments(mean=copy(state.moments.mean), square=copy(state.moments.square))
+        self._grown = state.grown
+        self._progress = state.progress
+        self.steps_done = state.progress.step
+        self._seconds = state.progress.seconds
 
     def field(self) -> Field:
         """The scene as it stands."""

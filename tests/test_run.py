@@ -1,0 +1,373 @@
+"""The folder of a run, and that no failure at any point of a save costs what was saved before."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+from test_determinism import small_scene
+from tiny_fields import assert_same_state, tiny_state
+
+from warpnerf import checkpoint
+from warpnerf.checks import InputError
+from warpnerf.config import TrainConfig
+from warpnerf.run import Run
+from warpnerf.state import Progress, TrainingState
+
+CALLS = ("open", "write", "fsync", "close", "replace", "unlink", "mkdir", "rmdir")
+"""The system calls, by their names in ``os``, that a save may make."""
+
+KILLED = 9
+
+state_of = cache(tiny_state)
+
+
+class Faults:
+    """Counts the system calls of a save, and lets one of them go wrong."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, act: Callable[[str], None]) -> None:
+        self.calls: list[str] = []
+        self.at: int | None = None
+        self.written = b""
+        self._act = act
+        for name in CALLS:
+            monkeypatch.setattr(os, name, self._counted(name, getattr(os, name)))
+
+    def _counted(self, name: str, real: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*arguments: Any, **options: Any) -> Any:
+            self.calls.append(name)
+            if len(self.calls) == self.at:
+                if name == "write":  # fails half way
+                    real(arguments[0], arguments[1][: len(arguments[1]) // 2])
+                self._act(name)
+            result = real(*arguments, **options)
+            if name == "write":
+                self.written += bytes(arguments[1][:result])
+            return result
+
+        return call
+
+
+def disk_full(name: str) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def killed(name: str) -> None:
+    os._exit(KILLED)
+
+
+def new_run(folder: Path) -> Run:
+    run = Run(folder)
+    run.create(small_scene(), "builtin:room", 1, 2.0, TrainConfig())
+    return run
+
+
+def run_with(folder: Path, *steps: int) -> Run:
+    """A run that has saved these steps."""
+    run = new_run(folder)
+    for step in steps:
+        run.save_checkpoint(state_of(step))
+    return run
+
+
+def steps_in(run: Run) -> list[str]:
+    return [path.name for path in run.checkpoints]
+
+
+def temporary(folder: Path) -> list[Path]:
+    return list(folder.rglob(".*"))
+
+
+def calls_of(act: Callable[[], Any]) -> list[str]:
+    """The system calls that something makes when all goes well."""
+    with pytest.MonkeyPatch.context() as patch:
+        faults = Faults(patch, disk_full)
+        act()
+    return faults.calls
+
+
+def in_child(act: Callable[[], Any]) -> int:
+    """Run something in a process of its own; its exit status."""
+    child = os.fork()
+    if child == 0:
+        try:
+            act()
+            os._exit(0)
+        except BaseException:
+            os._exit(1)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+@pytest.fixture(autouse=True)
+def several_writes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(checkpoint, "CHUNK", 3000)
+
+
+def require_old_or_new(folder: Path, old: int, new: int) -> None:
+    """What can be read, to resume from and to render, is one of two steps, whole."""
+    state, notes = Run(folder).load_state()
+    assert state.progress.step in (old, new)
+    assert notes == []
+    assert_same_state(state, state_of(state.progress.step))
+    field, _ = Run(folder).load_field("cpu", 1)
+    expected = state_of(state.progress.step).field.grid.values.numpy()
+    assert (field.grid.values.numpy() == expected).all()
+
+
+def test_all_of_a_save_goes_through_the_calls_that_fail_below(tmp_path: Path) -> None:
+    run = run_with(tmp_path, 1, 2)
+    with pytest.MonkeyPatch.context() as patch:
+        faults = Faults(patch, disk_full)
+        run.save_checkpoint(state_of(3))
+    n_writes = faults.calls.count("write")
+    assert n_writes > 5
+    before, after = ["open", *n_writes * ["write"], "fsync", "close"], ["open", "fsync", "close"]
+    assert faults.calls == [*before, "replace", *after, "unlink"]
+    assert faults.written == run.checkpoints[0].read_bytes()
+
+
+def test_a_full_disk_at_any_call_costs_nothing_that_was_saved(tmp_path: Path) -> None:
+    counted = run_with(tmp_path / "counted", 1, 2)
+    n_calls = len(calls_of(lambda: counted.save_checkpoint(state_of(3))))
+    for at in range(1, n_calls + 1):
+        run = run_with(tmp_path / f"run{at}", 1, 2)
+        with pytest.MonkeyPatch.context() as patch:
+            faults = Faults(patch, disk_full)
+            faults.at = at
+            with pytest.raises(
+                InputError, match=r"run\d+ cannot be written: No space left"
+            ) as full:
+                run.save_checkpoint(state_of(3))
+        assert f"go on after step {run.last_step} with: {run.resume_command}" in str(full.value)
+        require_old_or_new(run.folder, 2, 3)
+        assert temporary(run.folder) == []
+        run.save_checkpoint(state_of(4))  # with room again
+        require_old_or_new(run.folder, 4, 4)
+
+
+def test_killed_at_any_call_an_old_or_the_new_checkpoint_is_whole(tmp_path: Path) -> None:
+    run = run_with(tmp_path, 1, 2)
+    n_calls = len(calls_of(lambda: run.save_checkpoint(state_of(3))))
+    outcomes = []
+    for at in range(1, n_calls + 1):
+        old, new = 2 + at, 3 + at  # killed again and again, with no room to clean up between
+
+        def save(at: int = at, new: int = new) -> None:
+            with pytest.MonkeyPatch.context() as patch:
+                Faults(patch, killed).at = at
+                run.save_checkpoint(state_of(new))
+
+        assert in_child(save) == KILLED
+        require_old_or_new(tmp_path, old, new)
+        outcomes.append(run.last_step == new)
+        assert len(temporary(tmp_path)) <= 1
+        run.save_checkpoint(state_of(new))
+        assert temporary(tmp_path) == []
+        assert len(run.checkpoints) == 2
+    assert outcomes == sorted(outcomes)  # the old one up to some call, from there on the new one
+    assert set(outcomes) == {False, True}
+
+
+def test_killed_over_and_over_leaves_one_temporary_file(tmp_path: Path) -> None:
+    run = run_with(tmp_path, 1, 2)
+
+    def save() -> None:
+        with pytest.MonkeyPatch.context() as patch:
+            Faults(patch, killed).at = 5
+            run.save_checkpoint(state_of(3))
+
+    for _ in range(4):
+        assert in_child(save) == KILLED
+        assert len(temporary(tmp_path)) == 1
+    require_old_or_new(tmp_path, 2, 2)
+
+
+def test_interrupted_at_any_call_nothing_is_lost_or_left(tmp_path: Path) -> None:
+    """By a second Ctrl-C."""
+
+    def interrupt(name: str) -> None:
+        raise KeyboardInterrupt
+
+    run = run_with(tmp_path, 1, 2)
+    n_calls = len(calls_of(lambda: run.save_checkpoint(state_of(3))))
+    for at in range(1, n_calls + 1):
+        with pytest.MonkeyPatch.context() as patch:
+            Faults(patch, interrupt).at = at
+            with pytest.raises(KeyboardInterrupt):
+                run.save_checkpoint(state_of(3 + at))
+        require_old_or_new(tmp_path, 2 + at, 3 + at)
+        assert temporary(tmp_path) == []
+        run.save_checkpoint(state_of(3 + at))
+
+
+def whole_steps(folder: Path) -> set[int]:
+    """The steps of what ``eval`` would read in a folder and in previous/."""
+    steps = set()
+    for place in (folder, folder / "previous"):
+        if Run(place).results and (place / "config.json").exists():
+            field, notes = Run(place).load_field("cpu", 1)
+            assert notes == []
+            values = field.grid.values.numpy()
+            same = [n for n in (1, 8, 9) if (values == state_of(n).field.grid.values.numpy()).all()]
+            steps.update(same)
+    return steps
+
+
+@pytest.mark.parametrize("finished", [False, True])
+def test_killed_while_replacing_a_run_one_of_the_two_is_whole(
+    tmp_path: Path, finished: bool
+) -> None:
+    """Up to the first checkpoint of the new run, the old one is in the folder or in previous/."""
+
+    def old_run(name: str) -> Path:
+        run = run_with(tmp_path / name, 8, 9)
+        if finished:
+            run.save_field(state_of(9).field)
+        return run.folder
+
+    def replaced(folder: Path, at: int | None) -> None:
+        with pytest.MonkeyPatch.context() as patch:
+            Faults(patch, killed).at = at
+            new_run(folder).save_checkpoint(state_of(1))
+
+    counted = old_run("counted")
+    n_calls = len(calls_of(lambda: replaced(counted, None)))
+    for at in range(1, n_calls + 1):
+        folder = old_run(f"run{at}")
+        assert in_child(lambda folder=folder, at=at: replaced(folder, at)) == KILLED
+        assert whole_steps(folder) & {1, 9}
+        new_run(folder)  # another one, that ends before it has saved anything
+        assert whole_steps(folder) & {1, 9}
+        replaced(folder, None)
+        require_old_or_new(folder, 1, 1)
+        assert not (folder / "previous").exists()
+        assert not (folder / "field.safetensors").exists()
+        assert temporary(folder) == []
+
+
+def test_a_run_is_put_aside_until_the_next_has_saved_something(tmp_path: Path) -> None:
+    run_with(tmp_path, 8, 9)
+    (tmp_path / "test" / "old.png").write_bytes(b"")
+    (tmp_path / "notes.txt").write_text("mine")
+    run = new_run(tmp_path)
+    assert run.checkpoints == [] and list((tmp_path / "test").iterdir()) == []
+    assert f"the run before is in {tmp_path / 'previous'}" in run.way_on()
+    require_old_or_new(tmp_path / "previous", 9, 9)
+    new_run(tmp_path)  # once more, without having saved anything
+    require_old_or_new(tmp_path / "previous", 9, 9)
+    run.save_checkpoint(state_of(1))
+    assert not (tmp_path / "previous").exists()
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
+def test_the_last_two_are_kept(tmp_path: Path) -> None:
+    run = run_with(tmp_path, 1, 20, 300, 4000)
+    assert steps_in(run) == ["checkpoint-00004000.safetensors", "checkpoint-00000300.safetensors"]
+
+
+def test_a_damaged_checkpoint_is_passed_over_with_a_note(tmp_path: Path) -> None:
+    run = run_with(tmp_path, 1, 2)
+    newest = run.checkpoints[0]
+    newest.write_bytes(newest.read_bytes()[:-1])
+    state, notes = run.load_state()
+    assert_same_state(state, state_of(1))
+    assert len(notes) == 1 and str(newest) in notes[0]
+    _, notes = run.load_field("cpu", 1)
+    assert len(notes) == 1 and str(newest) in notes[0]
+    # Resumed before it, and interrupted before it too: it must not push a good one out.
+    run.save_checkpoint(replace(state_of(1), progress=replace(state.progress, step=1)))
+    assert steps_in(run) == ["checkpoint-00000001.safetensors"]
+
+
+def test_damaged_throughout_it_is_refused(tmp_path: Path) -> None:
+    run = run_with(tmp_path, 1, 2)
+    for path in run.checkpoints:
+        path.write_bytes(b"")
+    with pytest.raises(InputError, match="is damaged"):
+        run.load_state()
+    with pytest.raises(InputError, match="is damaged"):
+        run.load_field("cpu", 1)
+
+
+def test_nothing_saved_is_said_so(tmp_path: Path) -> None:
+    run = new_run(tmp_path)
+    with pytest.raises(InputError, match=r"holds no checkpoint.*--overwrite"):
+        run.load_state()
+    with pytest.raises(InputError, match="holds no field"):
+        run.load_field("cpu", 1)
+
+
+def test_a_configuration_that_is_not_the_checkpoint_s_is_refused(tmp_path: Path) -> None:
+    run = run_with(tmp_path, 1)
+    path = tmp_path / "config.json"
+    path.write_text(path.read_text().replace('"rays_per_step": 4096', '"rays_per_step": 8'))
+    with pytest.raises(InputError, match=r"config\.json: train\.rays_per_step is 8, but .* 4096"):
+        run.load_state()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ('"steps": 4000', '"steps": 0', "steps"),
+        ('"steps": 4000', '"steps": "many"', r"train\.steps"),
+        ('"downscale": 1', '"down": 1', "downscale"),
+        ('"downscale": 1', '"downscale": 1, "downscale": 2', "twice"),
+        ('"grow_at": [', '"grow_at": [[', "grow_at"),
+    ],
+)
+def test_a_broken_config_json_is_refused(tmp_path: Path, old: str, new: str, says: str) -> None:
+    run = new_run(tmp_path)
+    path = tmp_path / "config.json"
+    text = path.read_text()
+    assert old in text
+    text = text.replace(old, new, 1)
+    path.write_text(text.replace("0.6\n      ]", "0.6\n      ]]") if "[[" in new else text)
+    with pytest.raises(InputError, match=rf"config\.json.*{says}"):
+        run.read_config()
+
+
+def test_the_configuration_comes_back_as_it_was(tmp_path: Path) -> None:
+    config = TrainConfig(content_distance=0.1, background=(0.0, 1.0, 0.5), time_limit=3.0)
+    run = Run(tmp_path)
+    run.create(small_scene(), "builtin:room", 3, 0.1, config)
+    read = run.read_config()
+    assert (read.scene, read.downscale, read.train) == ("builtin:room", 3, config)
+
+
+def test_reports_of_steps_to_be_done_again_are_dropped(tmp_path: Path) -> None:
+    run = new_run(tmp_path)
+    run.rewind_log(0)  # no log yet
+    progress: Progress = state_of(1).progress
+    for step in (25, 50, 75):
+        run.log(replace(progress, step=step))
+    path = tmp_path / "log.jsonl"
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(lines) + lines[0][:20])  # cut off by a crash
+    run.rewind_log(60)
+    assert path.read_text() == "".join(lines[:2])
+    run.log(replace(progress, step=75))
+    assert path.read_text() == "".join(lines)
+
+
+def test_a_taken_folder_names_both_ways_out(tmp_path: Path) -> None:
+    new_run(tmp_path)
+    with pytest.raises(InputError, match=r"--resume .*--overwrite"):
+        Run.require_free(tmp_path, overwrite=False)
+    Run.require_free(tmp_path, overwrite=True)
+
+
+def test_the_command_to_resume_is_quoted() -> None:
+    assert Run("my runs/room").resume_command == "warpnerf train --resume 'my runs/room'"
+
+
+def test_a_state_of_the_same_step_replaces_it(tmp_path: Path) -> None:
+    run = run_with(tmp_path, 5)
+    changed: TrainingState = replace(state_of(5), reach=1.0)
+    run.save_checkpoint(changed)
+    assert_same_state(run.load_state()[0], changed)

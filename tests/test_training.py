@@ -1,0 +1,215 @@
+"""A training that is interrupted and resumed ends as one that was not, bit for bit."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from test_determinism import small_scene
+from tiny_fields import assert_same_state
+
+from warpnerf import training
+from warpnerf.checkpoint import load_checkpoint, save_checkpoint
+from warpnerf.checks import InputError
+from warpnerf.config import GridConfig, OptimConfig, TrainConfig
+from warpnerf.scene import Scene
+from warpnerf.state import TrainingState
+from warpnerf.training import Trainer, train
+
+STEPS = 20
+GROWING = (7, 13)
+"""The steps at which the grid of ``tiny_config`` grows: the first with a share above 0.3, 0.6."""
+
+
+@pytest.fixture(autouse=True)
+def early_growth(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Free space is looked for, and the grid grows, within a short training."""
+    monkeypatch.setattr(training, "FIRST_LOOK", 4)
+    monkeypatch.setattr(training, "REPORT_EVERY", 3)
+
+
+def ball() -> Scene:
+    """Something round of many colours, with nothing around it."""
+    scene = small_scene()
+    v, u = np.mgrid[:18, :24]
+    inside = np.hypot(v - 8.5, u - 11.5) < 4.0
+    for view in scene.views:
+        view.image[..., 3] = 255 * inside
+    return scene
+
+
+def tiny_config(**changes: Any) -> TrainConfig:
+    return replace(
+        TrainConfig(
+            steps=STEPS,
+            rays_per_step=300,
+            occupancy_every=5,
+            alpha_min=0.1,
+            background="random",
+            threads=1,
+            grid=GridConfig(voxels=6000, grow_at=(0.301, 0.601), alpha_init=0.1),
+            optim=OptimConfig(tv_every=3, tv_density=1e-4, tv_rgb=1e-4),
+        ),
+        **changes,
+    )
+
+
+def stopped_at(
+    step: int, file: Path, config: TrainConfig, scene: Scene, resume: TrainingState | None = None
+) -> TrainingState:
+    """Train up to a step, and what a file then gives back."""
+    trainer = Trainer(scene, config, resume)
+    trainer.run(
+        on_checkpoint=lambda state: save_checkpoint(file, state),
+        stop=lambda: trainer.steps_done >= step,
+    )
+    assert trainer.steps_done == step
+    return load_checkpoint(file)
+
+
+def without_seconds(state: TrainingState) -> TrainingState:
+    """The one thing that no two trainings share."""
+    return replace(state, progress=replace(state.progress, seconds=0.0))
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize("unbounded", [False, True])
+def test_resumed_after_any_step_it_ends_the_same(
+    tmp_path: Path, threads: int, unbounded: bool, on_cpu: None
+) -> None:
+    scene, config = replace(ball(), unbounded=unbounded), tiny_config(threads=threads)
+    whole = stopped_at(STEPS, tmp_path / "whole", config, scene)
+    assert whole.grown == 2 and 0.02 < whole.progress.occupied < 0.98
+    assert unbounded or (whole.field.grid.box_min > scene.box_min).any()
+    for step in range(1, STEPS):
+        begun = stopped_at(step, tmp_path / "begun", config, scene)
+        assert begun.grown == sum(step > at for at in GROWING)
+        resumed = stopped_at(STEPS, tmp_path / "resumed", begun.config, scene, begun)
+        assert_same_state(without_seconds(resumed), without_seconds(whole))
+
+
+def test_interrupted_after_every_step_it_ends_the_same(tmp_path: Path, on_cpu: None) -> None:
+    whole = stopped_at(STEPS, tmp_path / "whole", tiny_config(), ball())
+    state = None
+    for step in range(1, STEPS + 1):
+        state = stopped_at(step, tmp_path / "state", tiny_config(), ball(), state)
+    assert state is not None
+    assert_same_state(without_seconds(state), without_seconds(whole))
+
+
+def test_train_resumes_too_and_leaves_the_state_alone(tmp_path: Path, on_cpu: None) -> None:
+    scene = ball()
+    whole = train(scene, tiny_config())
+    state = stopped_at(9, tmp_path / "state", tiny_config(), scene)
+    for _ in range(2):  # the second would differ had the first worked in the state's own arrays
+        result = train(scene, resume=state)
+        assert replace(result.progress, seconds=0.0) == replace(whole.progress, seconds=0.0)
+        values = result.field.grid.values.numpy()
+        np.testing.assert_array_equal(values, whole.field.grid.values.numpy())
+
+
+def test_estimates_that_another_machine_rounds_otherwise_change_nothing(
+    tmp_path: Path, on_cpu: None
+) -> None:
+    scene = replace(ball(), unbounded=True)
+    whole = stopped_at(STEPS, tmp_path / "whole", tiny_config(), scene)
+    begun = stopped_at(5, tmp_path / "begun", tiny_config(), scene)
+    nudged = replace(scene, content_distance=2.0 * (1 + 1e-7), box_max=scene.box_max * (1 + 1e-7))
+    resumed = stopped_at(STEPS, tmp_path / "resumed", tiny_config(), nudged, begun)
+    assert_same_state(without_seconds(resumed), without_seconds(whole))
+
+
+def test_a_finished_training_resumes_to_its_end(tmp_path: Path) -> None:
+    state = stopped_at(STEPS, tmp_path / "state", tiny_config(), ball())
+    saved: list[TrainingState] = []
+    result = train(ball(), resume=state, on_checkpoint=saved.append)
+    assert result.progress == state.progress
+    np.testing.assert_array_equal(result.field.grid.values.numpy(), state.field.grid.values.numpy())
+    assert not saved  # nothing new
+
+
+def test_seconds_before_the_resumption_count(tmp_path: Path) -> None:
+    config = tiny_config(time_limit=1000.0)
+    state = stopped_at(2, tmp_path / "state", config, ball())
+    spent = replace(state, progress=replace(state.progress, seconds=900.0))
+    trainer = Trainer(ball(), config, spent)
+    assert trainer.fraction == 0.9
+    trainer.step()
+    assert 900.0 <= trainer.report().seconds < 1000.0
+
+
+def test_checkpoints_come_when_due_and_at_the_end() -> None:
+    for every, steps in ((1e-9, list(range(1, STEPS + 1))), (1e9, [STEPS])):
+        saved: list[int] = []
+        train(
+            ball(),
+            tiny_config(checkpoint_every=every),
+            on_checkpoint=lambda state, saved=saved: saved.append(state.progress.step),
+        )
+        assert saved == steps
+
+
+@pytest.mark.parametrize(
+    ("changes", "name"),
+    [
+        ({"steps": STEPS + 1}, "steps"),
+        ({"time_limit": 60.0}, "time_limit"),
+        ({"seed": 1}, "seed"),
+        ({"scaling": "none"}, "scaling"),
+        ({"grid": GridConfig(voxels=6000, grow_at=(0.301,), alpha_init=0.1)}, "grid.grow_at"),
+        ({"optim": OptimConfig(decay=0.5)}, "optim.decay"),
+    ],
+)
+def test_another_configuration_is_refused_by_name(
+    tmp_path: Path, changes: dict[str, Any], name: str
+) -> None:
+    state = stopped_at(1, tmp_path / "state", tiny_config(), ball())
+    with pytest.raises(InputError, match=rf"^{name} is "):
+        train(ball(), tiny_config(**changes), resume=state)
+
+
+def test_what_does_not_decide_the_result_may_change(tmp_path: Path) -> None:
+    state = stopped_at(17, tmp_path / "state", tiny_config(), ball())
+    changed = tiny_config(threads=2, checkpoint_every=7.0)
+    progress = train(ball(), changed, resume=state).progress
+    assert progress.step == STEPS
+
+
+def test_other_photographs_are_refused(tmp_path: Path) -> None:
+    state = stopped_at(1, tmp_path / "state", tiny_config(), ball())
+    scene = ball()
+    scene.views[1].image[3, 4, 0] ^= 1
+    with pytest.raises(InputError, match=r"noise.*photographs"):
+        train(scene, resume=state)
+
+
+def test_the_threads_in_use_are_part_of_the_state() -> None:
+    trainer = Trainer(ball(), tiny_config(threads=None))
+    trainer.step()
+    assert trainer.state().config.threads == trainer.workers.count
+
+
+@pytest.mark.parametrize("where", ["loss", "grid"])
+def test_what_is_not_finite_is_never_saved(where: str) -> None:
+    saved: list[int] = []
+    trainer = Trainer(ball(), tiny_config(checkpoint_every=1e-9))
+
+    def keep(state: TrainingState) -> None:
+        saved.append(state.progress.step)
+        if trainer.steps_done == 4 and where == "loss":  # of the batch of step 5
+            trainer.grid.values.fill_(math.nan)
+
+    def spoil() -> bool:
+        if trainer.steps_done == 4 and where == "grid":
+            values = trainer.grid.values.numpy()
+            values[0, 2] = math.nan  # a corner, which no ray meets
+            trainer.grid.values.assign(values)
+        return False
+
+    with pytest.raises(FloatingPointError, match="not finite after step 5"):
+        trainer.run(on_checkpoint=keep, stop=spoil)
+    assert saved == [1, 2, 3, 4]

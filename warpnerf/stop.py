@@ -1,0 +1,51 @@
+"""Ctrl-C and SIGTERM: how a program is asked to end, and what it then exits with."""
+
+from __future__ import annotations
+
+import signal
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Stopped(KeyboardInterrupt):
+    """A signal asks the program to end here and now."""
+
+    def __init__(self, number: int) -> None:
+        """Keep the signal's number."""
+        super().__init__()
+        self.exit_code = 128 + number
+        """130 after Ctrl-C, 143 after SIGTERM, as shells have it."""
+
+
+def raise_when_asked() -> None:
+    """From now on, Ctrl-C and SIGTERM raise Stopped in the main thread."""
+    for number in SIGNALS:
+        signal.signal(number, _raise)
+
+
+class StopRequest:
+    """Within it, the first signal is only noted, so that a step can be finished and saved."""
+
+    def __enter__(self) -> StopRequest:
+        """Take the signals over."""
+        self.exit_code: int | None = None
+        self._before = {number: signal.signal(number, self._note) for number in SIGNALS}
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Give them back."""
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    @property
+    def asked(self) -> bool:
+        """Whether a signal came."""
+        return self.exit_code is not None
+
+    def _note(self, number: int, frame: object) -> None:
+        self.exit_code = Stopped(number).exit_code
+        raise_when_asked()  # who asks twice does not want to wait
+
+
+def _raise(number: int, frame: object) -> None:
+    raise Stopped(number)
