@@ -5,6 +5,7 @@ import os
 import pytest
 import warp as wp
 from drive import Kernels
+from watched_command import assert_trained, make_scene, train
 
 if "WARP_CACHE_PATH" in os.environ:
     wp.config.kernel_cache_dir = os.environ["WARP_CACHE_PATH"]
@@ -43,3 +44,10 @@ def packed(device: str) -> Kernels:
     if device != "cpu":
         pytest.skip("packs of eight samples are the CPU's form of the kernels")
     return Kernels("float32", device, packed=True)
+
+
+@pytest.fixture(scope="session")
+def compiled_kernels(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """What a run compiles is in the cache, so that commands under test take their usual time."""
+    folder = tmp_path_factory.mktemp("compiled")
+    assert_trained(train(make_scene(folder), folder=folder, limit=None))

@@ -52,7 +52,8 @@ def test_help_names_every_option() -> None:
     code, out, _ = run("train", "--help")
     assert code == 0
     options = ["output", "steps", "time-limit", "scaling", "content-distance", "near", "downscale"]
-    for option in [*options, "device", "threads", "seed", "preset", "resume", "checkpoint-every"]:
+    more = ["device", "threads", "seed", "preset", "voxels", "resume", "checkpoint-every"]
+    for option in [*options, *more]:
         assert f"--{option}" in out
     code, out, _ = run("eval", "--help")
     assert code == 0

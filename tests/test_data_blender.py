@@ -90,7 +90,7 @@ def test_missing_images_are_counted_per_file(tmp_path: Path) -> None:
     (tmp_path / "test/r_1.png").unlink()
     assert any(
         "transforms_test.json: left out 1 of 3 frames for want of an image" in note
-        for note in load_scene(tmp_path).notes
+        for note in load_scene(tmp_path).warnings
     )
 
 
@@ -99,7 +99,9 @@ def test_same_images_for_training_and_testing_are_noted(tmp_path: Path) -> None:
     save(tmp_path / "transforms_test.json", content)
     scene = load_scene(tmp_path)
     assert scene.splits == {"train": (0, 1, 2, 3), "test": (0, 1, 2, 3)}
-    assert any("used for training and for testing: 4 of 4 images" in note for note in scene.notes)
+    assert any(
+        "used for training and for testing: 4 of 4 images" in note for note in scene.warnings
+    )
 
 
 def test_message_names_the_file_of_the_split(tmp_path: Path) -> None:

@@ -78,7 +78,7 @@ def test_split_of_the_file_is_used(tmp_path: Path) -> None:
     assert len(scene.views) == 4
     assert any(
         "not among the frames: 1 of 3 train_filenames (first: images/009.png)" in note
-        for note in scene.notes
+        for note in scene.warnings
     )
     assert any(
         "in no split and not used: 1 of 5 images (first: images/004.png)" in note
@@ -97,7 +97,9 @@ def test_image_in_both_splits_is_noted(tmp_path: Path) -> None:
         tmp_path, lambda c: c.update(train_filenames=names, test_filenames=names[:1])
     )
     assert scene.splits == {"train": (0, 1, 2, 3), "test": (0,)}
-    assert any("used for training and for testing: 1 of 4 images" in note for note in scene.notes)
+    assert any(
+        "used for training and for testing: 1 of 4 images" in note for note in scene.warnings
+    )
 
 
 def test_missing_images_are_counted(tmp_path: Path) -> None:
@@ -108,7 +110,7 @@ def test_missing_images_are_counted(tmp_path: Path) -> None:
     assert len(scene.views) == 4
     assert any(
         "left out 2 of 6 frames for want of an image (first: images/001.png)" in note
-        for note in scene.notes
+        for note in scene.warnings
     )
 
 
@@ -119,7 +121,9 @@ def test_image_listed_twice_is_noted(tmp_path: Path) -> None:
 
     scene = load_changed(tmp_path, change)
     assert len(scene.views) == 4
-    assert any("left out 1 of 5 frames for naming an image again" in note for note in scene.notes)
+    assert any(
+        "left out 1 of 5 frames for naming an image again" in note for note in scene.warnings
+    )
 
 
 def test_keys_that_change_the_picture_are_named(tmp_path: Path) -> None:
@@ -130,7 +134,7 @@ def test_keys_that_change_the_picture_are_named(tmp_path: Path) -> None:
         content["applied_transform"] = np.eye(4)[:3].tolist()
 
     scene = load_changed(tmp_path, change)
-    assert [note for note in scene.notes if "is not used" in note] == [
+    assert [note for note in scene.warnings if "is not used" in note] == [
         "transforms.json: mask_path is not used: masked pixels are trained on like all others"
     ]
     assert scene.content_distance == pytest.approx(np.sqrt(10.0))
@@ -287,9 +291,9 @@ def test_pose_with_a_number_out_of_range_is_refused(tmp_path: Path) -> None:
     content["frames"][1]["transform_matrix"][0][3] = "HERE"
     save(tmp_path / "transforms.json", content)
     text = (tmp_path / "transforms.json").read_text()
-    for number, message in [("1e999", rf"{POSE}\[0\]\[3\]: is not a finite"), ("NaN", "NaN is")]:
+    for number in ("1e999", "NaN", "-Infinity"):
         (tmp_path / "transforms.json").write_text(text.replace('"HERE"', number))
-        with pytest.raises(InputError, match=rf"transforms\.json: .*{message}"):
+        with pytest.raises(InputError, match=rf"{POSE}\[0\]\[3\]: is not a finite number"):
             load_scene(tmp_path)
 
 

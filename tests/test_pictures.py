@@ -8,7 +8,7 @@ import imageio.v3 as iio
 import numpy as np
 
 from warpnerf.field import Rendering
-from warpnerf.pictures import comparison, depth_colours, write_png
+from warpnerf.pictures import comparison, depth_colours, picture_files, write_png
 
 
 def test_png_keeps_pixels_and_clips(tmp_path: Path) -> None:
@@ -50,3 +50,26 @@ def test_comparison_shows_three_panels() -> None:
     last = image[:, -width:]
     np.testing.assert_array_equal(last[0], 1.0)
     np.testing.assert_allclose(last[1:], depth_colours(depth, 0.0, 4.0)[1:])
+
+
+def test_every_view_gets_a_picture_of_its_own() -> None:
+    names = ["a/b.png", "a_b.png", "a_B.png", "a_b_2.png", "c.jpg", "c.jpg.png", "c.png"]
+    assert picture_files(names) == {
+        "a/b.png": "a_b.png",
+        "a_b.png": "a_b_2.png",
+        "a_B.png": "a_B_3.png",
+        "a_b_2.png": "a_b_2_2.png",
+        "c.jpg": "c.jpg.png",
+        "c.jpg.png": "c.jpg_2.png",
+        "c.png": "c.png",
+    }
+
+
+def test_names_of_pictures_fit_a_file_system(tmp_path: Path) -> None:
+    long = "images/" + 240 * "x"
+    names = [f"{long}1.png", f"{long}2.png", "\u00e4" * 240 + ".png", "\ud800.png"]
+    files = picture_files(names)
+    for name in files.values():
+        write_png(tmp_path / name, np.zeros((2, 2, 3)))
+    assert len(list(tmp_path.iterdir())) == len(names)
+    assert files[names[0]].endswith("x1.png")

@@ -255,7 +255,7 @@ def test_bad_tensors(device: str) -> None:
     fails("box_max must lie above box_min", raw, origins, directions, *box[::-1])
     fails("box_min must be three finite", raw, origins, directions, (0, 0), (1, 1, 1))
     fails("dense tensor", raw.to_sparse(), origins, directions, *box)
-    fails("origins must be on", raw, origins.to("meta"), directions, *box)
+    fails("origins must be on the CPU or", raw, origins.to("meta"), directions, *box)
 
 
 # scale_gradient
@@ -370,7 +370,8 @@ def test_scale_gradient_refuses(device: str) -> None:
         ((colors, sigmas, t[:, :4]), "one shape"),
         ((colors[:3], sigmas, t), "colors must be"),
         ((colors, sigmas, t, 0.0), "content_distance must be"),
-        ((colors, sigmas, t, torch.tensor([1.0, -1.0])), "above 0 everywhere"),
+        ((colors, sigmas, t, torch.tensor([-1.0])), "above 0 everywhere"),
+        ((colors, sigmas, t, torch.tensor([1.0, 2.0])), "must broadcast over distances"),
         ((colors, sigmas, t, 1.0, "cubic"), "scaling must be one of"),
     ]:
         with pytest.raises(InputError, match=message):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import struct
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -51,9 +53,10 @@ def picture(seed: int, *, width: int = 8, height: int = 6, channels: int = 3) ->
     return np.random.default_rng(seed).integers(0, 256, (height, width, channels), dtype=np.uint8)
 
 
-def transforms_content(n: int) -> dict[str, Any]:
+def transforms_content(n: int, scale: int = 1) -> dict[str, Any]:
     """What ``write_transforms`` writes."""
     lens = {"fl_x": 10.0, "fl_y": 11.0, "cx": 4.25, "cy": 2.75, "w": 8, "h": 6}
+    lens = {key: scale * value for key, value in lens.items()}
     frames = [
         {"file_path": f"images/{i:03d}.png", "transform_matrix": pose.tolist()}
         for i, pose in enumerate(ring(n))
@@ -61,12 +64,13 @@ def transforms_content(n: int) -> dict[str, Any]:
     return {**lens, "frames": frames}
 
 
-def write_transforms(folder: Path, n: int = 4) -> dict[str, Any]:
+def write_transforms(folder: Path, n: int = 4, scale: int = 1) -> dict[str, Any]:
     """A transforms.json with its images; returns the content, to be changed and saved again."""
     (folder / "images").mkdir(parents=True)
     for i in range(n):
-        Image.fromarray(picture(i)).save(folder / f"images/{i:03d}.png")
-    content = transforms_content(n)
+        pixels = picture(i, width=8 * scale, height=6 * scale)
+        Image.fromarray(pixels).save(folder / f"images/{i:03d}.png")
+    content = transforms_content(n, scale)
     save(folder / "transforms.json", content)
     return content
 
@@ -84,3 +88,33 @@ def write_blender(folder: Path, split: str, poses: list[np.ndarray], *, channels
 
 def save(path: Path, content: Any) -> None:
     path.write_text(json.dumps(content))
+
+
+def hand_made_png(
+    path: Path,
+    *,
+    size: tuple[int, int],
+    depth: int,
+    colour: int,
+    raw: bytes,
+    transparent: bytes = b"",
+) -> Path:
+    """A PNG that Pillow does not write; raw rows begin with their filter byte."""
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        return (
+            struct.pack(">I", len(content))
+            + kind
+            + content
+            + struct.pack(">I", zlib.crc32(kind + content))
+        )
+
+    header = struct.pack(">IIBBBBB", *size, depth, colour, 0, 0, 0)
+    path.write_bytes(
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", header)
+        + (chunk(b"tRNS", transparent) if transparent else b"")
+        + chunk(b"IDAT", zlib.compress(raw))
+        + chunk(b"IEND", b"")
+    )
+    return path

@@ -6,9 +6,12 @@ looking along -z); pixel (column u, row v) has its centre at (u + 0.5, v + 0.5);
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+
+from warpnerf.checks import InputError, require_at_least, require_positive
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -45,6 +48,32 @@ class Camera:
     """Tangential distortion."""
     p2: float = 0.0
     """Tangential distortion."""
+
+    def __post_init__(self) -> None:
+        """Refuse what makes no rays."""
+        self.check()
+
+    def check(self) -> None:
+        """Refuse what makes no rays; kernels would not notice.
+
+        Raises:
+            InputError: A size or focal length is not above zero, a number is not finite, or the
+                pose has another shape.
+        """
+        require_at_least("Camera.width", self.width, 1)
+        require_at_least("Camera.height", self.height, 1)
+        require_positive("Camera.fx", self.fx)
+        require_positive("Camera.fy", self.fy)
+        for name in ("cx", "cy", "k1", "k2", "k3", "p1", "p2"):
+            if not math.isfinite(getattr(self, name)):
+                raise InputError(f"Camera.{name} must be finite, not {getattr(self, name)}.")
+        if not isinstance(self.c2w, np.ndarray) or self.c2w.shape != (3, 4):
+            raise InputError(
+                f"Camera.c2w must be an array [3, 4], not {list(np.shape(self.c2w))}; leave out a "
+                "4x4 matrix's last row."
+            )
+        if not np.isfinite(self.c2w).all():
+            raise InputError("Camera.c2w must be finite, but holds NaN or infinity.")
 
     @property
     def position(self) -> np.ndarray:

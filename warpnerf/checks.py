@@ -27,6 +27,12 @@ def require_at_least(field: str, value: float, least: float) -> None:
         raise InputError(f"{field} must be a finite number of at least {least:g}, not {value}.")
 
 
+def require_whole(field: str, value: int, least: int) -> None:
+    """Raise InputError unless value is a whole number of at least `least`."""
+    if isinstance(value, bool) or not hasattr(value, "__index__") or value < least:
+        raise InputError(f"{field} must be a whole number of at least {least}, not {value!r}.")
+
+
 def require_one_of(field: str, value: str, choices: Iterable[str]) -> None:
     """Raise InputError unless value is one of the choices."""
     if value not in choices:

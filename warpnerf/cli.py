@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import io
+import logging
+import re
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -24,6 +28,9 @@ if TYPE_CHECKING:
 FAILED = 1
 BAD_INPUT = 2
 
+OUT_OF_MEMORY = re.compile("failed to allocate|can't start new thread", re.IGNORECASE)
+"""What Warp and the standard library say in a RuntimeError where a MemoryError is meant."""
+
 
 def train_command(
     scene: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[SCENE]")] = None,
@@ -35,6 +42,7 @@ def train_command(
     time_limit: float | None = None,
     scaling: Scaling | None = None,
     content_distance: float | Literal["auto"] | None = None,
+    voxels: int | None = None,
     near: float | None = None,
     downscale: int | None = None,
     device: str | None = None,
@@ -54,6 +62,7 @@ def train_command(
         time_limit: Seconds of training; the schedule is squeezed to fit.
         scaling: How a sample's gradient depends on its distance from the camera.
         content_distance: Where gradients reach full strength, in the scene's units.
+        voxels: Nodes of the final grid, in all; memory goes with their number.
         near: Nothing is sampled nearer to the camera than this, in the scene's units.
         downscale: Average blocks of so many pixels squared; by default 1, as they are.
         device: cpu, cuda, cuda:1, ...
@@ -76,9 +85,13 @@ def train_command(
 
     def changed(config: TrainConfig) -> TrainConfig:
         config = dataclasses.replace(config, **given)
-        if near is None:
-            return config
-        return dataclasses.replace(config, march=dataclasses.replace(config.march, near=near))
+        if voxels is not None:
+            grid = dataclasses.replace(config.grid, voxels=voxels)
+            config = dataclasses.replace(config, grid=grid)
+        if near is not None:
+            march = dataclasses.replace(config.march, near=near)
+            config = dataclasses.replace(config, march=march)
+        return config
 
     if resume is not None:
         fixed = {"output": output, "preset": preset, "downscale": downscale, "overwrite": overwrite}
@@ -142,11 +155,18 @@ def eval_command(
 
 def _begin(source: str, output: Path, downscale: int, config: TrainConfig, overwrite: bool) -> int:
     """Train from the first step on."""
+    from warpnerf.data.files import exists
+
+    if exists(output):
+        from warpnerf.run import Run
+
+        Run.require_free(output, overwrite)
+    scene = _read(source, downscale)
+
+    # Not before: these load Warp, and bad input is refused at once.
     from warpnerf.run import Run
     from warpnerf.training import Trainer
 
-    Run.require_free(output, overwrite)
-    scene = _read(source, downscale)
     trainer = Trainer(scene, config)
     _describe(scene, trainer.content_distance, config)
     run = Run(output)
@@ -238,6 +258,8 @@ def _describe(scene: Scene, content_distance: float, config: TrainConfig) -> Non
     shown = ", ".join(f"{w} x {h}" for w, h in sizes[:3]) + (", ..." if len(sizes) > 3 else "")
     extent = scene.box_max - scene.box_min
     print(f"{scene.name}: {train} training and {test} test views, {shown} pixels")
+    for warning in scene.warnings:
+        print(f"  warning: {warning}")
     for note in scene.notes:
         print(f"  note: {note}")
     print(f"  content distance {content_distance:.4g} scene units, scaling {config.scaling}")
@@ -314,6 +336,11 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"warpnerf {__version__}")
         return 0
     raise_when_asked()
+    warnings.filterwarnings("ignore", module="PIL")  # what matters in an image is refused
+    logging.getLogger("PIL").setLevel(logging.CRITICAL)
+    warnings.formatwarning = lambda message, *_: f"warpnerf: warning: {message}.\n"
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # file names may hold anything
     try:
         return tyro.extras.subcommand_cli_from_dict(
             {"train": train_command, "eval": eval_command},
@@ -324,9 +351,13 @@ def main(arguments: list[str] | None = None) -> int:
     except InputError as error:
         print(f"warpnerf: error: {error}", file=sys.stderr)
         return BAD_INPUT
-    except MemoryError:
+    except (MemoryError, RuntimeError) as error:
+        if not isinstance(error, MemoryError) and not OUT_OF_MEMORY.search(str(error)):
+            raise
+        why = f" ({error})" if str(error) else ""
         print(
-            "warpnerf: error: out of memory; use --downscale, or a smaller preset.", file=sys.stderr
+            f"warpnerf: error: out of memory{why}; use fewer --voxels, or a larger --downscale.",
+            file=sys.stderr,
         )
         return BAD_INPUT
     except OSError as error:

@@ -6,12 +6,21 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
-from warpnerf.checks import InputError, require_at_least, require_one_of, require_positive
+from warpnerf.checks import (
+    InputError,
+    require_at_least,
+    require_one_of,
+    require_positive,
+    require_whole,
+)
 
 Scaling = Literal["none", "quadratic", "clamped"]
 Jacobian = Literal["none", "density", "paper"]
 Contraction = Literal["none", "linf", "l2"]
 Background = Literal["auto", "white", "black", "random"]
+
+MAX_VOXELS = 2**31
+"""Nodes are counted in 32 bits."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +40,12 @@ class GridConfig:
 
     def __post_init__(self) -> None:
         """Refuse what makes no grid."""
-        require_at_least("grid.voxels", self.voxels, 8)
+        require_whole("grid.voxels", self.voxels, 8)
+        if self.voxels >= MAX_VOXELS:
+            raise InputError(
+                "grid.voxels must be below 2^31 (1290 x 1290 x 1290), which kernels can count; use "
+                "fewer --voxels."
+            )
         require_one_of("grid.contraction", self.contraction, ("auto", *get_args(Contraction)))
         if not 0 < self.alpha_init < 1:
             raise InputError(f"grid.alpha_init must lie between 0 and 1, not {self.alpha_init}.")
@@ -107,7 +121,7 @@ class OptimConfig:
         require_positive("optim.epsilon", self.epsilon)
         require_at_least("optim.tv_density", self.tv_density, 0.0)
         require_at_least("optim.tv_rgb", self.tv_rgb, 0.0)
-        require_at_least("optim.tv_every", self.tv_every, 1)
+        require_whole("optim.tv_every", self.tv_every, 1)
         for name in ("beta1", "beta2"):
             if not 0 <= getattr(self, name) < 1:
                 raise InputError(f"optim.{name} must lie in [0, 1), not {getattr(self, name)}.")
@@ -155,11 +169,12 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         """Refuse what cannot be trained with."""
-        require_at_least("steps", self.steps, 1)
-        require_at_least("rays_per_step", self.rays_per_step, 1)
-        require_at_least("occupancy_every", self.occupancy_every, 1)
+        require_whole("steps", self.steps, 1)
+        require_whole("rays_per_step", self.rays_per_step, 1)
+        require_whole("occupancy_every", self.occupancy_every, 1)
         require_at_least("alpha_min", self.alpha_min, 0.0)
-        if not 0 <= self.seed < 2**63:
+        require_whole("seed", self.seed, 0)
+        if self.seed >= 2**63:
             raise InputError(f"seed must be at least 0 and below 2^63, not {self.seed}.")
         require_one_of("scaling", self.scaling, get_args(Scaling))
         require_one_of("jacobian", self.jacobian, get_args(Jacobian))
@@ -167,7 +182,7 @@ class TrainConfig:
         if self.time_limit is not None:
             require_positive("time_limit", self.time_limit)
         if self.threads is not None:
-            require_at_least("threads", self.threads, 1)
+            require_whole("threads", self.threads, 1)
         if isinstance(self.content_distance, str):
             require_one_of("content_distance", self.content_distance, ("auto",))
         else:

@@ -5,13 +5,16 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from warpnerf.checks import InputError
-from warpnerf.field import Field, Rendering
 from warpnerf.metrics import SSIM_WINDOW, psnr, ssim
 from warpnerf.scene import Scene, View, require_split
+
+if TYPE_CHECKING:
+    from warpnerf.field import Field, Rendering
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,7 +126,7 @@ def require_measurable(scene: Scene, split: str) -> None:
         if min(camera.width, camera.height) < SSIM_WINDOW:
             raise InputError(
                 f"{scene.views[index].name} is {camera.width} x {camera.height} pixels, but SSIM "
-                f"needs {SSIM_WINDOW} x {SSIM_WINDOW}; use a smaller --downscale."
+                f"needs {SSIM_WINDOW} x {SSIM_WINDOW}; use larger images, or a smaller --downscale."
             )
 
 

@@ -51,7 +51,11 @@ class Field:
 
         Returns:
             rgb [H, W, 3], depth [H, W] and opacity [H, W].
+
+        Raises:
+            InputError: The camera's pose is not finite.
         """
+        camera.check()  # its pose is an array, which may have changed since it was made
         rays = camera_rays(camera, self.workers)
         return self._rendering(self._render(*rays), (camera.height, camera.width))
 

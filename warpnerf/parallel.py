@@ -14,6 +14,7 @@ from typing import Any
 
 import warp as wp
 
+from warpnerf import kernel_cache
 from warpnerf.checks import InputError, require_at_least
 
 NODES = 1 << 20
@@ -37,8 +38,7 @@ class Workers:
         """
         if threads is not None:
             require_at_least("threads", threads, 1)
-        wp.config.log_level = wp.LOG_ERROR  # no banner, and no warning about a missing CUDA driver
-        wp.init()
+        kernel_cache.start()
         try:
             if device.startswith("cuda") and not wp.is_cuda_available():
                 raise ValueError("no CUDA driver")
@@ -72,7 +72,7 @@ class Workers:
     def load(self, kernel: wp.Kernel) -> None:
         """Compile a kernel, or fetch it from the cache, once: else every thread would."""
         if kernel not in self._loaded:
-            kernel.module.load(self.device, block_dim=256 if self.device.is_cuda else 1)
+            kernel_cache.load(kernel, self.device)
             self._loaded.add(kernel)
 
     def _launch(

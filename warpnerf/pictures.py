@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
 
@@ -24,6 +26,7 @@ _COLOURS = np.array(
     ]
 )
 _GAP = 4
+_LONGEST_STEM = 200
 
 
 def depth_colours(depth: np.ndarray, near: float, far: float) -> np.ndarray:
@@ -58,6 +61,30 @@ def comparison(target: np.ndarray, rendering: Rendering, near: float, far: float
     depth = opacity * depth_colours(surface, near, far) + (1.0 - opacity)
     gap = np.ones((target.shape[0], _GAP, 3))
     return np.concatenate([target, gap, np.clip(rendering.rgb, 0, 1), gap, depth], axis=1)
+
+
+def picture_files(names: Sequence[str]) -> dict[str, str]:
+    """File names for pictures of views, all in one folder: no two alike, none too long.
+
+    They are the views' own names, with _ for /; where that makes two alike, or alike but for
+    capitals, which some file systems do not tell apart, a number is added.
+
+    Args:
+        names: Of views, different from one another.
+    """
+    taken: set[str] = set()
+    files = {}
+    for name in names:
+        flat = re.sub(r"[/\\]", "_", name).removesuffix(".png")
+        # From the end, where numbers are; in bytes, which is what file systems count.
+        stem = flat.encode(errors="replace")[-_LONGEST_STEM:].decode(errors="replace")
+        file, count = f"{stem}.png", 1
+        while file.casefold() in taken:
+            count += 1
+            file = f"{stem}_{count}.png"
+        taken.add(file.casefold())
+        files[name] = file
+    return files
 
 
 def write_png(path: str | Path, rgb: np.ndarray) -> None:

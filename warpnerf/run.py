@@ -36,8 +36,8 @@ from warpnerf.config import TrainConfig
 from warpnerf.data.files import read_json
 from warpnerf.evaluation import Evaluation, evaluate
 from warpnerf.field import Field, Rendering
-from warpnerf.pictures import comparison, write_png
-from warpnerf.scene import Scene, View
+from warpnerf.pictures import comparison, picture_files, write_png
+from warpnerf.scene import Scene, View, require_split
 from warpnerf.state import Progress, TrainingState, differences
 
 KEPT = 2
@@ -129,7 +129,7 @@ class Run:
             "content_distance": content_distance,
             "box_min": scene.box_min.tolist(),
             "box_max": scene.box_max.tolist(),
-            "notes": list(scene.notes),
+            "notes": [*scene.warnings, *scene.notes],
             "train": asdict(config),
         }
         try:
@@ -248,10 +248,10 @@ class Run:
         Raises:
             InputError: They cannot be written.
         """
+        files = picture_files([scene.views[index].name for index in require_split(scene, split)])
 
         def picture(view: View, target: np.ndarray, rendering: Rendering) -> None:
-            name = view.name.replace("/", "_").replace("\\", "_").removesuffix(".png")
-            path = self.folder / "test" / f"{name}.png"
+            path = self.folder / "test" / files[view.name]
             with self._writing():
                 write_png(path, comparison(target, rendering, 0.0, far))
 

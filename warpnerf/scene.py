@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from warpnerf.camera import Camera
-from warpnerf.checks import InputError
+from warpnerf.checks import InputError, require_positive
 
 UNBOUNDED_BOX_SHARE = 0.75
 """Half edge of the box of photographs, in content distances."""
@@ -36,6 +36,29 @@ class View:
     depth: np.ndarray | None = None
     """[H, W] float32, true distance along each pixel's ray in scene units, where it is known."""
 
+    def __post_init__(self) -> None:
+        """Refuse a photograph that is not its camera's.
+
+        Raises:
+            InputError: Shapes or types do not fit.
+        """
+        size = (self.camera.height, self.camera.width)
+        image = self.image
+        if (
+            image.dtype != np.uint8
+            or image.shape[:2] != size
+            or image.shape[2:] not in ((3,), (4,))
+        ):
+            raise InputError(
+                f"{self.name}: image must be uint8 [{size[0]}, {size[1]}, 3 or 4] as its camera "
+                f"is, not {image.dtype} {list(image.shape)}."
+            )
+        if self.depth is not None and self.depth.shape != size:
+            raise InputError(
+                f"{self.name}: depth must be {list(size)} as its camera is, not "
+                f"{list(self.depth.shape)}."
+            )
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Scene:
@@ -56,7 +79,32 @@ class Scene:
     content_distance: float
     """Median distance from a camera to what all cameras look at, scene units."""
     notes: tuple[str, ...] = field(default=())
-    """What the reader should know: missing files, estimates, ignored keys; one sentence each."""
+    """How the scene was understood: its split, what was estimated; a line each."""
+    warnings: tuple[str, ...] = field(default=())
+    """What is odd and may be a mistake: missing files, duplicates, unused keys; a line each."""
+
+    def __post_init__(self) -> None:
+        """Refuse what nothing can be trained on.
+
+        Raises:
+            InputError: An empty box, no distance, or a split of views that are not there.
+        """
+        box = np.stack([self.box_min, self.box_max])
+        if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[0] < box[1]).all():
+            raise InputError(
+                f"{self.name}: box_min must lie below box_max on every axis, both finite, not "
+                f"{self.box_min} and {self.box_max}."
+            )
+        require_positive(f"{self.name}: content_distance", self.content_distance)
+        if len({view.name for view in self.views}) < len(self.views):
+            raise InputError(f"{self.name}: two views have one name; give each its own.")
+        for split, indices in self.splits.items():
+            if not all(0 <= index < len(self.views) for index in indices):
+                raise InputError(
+                    f"{self.name}: splits[{split!r}] must be indices of {len(self.views)} views."
+                )
+        if not self.splits.get("train"):
+            raise InputError(f"{self.name}: splits['train'] must name at least one view.")
 
     @property
     def cameras(self) -> list[Camera]:

@@ -49,9 +49,12 @@ def scale_gradient(
         colors, sigmas and distances, unchanged. No gradient flows to distances.
 
     Raises:
-        InputError: Shapes do not fit, or content_distance is not above zero.
+        InputError: Tensors are not dense floating point on one device, shapes do not fit, or
+            content_distance is not above zero.
     """
     require_one_of("scaling", scaling, get_args(Scaling))
+    for field, value in (("colors", colors), ("sigmas", sigmas), ("distances", distances)):
+        _require_tensor(field, value, colors)
     if sigmas.shape != distances.shape:
         raise InputError(
             f"sigmas and distances must have one shape, not {list(sigmas.shape)} and "
@@ -65,6 +68,13 @@ def scale_gradient(
             f"{list(sigmas.shape)}."
         )
     if isinstance(content_distance, torch.Tensor):
+        _require_dense("content_distance", content_distance)
+        content_distance = content_distance.to(distances.device)
+        if not _broadcasts_over(content_distance, distances):
+            raise InputError(
+                f"content_distance must broadcast over distances {list(distances.shape)}, not be "
+                f"{list(content_distance.shape)}."
+            )
         if not bool((content_distance > 0).all()):
             raise InputError("content_distance must be above 0 everywhere.")
     else:
@@ -188,6 +198,8 @@ def render_rays(
             f"step {step:g} is too short for rays that reach {reach:g} scene units: more than "
             f"{MAX_STEPS:g} steps; use a longer step, or scale the scene."
         )
+    for field, value in (("background", background), ("content_distance", content_distance)):
+        _require_dense(field, value)
     behind = torch.as_tensor(background, dtype=raw.dtype, device=raw.device).detach()
     if behind.shape not in ((3,), (len(rays[0]), 3)) or not bool(behind.isfinite().all()):
         raise InputError(
@@ -348,10 +360,9 @@ def _ray_arrays(
 
 
 def _require_grid(raw: torch.Tensor) -> None:
+    _require_tensor("raw", raw)
     if raw.dtype not in _PRECISIONS:
-        raise InputError(f"raw must be float32 or float64, not {raw.dtype}.")
-    if raw.layout != torch.strided:
-        raise InputError(f"raw must be a dense tensor, not {raw.layout}; call raw.to_dense().")
+        raise InputError(f"raw must be float32 or float64, not {raw.dtype}; call raw.float().")
     if raw.dim() != 4 or raw.shape[3] != 4 or min(raw.shape[:3]) < 2:
         raise InputError(
             f"raw must be [X, Y, Z, 4] with at least two nodes along each axis, "
@@ -361,7 +372,41 @@ def _require_grid(raw: torch.Tensor) -> None:
         raise InputError(f"raw must have fewer than 2^31 nodes, not {raw.shape[:3].numel()}.")
 
 
+def _require_tensor(field: str, value: Any, like: torch.Tensor | None = None) -> None:
+    """Raise InputError unless value is a dense floating-point tensor, on the device of ``like``."""
+    if not isinstance(value, torch.Tensor):
+        raise InputError(
+            f"{field} must be a torch tensor, not {type(value).__name__}; call torch.as_tensor."
+        )
+    _require_dense(field, value)
+    if not value.dtype.is_floating_point:
+        raise InputError(f"{field} must be floating point, not {value.dtype}; call its float.")
+    if like is not None and value.device != like.device:
+        raise InputError(
+            f"{field} must be on {like.device} as the others are, not on {value.device}; call its "
+            f"to({str(like.device)!r})."
+        )
+
+
+def _require_dense(field: str, value: Any) -> None:
+    """Raise InputError for a tensor that is sparse, or holds no values; numbers pass."""
+    if not isinstance(value, torch.Tensor):
+        return
+    if value.layout != torch.strided:
+        raise InputError(f"{field} must be a dense tensor, not {value.layout}; call its to_dense.")
+    if value.device.type not in ("cpu", "cuda"):
+        raise InputError(f"{field} must be on the CPU or on CUDA, not on {value.device}.")
+
+
+def _broadcasts_over(value: torch.Tensor, other: torch.Tensor) -> bool:
+    try:
+        return torch.broadcast_shapes(value.shape, other.shape) == other.shape
+    except RuntimeError:
+        return False
+
+
 def _corner(field: str, value: Sequence[float] | torch.Tensor) -> np.ndarray:
+    _require_dense(field, value)
     corner = np.asarray(
         value.detach().cpu() if isinstance(value, torch.Tensor) else value, dtype=np.float64
     )
@@ -371,10 +416,9 @@ def _corner(field: str, value: Sequence[float] | torch.Tensor) -> np.ndarray:
 
 
 def _rays(field: str, value: torch.Tensor, raw: torch.Tensor) -> torch.Tensor:
+    _require_tensor(field, value, raw)
     if value.dim() != 2 or value.shape[1] != 3:
         raise InputError(f"{field} must be [n_rays, 3], not {list(value.shape)}.")
-    if value.device != raw.device:
-        raise InputError(f"{field} must be on {raw.device} as raw is, not on {value.device}.")
     if not bool(value.isfinite().all()):
         raise InputError(f"{field} must be finite, but hold NaN or infinity.")
     return value.detach().to(raw.dtype).contiguous()

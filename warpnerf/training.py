@@ -12,6 +12,7 @@ import warp as wp
 from warpnerf_kernels import interp, occupancy
 from warpnerf_kernels.types import vec4
 
+from warpnerf.checks import InputError
 from warpnerf.config import Contraction, TrainConfig
 from warpnerf.field import Field
 from warpnerf.grid import FreeCells, VoxelGrid, grid_size, require_memory
@@ -108,6 +109,7 @@ class Trainer:
             if config.content_distance == "auto"
             else float(config.content_distance)
         )
+        _require_samples(scene, config)
         self._reach = _reach(scene)
         if resume is not None:  # estimates anew may be rounded otherwise
             self.content_distance, self._reach = resume.content_distance, resume.reach
@@ -302,11 +304,7 @@ class Trainer:
 
     def _first_grid(self, scene: Scene) -> VoxelGrid:
         config = self.config.grid
-        contraction: Contraction = (
-            ("linf" if scene.unbounded else "none")
-            if config.contraction == "auto"
-            else config.contraction
-        )
+        contraction = _contraction(scene, self.config)
         border = 0.0 if contraction == "none" else config.border
         extent = (scene.box_max - scene.box_min) * (1.0 + border)
         final = grid_size(extent, config.voxels)
@@ -379,6 +377,34 @@ class Trainer:
 
 
 _COLOURS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "random": (1.0, 1.0, 1.0)}
+
+
+def _contraction(scene: Scene, config: TrainConfig) -> Contraction:
+    if config.grid.contraction == "auto":
+        return "linf" if scene.unbounded else "none"
+    return config.grid.contraction
+
+
+def _require_samples(scene: Scene, config: TrainConfig) -> None:
+    """Raise InputError where march.near and march.far leave no sample inside the box to any ray."""
+    positions = np.array([camera.position for camera in scene.training_cameras])
+    outside = np.maximum(0.0, np.maximum(scene.box_min - positions, positions - scene.box_max))
+    across = np.maximum(np.abs(scene.box_min - positions), np.abs(scene.box_max - positions))
+    begin = float(np.linalg.norm(outside, axis=1).min())
+    end = float(np.linalg.norm(across, axis=1).max())
+    march = config.march
+    if _contraction(scene, config) != "none":
+        begin = 0.0  # space outside the box is sampled too
+    if march.near >= end:
+        raise InputError(
+            f"march.near is {march.near:g}, but the scene's box ends {end:.4g} scene units from "
+            "the farthest camera, so nothing of it would be sampled; use a smaller --near."
+        )
+    if march.far is not None and march.far <= begin:
+        raise InputError(
+            f"march.far is {march.far:g}, but the scene's box begins {begin:.4g} scene units from "
+            "the nearest camera, so nothing of it would be sampled; use a larger one."
+        )
 
 
 def _reach(scene: Scene) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -11,9 +12,14 @@ from pathlib import Path
 import numpy as np
 
 from warpnerf.checks import InputError
-from warpnerf.data.files import find_image, read_image
+from warpnerf.data.files import find_image
+from warpnerf.data.images import read_image
 from warpnerf.data.lens import Lens
+from warpnerf.memory import usable_memory
 from warpnerf.scene import Scene, View, estimate_extent
+
+COPIED_BYTES = 8
+"""Per pixel: with alpha for the device, and on the way there once more."""
 
 HOLD_OUT = 8
 """Without a split in the file every 8th image is for testing, as in LLFF and Mip-NeRF 360."""
@@ -38,7 +44,7 @@ def find_images(
     """Find the images of a scene file's frames; leave out the missing ones and the repeated ones.
 
     Returns:
-        The image of each frame that is kept, by the frame's index, and notes on the others.
+        The image of each frame that is kept, by the frame's index, and warnings of the others.
 
     Raises:
         InputError: A path leaves the folder, or no image is there.
@@ -63,18 +69,18 @@ def find_images(
             f"{file}: $.frames[0].file_path: no image of {len(missing)} frames is in the folder "
             f"(first: {missing[0]}); put the images next to the file."
         )
-    notes = []
+    warnings = []
     if missing:
-        notes.append(
+        warnings.append(
             f"{file.name}: left out {len(missing)} of {len(file_paths)} frames for want of an "
             f"image (first: {missing[0]})"
         )
     if repeated:
-        notes.append(
+        warnings.append(
             f"{file.name}: left out {len(repeated)} of {len(file_paths)} frames for naming an "
             f"image again (first: {repeated[0]})"
         )
-    return found, notes
+    return found, warnings
 
 
 def assemble(
@@ -83,7 +89,7 @@ def assemble(
     file: Path,
     frames: Sequence[Frame],
     splits: Mapping[str, set[str]],
-    notes: Sequence[str],
+    warnings: Sequence[str],
     downscale: int,
 ) -> Scene:
     """Read the images and make the scene.
@@ -94,20 +100,22 @@ def assemble(
         frames: Frames with different names.
         splits: Names for "train", "test" and "val"; what is left out is filled in, see
             ``complete_splits``.
-        notes: What is known so far; the result's notes begin with them.
+        warnings: Of what is odd so far; the result's begin with them.
         downscale: Edge of the blocks of pixels that become one.
 
     Raises:
         InputError: An image, the split or the placement of the cameras is of no use.
     """
     frames = sorted(frames, key=lambda frame: frame.name)
-    complete, split_notes = complete_splits(file, [frame.name for frame in frames], splits)
+    complete, notes = complete_splits(file, [frame.name for frame in frames], splits)
     used = set().union(*complete.values())
     frames = [frame for frame in frames if frame.name in used]
 
+    first = _read_view(frames[0], downscale)
+    _require_memory(file, first, len(frames), downscale)
     # Decoders release the interpreter lock. The first error cancels what is not yet read.
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        views = list(pool.map(lambda frame: _read_view(frame, downscale), frames))
+        views = [first, *pool.map(lambda frame: _read_view(frame, downscale), frames[1:])]
 
     index = {view.name: i for i, view in enumerate(views)}
     indices = {
@@ -128,7 +136,8 @@ def assemble(
         box_max=extent.box_max,
         unbounded=unbounded,
         content_distance=extent.content_distance,
-        notes=(*notes, *split_notes, *extent.notes),
+        notes=(*notes, *extent.notes),
+        warnings=(*warnings, *_oddities(views, complete)),
     )
 
 
@@ -150,12 +159,6 @@ def complete_splits(
     given = {split: set(members) for split, members in splits.items() if members}
     train = given.get("train", set(names) - set().union(*given.values()))
     test = given.get("test", set())
-    shared = train & test
-    if shared:
-        notes.append(
-            f"used for training and for testing: {len(shared)} of {len(names)} images (first: "
-            f"{min(shared)}), so test scores are too good"
-        )
     if not test:
         test = set(sorted(train)[::HOLD_OUT])
         train = train - test
@@ -171,6 +174,62 @@ def complete_splits(
             f"in no split and not used: {len(unused)} of {len(names)} images (first: {min(unused)})"
         )
     return complete, notes
+
+
+def _require_memory(file: Path, first: View, n_images: int, downscale: int) -> None:
+    """Raise InputError if images like the first would not fit: they are kept, and copied to train.
+
+    Without this, a system that promises more memory than it has ends the process without a word.
+    """
+    height, width, channels = first.image.shape
+    needed = n_images * height * width * (channels + COPIED_BYTES)
+    usable = usable_memory()
+    if usable is not None and needed > usable:
+        factor = math.ceil(downscale * math.sqrt(needed / usable))
+        raise InputError(
+            f"{file}: $.frames: {n_images} images of {width}x{height} pixels need "
+            f"{needed / 2**30:.1f} GiB, but there is {usable / 2**30:.1f} GiB of memory; use "
+            f"--downscale {factor}, or fewer images."
+        )
+
+
+def _oddities(views: Sequence[View], splits: Mapping[str, set[str]]) -> list[str]:
+    """Warnings of photographs that can be used, and yet are likely not what was meant."""
+    warnings = []
+    shared = splits["train"] & splits["test"]
+    if shared:
+        warnings.append(
+            f"used for training and for testing: {len(shared)} of {len(views)} images (first: "
+            f"{min(shared)}), so test scores are too good"
+        )
+    sizes = {(view.camera.width, view.camera.height): view.name for view in reversed(views)}
+    if len(sizes) > 1:
+        shown = ", ".join(f"{name} {w}x{h}" for (w, h), name in sorted(sizes.items())[:2])
+        warnings.append(
+            f"images of {len(sizes)} sizes (first: {shown}): each frame needs a lens of its own "
+            "if the lens is given in pixels"
+        )
+    copies = _copies(views)
+    if copies:
+        warnings.append(
+            f"the same photograph from the same place: {len(copies)} of {len(views)} images "
+            f"(first: {copies[0][1]} is {copies[0][0]} again)"
+        )
+    return warnings
+
+
+def _copies(views: Sequence[View]) -> list[tuple[str, str]]:
+    """Pairs of names whose poses and pixels are the same, each view with the first of its kind."""
+    pairs = []
+    first_at: dict[bytes, list[View]] = {}
+    for view in views:
+        others = first_at.setdefault(view.camera.c2w.tobytes(), [])
+        again = next((o for o in others if np.array_equal(o.image, view.image)), None)
+        if again is None:
+            others.append(view)
+        else:
+            pairs.append((again.name, view.name))
+    return pairs
 
 
 def _read_view(frame: Frame, downscale: int) -> View:

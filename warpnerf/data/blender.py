@@ -36,22 +36,22 @@ def load_blender(folder: Path, *, downscale: int = 1) -> Scene:
     """
     frames: dict[str, Frame] = {}
     splits: dict[str, set[str]] = {}
-    notes: list[str] = []
+    warnings: list[str] = []
     for split in SPLITS:
         file = folder / split_file(split)
         if split != "train" and not exists(file):
             continue
-        _, found, found_notes = read_frames(file)
+        _, found, found_warnings = read_frames(file)
         # An image in two files keeps the first file's pose.
         for frame in found:
             frames.setdefault(frame.name, frame)
         splits[split] = {frame.name for frame in found}
-        notes += found_notes
+        warnings += found_warnings
     return assemble(
         folder=folder,
         file=folder / split_file("train"),
         frames=list(frames.values()),
         splits=splits,
-        notes=notes,
+        warnings=warnings,
         downscale=downscale,
     )

@@ -30,6 +30,8 @@ MIN_FOCAL = 0.02
 """Shortest focal length, in sizes of the image: a field of view of 178 degrees."""
 MAX_FOCAL = 1e6
 """Longest focal length, in sizes of the image."""
+MIN_ANGLE = 1e-100
+"""Smallest field of view whose focal length is a number at all, radians."""
 MAX_OFF_CENTRE = 50.0
 """Largest distance of the principal point from the middle, in sizes of the image."""
 
@@ -87,10 +89,12 @@ class Lens:
         for key, size in (("w", width), ("h", height)):
             if key in values and values[key] != size:
                 stated = f"{values.get('w', width):g}x{values.get('h', height):g}"
+                turned = (values.get("w"), values.get("h")) == (height, width)
                 raise InputError(
                     f"{self.file}: {self.fields[key]}: the file is for images of {stated} pixels, "
-                    f"but {image} has {width}x{height}; use the original images, or scale w, h, "
-                    "fl_x, fl_y, cx and cy with them."
+                    f"but {image} has {width}x{height}"
+                    + (" as stored, without its EXIF rotation" if turned else "")
+                    + "; use the original images, or change w, h, fl_x, fl_y, cx and cy with them."
                 )
         fx, fy = self._focal_lengths(width, height)
         camera = Camera(
@@ -181,7 +185,7 @@ def read_lens(file: Path, levels: Sequence[tuple[str, LensFields]]) -> Lens:
 
 def _check_value(file: Path, field: str, key: str, value: float) -> None:
     if key.startswith("camera_angle"):
-        if not 0.0 < value < math.pi:
+        if not MIN_ANGLE < value < math.pi:
             raise InputError(
                 f"{file}: {field}: {value:g} is not a field of view; give radians between 0 and pi."
             )

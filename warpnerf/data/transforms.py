@@ -28,7 +28,7 @@ IGNORED = {
 
 
 class PictureKeys(LensFields):
-    """A lens, and the keys that are named in a note because they are not used."""
+    """A lens, and the keys that are named in a warning because they are not used."""
 
     mask_path: object = None
     white_transparent: object = None
@@ -66,7 +66,7 @@ def load_transforms(file: Path, *, downscale: int = 1) -> Scene:
         InputError: Something in the file or its images is wrong; the message names it.
     """
     folder = file.parent
-    data, frames, notes = read_frames(file)
+    data, frames, warnings = read_frames(file)
     names = {frame.name for frame in frames}
     splits: dict[str, set[str]] = {}
     for split in ("train", "val", "test"):
@@ -78,13 +78,18 @@ def load_transforms(file: Path, *, downscale: int = 1) -> Scene:
                 f"{listed[0]}); correct the list or remove it."
             )
         if absent:
-            notes.append(
+            warnings.append(
                 f"{file.name}: not among the frames: {len(absent)} of {len(listed)} "
                 f"{split}_filenames (first: {absent[0]})"
             )
         splits[split] = members
     return assemble(
-        folder=folder, file=file, frames=frames, splits=splits, notes=notes, downscale=downscale
+        folder=folder,
+        file=file,
+        frames=frames,
+        splits=splits,
+        warnings=warnings,
+        downscale=downscale,
     )
 
 
@@ -92,13 +97,13 @@ def read_frames(file: Path) -> tuple[TransformsFile, list[Frame], list[str]]:
     """Read a file of frames and check everything but the images' pixels.
 
     Returns:
-        The file's content, the frames whose images are there, and notes on the others.
+        The file's content, the frames whose images are there, and warnings of the others.
 
     Raises:
         InputError: As ``load_transforms``.
     """
     data = read_json(file, TransformsFile)
-    found, notes = find_images(file.parent, file, [entry.file_path for entry in data.frames])
+    found, warnings = find_images(file.parent, file, [entry.file_path for entry in data.frames])
     frames = []
     for index, path in found.items():
         entry = data.frames[index]
@@ -113,8 +118,8 @@ def read_frames(file: Path) -> tuple[TransformsFile, list[Frame], list[str]]:
         )
     for key, consequence in IGNORED.items():
         if getattr(data, key) or any(getattr(entry, key) for entry in data.frames):
-            notes.append(f"{file.name}: {key} is not used: {consequence}")
-    return data, frames, notes
+            warnings.append(f"{file.name}: {key} is not used: {consequence}")
+    return data, frames, warnings
 
 
 def _listed_names(

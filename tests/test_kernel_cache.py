@@ -1,0 +1,68 @@
+"""Compiled kernels are believed only as they were written."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import pytest
+
+from warpnerf.kernel_cache import SUMS, DamagedKernelError, _seal, _verify
+
+CODE, META, SOURCE = "a.cpu.o", "a.meta", "a.cpp"
+
+
+@pytest.fixture
+def module(tmp_path: Path) -> Path:
+    """A sealed folder as Warp leaves it."""
+    for name in (CODE, META, SOURCE):
+        (tmp_path / name).write_text(f"content of {name}")
+    _verify(tmp_path)
+    _seal(tmp_path)
+    return tmp_path
+
+
+def test_a_seal_is_what_sha256sum_writes(module: Path) -> None:
+    lines = [
+        f"{hashlib.sha256((module / name).read_bytes()).hexdigest()}  {name}\n"
+        for name in (CODE, META)
+    ]
+    assert (module / SUMS).read_text() == "".join(lines)
+    assert sorted(path.name for path in module.iterdir()) == sorted([SUMS, CODE, META, SOURCE])
+
+
+@pytest.mark.parametrize("name", [CODE, META])
+@pytest.mark.parametrize("content", ["content of a.cpu.p", "", "content"])
+def test_damage_shows(module: Path, name: str, content: str) -> None:
+    _verify(module)
+    (module / name).write_text(content)
+    with pytest.raises(DamagedKernelError, match=rf"{module.name} in it is damaged"):
+        _verify(module)
+
+
+@pytest.mark.parametrize("sums", [b"", b"0  a.cpu.o\n", b"nonsense", b"\xff"])
+def test_a_damaged_seal_is_damage_too(module: Path, sums: bytes) -> None:
+    (module / SUMS).write_bytes(sums)
+    if not sums:  # seals nothing
+        _verify(module)
+        return
+    with pytest.raises(DamagedKernelError):
+        _verify(module)
+
+
+def test_what_was_removed_is_compiled_again_and_what_was_added_is_sealed(module: Path) -> None:
+    (module / CODE).unlink()
+    _verify(module)
+    (module / CODE).write_text("compiled again")
+    (module / "a.sm_90.cubin").write_text("for another device")
+    _seal(module)
+    _verify(module)
+    (module / "a.sm_90.cubin").write_text("for another device?")
+    with pytest.raises(DamagedKernelError):
+        _verify(module)
+
+
+def test_a_folder_that_is_not_there_is_neither_damaged_nor_made(tmp_path: Path) -> None:
+    _verify(tmp_path / "none")
+    _seal(tmp_path / "none")
+    assert not (tmp_path / "none").exists()

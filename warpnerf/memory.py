@@ -1,0 +1,44 @@
+"""How much memory there is to use."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+CONTAINER_LIMITS = (
+    Path("/sys/fs/cgroup/memory.max"),
+    Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"),
+)
+"""Where Linux says how much a container may use: control groups of version 2, and of version 1."""
+
+
+def usable_memory() -> int | None:
+    """Bytes that this process can hope for: the machine's, its container's or its own limit's.
+
+    None where the system does not tell.
+    """
+    limits = [limit for limit in (_machine(), *map(_container, CONTAINER_LIMITS), _own()) if limit]
+    return min(limits, default=None)
+
+
+def _machine() -> int | None:
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        return None
+
+
+def _container(limit: Path) -> int | None:
+    try:
+        return int(limit.read_text())
+    except (OSError, ValueError):  # not there, or "max"
+        return None
+
+
+def _own() -> int | None:
+    try:
+        import resource
+    except ImportError:
+        return None
+    soft, _ = resource.getrlimit(resource.RLIMIT_AS)
+    return None if soft == resource.RLIM_INFINITY else soft
