@@ -198,7 +198,7 @@ class Kernels:
     def backward(self, p: Problem, scaling: str = "none", jacobian: str = "none") -> Float64:
         """The gradient [X, Y, Z, 4] of the outputs' product with the problem's adjoints."""
         gradients = self.zeros((self.workers.count, p.raw[..., 0].size), self.types.vec4)
-        touched = self.touched(gradients.shape[1])
+        touched = self.touched(*gradients.shape)
         variant = self.variant(p, scaling, jacobian)
         self.workers.launch_owned(
             self.render.render_backward_kernel(variant),
@@ -216,10 +216,10 @@ class Kernels:
         )
         return total_gradient(gradients, touched).reshape(p.raw.shape)
 
-    def touched(self, n_nodes: int, value: int = 0) -> wp.array:
+    def touched(self, n_workers: int, n_nodes: int, value: int = 0) -> wp.array:
         """Flags of the tiles of nodes that have a gradient."""
-        n_tiles = -(-n_nodes // tiles.TILE)
-        return wp.full(n_tiles, value, dtype=wp.uint8, device=self.device)
+        shape = (n_workers, -(-n_nodes // tiles.TILE))
+        return wp.full(shape, value, dtype=wp.uint8, device=self.device)
 
     def train(
         self, p: Problem, scaling: str = "none", jacobian: str = "none", capacity: int = 64
@@ -228,7 +228,7 @@ class Kernels:
         workers = self.workers
         error, n_samples = self.zeros(p.n_rays), self.zeros(p.n_rays, wp.int32)
         gradients = self.zeros((workers.count, p.raw[..., 0].size), self.types.vec4)
-        touched = self.touched(gradients.shape[1])
+        touched = self.touched(*gradients.shape)
         variant = self.variant(p, scaling, jacobian)
         workers.launch_owned(
             self.render.render_train_kernel(variant),
@@ -250,9 +250,9 @@ class Kernels:
 def total_gradient(gradients: wp.array, touched: wp.array) -> Float64:
     """The sum over workers [n_nodes, 4]; every tile that holds some of it must be flagged."""
     rows = gradients.numpy()
-    nodes = np.flatnonzero(rows.any(axis=(0, 2)))
-    flags = np.append(touched.numpy(), 0)
-    assert (flags[nodes // tiles.TILE] | flags[nodes // tiles.TILE - 1]).all()
+    for row, flags in zip(rows, np.pad(touched.numpy(), ((0, 0), (0, 1))), strict=True):
+        tile = np.flatnonzero(row.any(axis=1)) // tiles.TILE
+        assert (flags[tile] | flags[tile - 1]).all()
     return np.asarray(rows.sum(axis=0))
 
 

@@ -45,7 +45,7 @@ def _of(name: str) -> SimpleNamespace:
         points: wp.array(dtype=vec3),
         adj: wp.array(dtype=vec4),
         out: wp.array2d(dtype=vec4),
-        touched: wp.array(dtype=wp.uint8),
+        touched: wp.array2d(dtype=wp.uint8),
     ):
         n = first + wp.tid()
         u = points[n]

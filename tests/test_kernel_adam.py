@@ -23,7 +23,7 @@ def step(
     flags: Any = None,
 ) -> tuple[Any, Any, Any, Any]:
     vec4 = kernels.types.vec4
-    touched = kernels.touched(len(values), 1)
+    touched = kernels.touched(*gradients.shape[:2], 1)
     if flags is not None:
         touched.assign(np.asarray(flags, np.uint8))
     arrays = [kernels.array(a, vec4) for a in (gradients, values, mean, square)]
@@ -78,15 +78,18 @@ def test_gradients_that_cancel_between_workers_are_zeroed_too(kernels64: Kernels
 
 
 def test_tiles_that_are_not_flagged_are_passed_over(kernels64: Kernels) -> None:
+    """Each worker's flags are of its own row."""
     rng = np.random.default_rng(4)
     gradients, values = rng.normal(size=(2, 100, 4)), rng.normal(size=(100, 4))
-    full = step(kernels64, 1, gradients, values, 0 * values, 0 * values)
-    flags = np.arange(100 // TILE) % 4 == 0
+    flags = np.arange(100 // TILE) % 5 == np.array([[0], [2]])
     # The first node of the next tile may have been added to as well.
-    flagged = np.repeat(flags | np.roll(flags, 1), TILE)[:100]
+    flagged = np.repeat(flags | np.roll(flags, 1, axis=1), TILE, axis=1)
+    assert not flagged.any(axis=0).all()
+    counted = np.where(flagged[..., None], gradients, 0.0)
+    expected = step(kernels64, 1, counted, values, 0 * values, 0 * values)
     for span in (1, TILE, 48):
         found = step(kernels64, 1, gradients, values, 0 * values, 0 * values, span, flags)
-        assert np.array_equal(found[1][flagged], full[1][flagged])
-        assert np.array_equal(found[1][~flagged], values[~flagged])
-        assert not found[0][:, flagged].any()
-        assert np.array_equal(found[0][:, ~flagged], gradients[:, ~flagged])
+        for new, exact in zip(found[1:], expected[1:], strict=True):
+            assert np.array_equal(new, exact)
+        assert not found[0][flagged].any()
+        assert np.array_equal(found[0][~flagged], gradients[~flagged])

@@ -46,7 +46,7 @@ def adj_gather(kernels: Kernels, shape: Any, u: Any, adj: Any) -> Any:
         kernels.array(u, types.vec3),
         kernels.array(adj, types.vec4),
         out,
-        kernels.touched(out.shape[1]),
+        kernels.touched(*out.shape),
     )
     both = out.numpy()
     assert not both[0].any()  # another worker's
@@ -104,7 +104,7 @@ def test_only_tiles_around_the_point_are_flagged(kernels64: Kernels) -> None:
     types, size = kernels64.types, (6, 5, 40)
     for seed in range(N_SEEDS):
         u = np.random.default_rng(seed).uniform(size=(1, 3)) * (np.array(size) - 1)
-        out, touched = kernels64.zeros((1, 1200), types.vec4), kernels64.touched(1200)
+        out, touched = kernels64.zeros((1, 1200), types.vec4), kernels64.touched(1, 1200)
         kernels64.workers.launch(
             drive_kernels.of(kernels64).scatter_points,
             1,
@@ -118,7 +118,7 @@ def test_only_tiles_around_the_point_are_flagged(kernels64: Kernels) -> None:
         nodes = np.flatnonzero(out.numpy()[0].any(axis=-1))
         assert len(nodes) == 8
         # A pair of nodes along z flags the tile that it begins in.
-        assert np.array_equal(np.flatnonzero(touched.numpy()), np.unique(nodes[::2] // TILE))
+        assert np.array_equal(np.flatnonzero(touched.numpy()[0]), np.unique(nodes[::2] // TILE))
 
 
 def test_activations_against_the_oracle(kernels64: Kernels) -> None:

@@ -80,7 +80,7 @@ def add_total_variation(
 
     Args:
         grid: The grid.
-        gradients: Row 0 is added to.
+        gradients: Added to, in a row that has some at the node.
         config: Holds the weights, and how many steps this one gradient stands for.
         workers: Where to work.
     """

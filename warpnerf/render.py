@@ -163,7 +163,7 @@ class Gradients:
     rows: wp.array
     """[n_workers, n_nodes] vec4; their sum over the workers is the gradient."""
     touched: wp.array
-    """[n_tiles] uint8, 0 where neither a tile of nodes nor the next one's first has a gradient."""
+    """[n_workers, n_tiles] uint8, 0 where neither a tile nor the first node behind it has any."""
 
     @staticmethod
     def zeros(n_nodes: int, workers: Workers) -> Gradients:
@@ -171,7 +171,7 @@ class Gradients:
         n_tiles = -(-n_nodes // tiles.TILE)
         return Gradients(
             rows=wp.zeros((workers.count, n_nodes), dtype=vec4, device=workers.device),
-            touched=wp.zeros(n_tiles, dtype=wp.uint8, device=workers.device),
+            touched=wp.zeros((workers.count, n_tiles), dtype=wp.uint8, device=workers.device),
         )
 
 

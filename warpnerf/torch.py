@@ -272,7 +272,9 @@ class _Render(torch.autograd.Function):
         adj_rgb, adj_opacity, adj_depth = (grad.contiguous() for grad in grads)
         n_nodes = raw.shape[:3].numel()
         adj_raw = raw.new_zeros(workers.count, n_nodes, 4)
-        touched = torch.zeros(-(-n_nodes // tiles.TILE), dtype=torch.uint8, device=raw.device)
+        touched = torch.zeros(
+            workers.count, -(-n_nodes // tiles.TILE), dtype=torch.uint8, device=raw.device
+        )
         variant = _variant(raw, kernels, call.scaling)
         with _stream(raw):
             workers.launch_owned(

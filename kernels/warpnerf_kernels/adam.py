@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from .tiles import TILE, next_tile, prefetch, prefetch_row, tile_of
+from .tiles import TILE, flagged, next_tile, prefetch, prefetch_row, tile_of
 from .types import real, vec4
 
 wp.set_module_options({"enable_backward": False})
@@ -18,7 +18,7 @@ def adam_step(
     epsilon: real,
     correction1: real,  # 1 / (1 - beta1^step)
     correction2: real,  # 1 / (1 - beta2^step)
-    touched: wp.array(dtype=wp.uint8),  # [n_tiles] as adj_gather left it
+    touched: wp.array2d(dtype=wp.uint8),  # [n_workers, n_tiles] as adj_gather left it
     gradients: wp.array2d(dtype=vec4),  # [n_workers, n_nodes] summed in order, then zeroed
     values: wp.array(dtype=vec4),  # [n_nodes] updated
     mean: wp.array(dtype=vec4),  # [n_nodes] first moment, updated
@@ -32,7 +32,8 @@ def adam_step(
     while tile < last:
         node = tile * wp.static(TILE)
         for worker in range(gradients.shape[0]):
-            prefetch_row(gradients, worker, node)
+            if flagged(touched, worker, tile):
+                prefetch_row(gradients, worker, node)
         prefetch(values, node)
         prefetch(mean, node)
         prefetch(square, node)
@@ -44,9 +45,8 @@ def adam_step(
         for i in range(wp.max(start, node), wp.min(end, node + wp.static(TILE))):
             gradient = vec4()
             for worker in range(gradients.shape[0]):
-                row = gradients[worker, i]
-                if not (row == zero):
-                    gradient += row
+                if flagged(touched, worker, tile):
+                    gradient += gradients[worker, i]
                     gradients[worker, i] = zero
             if not (gradient == zero):
                 value = values[i]
@@ -54,12 +54,14 @@ def adam_step(
                 v = square[i]
                 for channel in range(4):
                     g = gradient[channel]
-                    if g != real(0.0):
-                        m[channel] = beta1 * m[channel] + (real(1.0) - beta1) * g
-                        v[channel] = beta2 * v[channel] + (real(1.0) - beta2) * g * g
-                        value[channel] = value[channel] - learning_rate[channel] * (
-                            correction1 * m[channel]
-                        ) / (wp.sqrt(correction2 * v[channel]) + epsilon)
+                    m_new = beta1 * m[channel] + (real(1.0) - beta1) * g
+                    v_new = beta2 * v[channel] + (real(1.0) - beta2) * g * g
+                    x_new = value[channel] - learning_rate[channel] * (correction1 * m_new) / (
+                        wp.sqrt(correction2 * v_new) + epsilon
+                    )
+                    m[channel] = wp.where(g != real(0.0), m_new, m[channel])
+                    v[channel] = wp.where(g != real(0.0), v_new, v[channel])
+                    value[channel] = wp.where(g != real(0.0), x_new, value[channel])
                 values[i] = value
                 mean[i] = m
                 square[i] = v

@@ -52,7 +52,7 @@ def adj_shade(
     adj_rgb: vec3,
     worker: int,
     adj_values: wp.array2d(dtype=vec4),  # [n_workers, X * Y * Z], added to
-    touched: wp.array(dtype=wp.uint8),  # [n_tiles] as in interp.adj_gather
+    touched: wp.array2d(dtype=wp.uint8),  # [n_workers, n_tiles] as in interp.adj_gather
 ):
     """Hand the gradients of a sample's density and colour to the nodes around it."""
     adj_density = adj_softplus(sample.sigma_slope, adj_sigma)
@@ -184,7 +184,7 @@ def adj_integrate(
     kept: wp.array(dtype=Sample),  # read, as integrate left it
     worker: int,
     adj_values: wp.array2d(dtype=vec4),  # [n_workers, X * Y * Z], added to
-    touched: wp.array(dtype=wp.uint8),  # [n_tiles] as in interp.adj_gather
+    touched: wp.array2d(dtype=wp.uint8),  # [n_workers, n_tiles] as in interp.adj_gather
 ):
     """Adjoint of integrate. With G_i = dL/dw_i = <adj_rgb, c_i> + adj_depth t_i,
 

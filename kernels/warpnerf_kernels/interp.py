@@ -61,7 +61,7 @@ def adj_gather(
     adj_value: vec4,
     worker: int,
     adj_values: wp.array2d(dtype=vec4),  # [n_workers, X * Y * Z], added to
-    touched: wp.array(dtype=wp.uint8),  # [n_tiles] set to 1 where a pair of nodes along z begins
+    touched: wp.array2d(dtype=wp.uint8),  # [n_workers, n_tiles] set to 1 where a pair begins
 ):
     """Transpose of gather: hands adj_value to the eight nodes with the weights it was made with."""
     stride_y = size[2]
@@ -76,12 +76,11 @@ def adj_gather(
     n01 = base + stride_y
     n10 = base + stride_x
     n11 = base + stride_x + stride_y
-    # Workers share these flags: whoever comes first, the value is the same.
     yes = wp.uint8(1)
-    touched[tile_of(n00)] = yes
-    touched[tile_of(n01)] = yes
-    touched[tile_of(n10)] = yes
-    touched[tile_of(n11)] = yes
+    touched[worker, tile_of(n00)] = yes
+    touched[worker, tile_of(n01)] = yes
+    touched[worker, tile_of(n10)] = yes
+    touched[worker, tile_of(n11)] = yes
     low = gx * gy * adj_value
     wp.atomic_add(adj_values, worker, n00, gz * low)
     wp.atomic_add(adj_values, worker, n00 + 1, fz * low)

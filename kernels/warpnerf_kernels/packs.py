@@ -197,6 +197,7 @@ def shade(grid: Grid, packs: wp.array(dtype=Pack), slot: int):
     + r"""
 auto& pack = packs.data[slot];
 auto* values = adj_values.data + (size_t)worker * adj_values.shape[1];
+auto* flags = touched.data + (size_t)worker * touched.shape[1];
 for (int n = 0; n < 8; ++n) fetch(values + packs.data[later].base.c[n], size);
 const int stride_y = size.c[2], stride_x = stride_y * size.c[1];
 vec red = load(pack.red), green = load(pack.green), blue = load(pack.blue);
@@ -215,7 +216,7 @@ for (int n = 0; n < 8; ++n) {
         quad_at* column = (quad_at*)(values + node);
         column[0] = fma(quad(share), low, quad(column[0]));
         column[1] = fma(quad(share), high, quad(column[1]));
-        touched.data[(unsigned)node / TILE] = 1;
+        flags[(unsigned)node / TILE] = 1;
     };
     const int base = pack.base.c[n];
     add(base, pack.share_00.c[n]);
@@ -232,7 +233,7 @@ def adj_shade(
     later: int,  # slot of a pack whose turn comes soon
     worker: int,
     adj_values: wp.array2d(dtype=float4),  # [n_workers, X * Y * Z], added to
-    touched: wp.array(dtype=wp.uint8),  # [n_tiles] as in interp.adj_gather
+    touched: wp.array2d(dtype=wp.uint8),  # [n_workers, n_tiles] as in interp.adj_gather
 ):
     """integral.adj_shade, down to interp.adj_gather; one by one, as samples may share nodes."""
     ...
@@ -387,7 +388,7 @@ def adj_integrate(
     packs: wp.array(dtype=Pack),  # as integrate left it
     worker: int,
     adj_values: wp.array2d(dtype=vec4),  # [n_workers, X * Y * Z], added to
-    touched: wp.array(dtype=wp.uint8),  # [n_tiles] as in interp.adj_gather
+    touched: wp.array2d(dtype=wp.uint8),  # [n_workers, n_tiles] as in interp.adj_gather
 ):
     """integral.adj_integrate, a pack at a time; those that shared the last slot are made again."""
     adj_transmittance = wp.dot(adj_rgb, background) - adj_opacity

@@ -7,7 +7,7 @@ huber(d) = d^2 / 2 for |d| <= 1, |d| - 1/2 beyond: an edge costs its height, not
 import warp as wp
 
 from .interp import flat_index
-from .tiles import TILE, next_tile, prefetch, prefetch_row, tile_of
+from .tiles import TILE, flagged, next_tile, prefetch, prefetch_row, tile_of
 from .types import real, vec4
 
 wp.set_module_options({"enable_backward": False})
@@ -111,8 +111,8 @@ def total_variation_backward(
     values: wp.array(dtype=vec4),  # [X * Y * Z]
     size: wp.vec3i,
     weight: vec4,  # per channel
-    touched: wp.array(dtype=wp.uint8),  # [n_tiles] as adj_gather left it
-    adj_values: wp.array2d(dtype=vec4),  # [n_workers, X * Y * Z], row 0 is added to
+    touched: wp.array2d(dtype=wp.uint8),  # [n_workers, n_tiles] as adj_gather left it
+    adj_values: wp.array2d(dtype=vec4),  # [n_workers, X * Y * Z], added to where not 0
 ):
     """d TV / d x at the nodes that already have a gradient; unseen ones stay as they are."""
     start = (first + wp.tid()) * span
@@ -124,7 +124,8 @@ def total_variation_backward(
     while tile < last:
         node = tile * wp.static(TILE)
         for worker in range(adj_values.shape[0]):
-            prefetch_row(adj_values, worker, node)
+            if flagged(touched, worker, tile):
+                prefetch_row(adj_values, worker, node)
         prefetch(values, node)
         prefetch(values, node - stride_y)
         prefetch(values, node + stride_y)
@@ -135,10 +136,11 @@ def total_variation_backward(
     while tile < last:
         node = tile * wp.static(TILE)
         for n in range(wp.max(start, node), wp.min(end, node + wp.static(TILE))):
-            seen = int(0)
+            seen = int(-1)
             for worker in range(adj_values.shape[0]):
-                if not (adj_values[worker, n] == vec4()):
-                    seen = 1
-            if seen == 1:
-                adj_values[0, n] = adj_values[0, n] + adj_node_variation(values, size, weight, n)
+                if flagged(touched, worker, tile):
+                    if not (adj_values[worker, n] == vec4()):
+                        seen = worker
+            if seen >= 0:
+                adj_values[seen, n] += adj_node_variation(values, size, weight, n)
         tile = next_tile(touched, tile + 1, last)

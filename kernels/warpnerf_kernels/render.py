@@ -123,7 +123,7 @@ def render_backward_kernel(variant: Variant) -> wp.Kernel:
         kept: wp.array(dtype=Kept),  # [n_workers * capacity]
         # out
         adj_values: wp.array2d(dtype=vec4),  # [n_workers, X * Y * Z], added to
-        touched: wp.array(dtype=wp.uint8),  # [n_tiles] as in interp.adj_gather
+        touched: wp.array2d(dtype=wp.uint8),  # [n_workers, n_tiles] as in interp.adj_gather
     ):
         i = first + wp.tid()
         ray = prepare_ray(
@@ -192,7 +192,7 @@ def render_train_kernel(variant: Variant) -> wp.Kernel:
         out_error: wp.array(dtype=real),  # [n_rays] squared error
         out_n_samples: wp.array(dtype=wp.int32),  # [n_rays]
         adj_values: wp.array2d(dtype=vec4),  # [n_workers, X * Y * Z], added to
-        touched: wp.array(dtype=wp.uint8),  # [n_tiles] as in interp.adj_gather
+        touched: wp.array2d(dtype=wp.uint8),  # [n_workers, n_tiles] as in interp.adj_gather
     ):
         i = first + wp.tid()
         row = worker * capacity

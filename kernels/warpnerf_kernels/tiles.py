@@ -21,20 +21,34 @@ def tile_of(node: int) -> int:
     return node // wp.static(TILE)
 
 
+@wp.func
+def flagged(touched: wp.array2d(dtype=wp.uint8), worker: int, tile: int) -> bool:
+    """Whether a worker may have added to a tile of its row."""
+    if touched[worker, tile] != wp.uint8(0):
+        return True
+    if tile > 0:
+        return touched[worker, tile - 1] != wp.uint8(0)
+    return False
+
+
 @wp.func_native("""
-const wp::uint8* flags = touched.data;
-if (tile >= end || flags[tile] || (tile > 0 && flags[tile - 1])) return tile;
-++tile;
-for (; tile + 8 <= end; tile += 8) {
-    wp::uint64 eight;
-    memcpy(&eight, flags + tile, 8);
-    if (eight) break;
+int first = end;
+for (int worker = 0; worker < touched.shape[0]; ++worker) {
+    const wp::uint8* flags = touched.data + (size_t)worker * touched.shape[1];
+    int t = tile;
+    if (t < end && !flags[t] && !(t > 0 && flags[t - 1])) {
+        wp::uint64 eight = 0;
+        for (++t; t + 8 <= first && !eight; t += 8) memcpy(&eight, flags + t, 8);
+        if (eight) t -= 8;
+        while (t < first && !flags[t]) ++t;
+    }
+    if (t < first) first = t;
 }
-while (tile < end && !flags[tile]) ++tile;
-return tile;
+return first;
 """)
-def next_tile(touched: wp.array(dtype=wp.uint8), tile: int, end: int) -> int:
-    """The first tile at or after `tile` that may hold gradient; `end` if none before it does."""
+def next_tile(touched: wp.array2d(dtype=wp.uint8), tile: int, end: int) -> int:
+    """The first tile at or after `tile` to which any worker may have added; `end` if there is none
+    before it."""
     ...
 
 
