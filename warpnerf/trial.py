@@ -284,8 +284,9 @@ class TrialKernels:
 
     def _rows(self, n_nodes: int) -> tuple[wp.array, wp.array]:
         """A row of gradients for each worker, and flags of the tiles that have one."""
-        rows = self._zeros((self._workers.count, n_nodes), self._types.vec4)
-        return rows, self._zeros(-(-n_nodes // tiles.TILE), wp.uint8)
+        n_workers, n_tiles = self._workers.count, -(-n_nodes // tiles.TILE)
+        rows = self._zeros((n_workers, n_nodes), self._types.vec4)
+        return rows, self._zeros((n_workers, n_tiles), wp.uint8)
 
     def _array(self, values: np.ndarray, dtype: Any = None) -> wp.array:
         dtype = dtype or self._types.real
@@ -301,9 +302,9 @@ def _total(rows: wp.array, touched: wp.array) -> np.ndarray:
 
     NaN in tiles that hold gradient and are not flagged: the optimiser would not see them.
     """
-    total = rows.numpy().astype(np.float64).sum(axis=0)
-    flags = np.append(touched.numpy(), 0).astype(bool)
-    tile = np.arange(len(total)) // tiles.TILE
-    seen = flags[tile] | flags[tile - 1]  # the last entry, appended, stands before the first tile
-    total[total.any(axis=1) & ~seen] = np.nan
-    return total
+    found = rows.numpy().astype(np.float64)
+    flags = np.pad(touched.numpy(), ((0, 0), (0, 1))) != 0
+    tile = np.arange(found.shape[1]) // tiles.TILE
+    seen = flags[:, tile] | flags[:, tile - 1]  # the column added stands before the first tile
+    found[found.any(axis=2) & ~seen] = np.nan
+    return np.asarray(found.sum(axis=0))

@@ -35,7 +35,7 @@ def gather_backward(
     points: wp.array(dtype=vec3),  # [n] grid coordinates
     adj_out: wp.array(dtype=vec4),  # [n]
     adj_values: wp.array2d(dtype=vec4),  # [n_workers, X * Y * Z], added to
-    touched: wp.array(dtype=wp.uint8),  # [n_tiles] as in interp.adj_gather
+    touched: wp.array2d(dtype=wp.uint8),  # [n_workers, n_tiles] as in interp.adj_gather
 ):
     """Transpose of gather_forward."""
     i = first + wp.tid()
