@@ -116,6 +116,7 @@ def eval_command(
     /,
     scene: str | None = None,
     split: Literal["test", "train", "val", "all"] = "test",
+    lpips: Path | None = None,
     json: Path | None = None,
     device: str = "cpu",
     threads: int | None = None,
@@ -126,6 +127,7 @@ def eval_command(
         folder: Output folder of a training run.
         scene: Other photographs in the same coordinates, reduced as those of the training were.
         split: Which views.
+        lpips: Weights of LPIPS, to measure it as well; see warpnerf/lpips.py for the file.
         json: Also write the figures to this file.
         device: cpu, cuda, cuda:1, ...
         threads: CPU threads; by default one per core.
@@ -135,6 +137,11 @@ def eval_command(
     from warpnerf.run import Run
 
     require_writable(json)
+    distance = None
+    if lpips is not None:
+        from warpnerf.lpips import Lpips
+
+        distance = Lpips(lpips)
     run = Run(folder)
     config = run.read_config()
     field, notes = run.load_field(device, threads)
@@ -142,7 +149,7 @@ def eval_command(
         print(f"warpnerf: note: {note}", file=sys.stderr)
     views = load_scene(scene or config.scene, downscale=config.downscale)
     require_measurable(views, split)
-    result = evaluate(field, views, split)
+    result = evaluate(field, views, split, lpips=distance)
     print(result)
     if json is not None:
         write_json(json, result.to_json())
