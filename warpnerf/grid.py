@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any
@@ -15,6 +14,7 @@ from warpnerf_kernels.types import FreeSpace, Grid, March, vec3, vec4
 
 from warpnerf.checks import InputError
 from warpnerf.config import Contraction
+from warpnerf.memory import usable_memory
 from warpnerf.parallel import Workers
 
 CONTRACTIONS = {"none": contraction.NONE, "linf": contraction.LINF, "l2": contraction.L2}
@@ -154,20 +154,13 @@ def require_memory(size: tuple[int, int, int], arrays: int) -> None:
     if math.prod(size) >= 2**31:
         raise InputError(f"grid.voxels must give fewer than 2^31 nodes, not {math.prod(size)}.")
     needed = math.prod(size) * 16 * arrays
-    total = _total_memory()
+    total = usable_memory()
     if total is not None and needed > total:
         raise InputError(
             f"grid.voxels: a grid of {size[0]} x {size[1]} x {size[2]} nodes needs "
             f"{needed / 2**30:.1f} GiB to train, but this machine has {total / 2**30:.1f} GiB; "
             "use fewer voxels."
         )
-
-
-def _total_memory() -> int | None:
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):
-        return None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import warp as wp
 from warpnerf_kernels import gradscale, tiles, types
 from warpnerf_kernels import render as kernels
@@ -169,8 +170,13 @@ class Gradients:
     def zeros(n_nodes: int, workers: Workers) -> Gradients:
         """No gradient yet."""
         n_tiles = -(-n_nodes // tiles.TILE)
+        if workers.device.is_cuda:
+            rows = wp.zeros((1, n_nodes), dtype=vec4, device=workers.device)
+        else:  # pages of zeros that take no memory until a gradient is added to them
+            zeros = np.zeros((workers.count, n_nodes, 4), np.float32)
+            rows = wp.array(zeros, dtype=vec4, device=workers.device, copy=False)
         return Gradients(
-            rows=wp.zeros((workers.count, n_nodes), dtype=vec4, device=workers.device),
+            rows=rows,
             touched=wp.zeros((workers.count, n_tiles), dtype=wp.uint8, device=workers.device),
         )
 

@@ -15,6 +15,7 @@ from warpnerf.checks import InputError
 from warpnerf.config import Contraction, TrainConfig
 from warpnerf.field import Field
 from warpnerf.grid import FreeCells, VoxelGrid, grid_size, require_memory
+from warpnerf.memory import give_back
 from warpnerf.optim import Moments, adam_step, add_total_variation
 from warpnerf.parallel import Workers
 from warpnerf.rays import PixelSampler
@@ -351,23 +352,27 @@ class Trainer:
         grown = sum(fraction >= at for at in self.config.grid.grow_at)
         if grown == self._grown or self.steps_done < FIRST_LOOK:
             return
-        self._look_for_free_space()
         box = self._tight_box()
         extent = (box[1] - box[0]) * (1.0 + self.grid.border)
         size = grid_size(extent, self._voxels(grown))
+        del self._pass  # gives its memory back before more is asked for
         self.grid, (mean, square) = self.grid.resized(
             self.workers, size, (self.moments.mean, self.moments.square), box
         )
         self.moments = replace(self.moments, mean=mean, square=square)
         self._grown = grown
+        give_back()
         self._pass = self._training_pass()
         self._look_for_free_space()
 
     def _tight_box(self) -> tuple[np.ndarray, np.ndarray]:
         """The box around what is occupied, where space is bounded; never larger than before."""
         box_min, box_max = self.grid.box_min, self.grid.box_max
+        if self.grid.contraction != "none":
+            return box_min, box_max
+        self._look_for_free_space()
         occupied = self.free.occupied_range()
-        if self.grid.contraction != "none" or occupied is None:
+        if occupied is None:
             return box_min, box_max
         extent = box_max - box_min
         return box_min + occupied[0] * extent, box_min + occupied[1] * extent
