@@ -57,7 +57,7 @@ def test_help_names_every_option() -> None:
         assert f"--{option}" in out
     code, out, _ = run("eval", "--help")
     assert code == 0
-    for option in ("scene", "split", "json"):
+    for option in ("scene", "split", "lpips", "json"):
         assert f"--{option}" in out
 
 
@@ -93,11 +93,19 @@ def test_eval_repeats_the_figures(trained: tuple[Path, str], tmp_path: Path) -> 
     code, out, err = run("eval", folder, "--json", target, "--threads", "1")
     assert code == 0, err
     figures = json.loads(target.read_text())
-    assert list(figures) == ["mean", "images"]
+    assert list(figures) == ["mean", "floaters", "images"]
     for row in (figures["mean"], *figures["images"]):
         assert np.isfinite([row["psnr"], row["ssim"]]).all()
     assert figures == json.loads((folder / "metrics.json").read_text())
     assert f"{figures['mean']['psnr']:.2f}" in out
+
+
+def test_eval_with_lpips(trained: tuple[Path, str], tmp_path: Path) -> None:
+    weights = tmp_path / "weights.safetensors"
+    code, _, err = run("eval", trained[0], "--lpips", weights)
+    assert code == 2
+    assert str(weights) in err and "LPIPS" in err
+    assert "Traceback" not in err
 
 
 def test_eval_of_the_training_views(trained: tuple[Path, str], tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """The built-in room: its pictures, its true depth, and the cameras in it."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -256,3 +257,15 @@ def test_downscale_crops_what_fills_no_pixel() -> None:
 def test_impossible_downscale_is_refused(downscale: int) -> None:
     with pytest.raises(ValueError, match="downscale"):
         room.room_scene(downscale=downscale)
+
+
+def test_photographed_anew_it_looks_the_same() -> None:
+    scene = room.room_scene(4)
+    assert scene.photograph is not None
+    for view in (scene.views[0], scene.views[33]):
+        np.testing.assert_array_equal(scene.photograph(view.camera), view.image)
+    camera = scene.views[0].camera
+    for place in ((0.45, -1.5, 0.2), (0.0, 9.0, 1.0)):  # in the crate, outside
+        c2w = camera.c2w.copy()
+        c2w[:, 3] = place
+        assert scene.photograph(replace(camera, c2w=c2w)) is None

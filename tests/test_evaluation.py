@@ -10,6 +10,8 @@ import pytest
 from tiny_fields import tiny_field
 from tiny_scenes import camera_at, ring
 
+from warpnerf import evaluation
+from warpnerf.camera import Camera
 from warpnerf.checks import InputError
 from warpnerf.evaluation import evaluate
 from warpnerf.field import Field
@@ -64,12 +66,47 @@ def test_another_picture_scores_worse() -> None:
 def test_json_has_the_promised_form() -> None:
     field = tiny_field()
     without = json.loads(evaluate(field, scene_of(field, depth=False)).to_json())
-    assert list(without) == ["mean", "images"]
-    assert list(without["mean"]) == ["psnr", "ssim"]
-    assert [list(image) for image in without["images"]] == [["name", "psnr", "ssim"]]
+    assert list(without) == ["mean", "floaters", "images"]
+    assert list(without["mean"]) == ["psnr", "ssim", "flip"]
+    assert list(without["floaters"]) == ["within", "near_mass", "near_rays"]
+    assert [list(image) for image in without["images"]] == [["name", "psnr", "ssim", "flip"]]
     assert without["mean"]["psnr"] == without["images"][0]["psnr"]
     known = json.loads(evaluate(field, scene_of(field, depth=True)).to_json())
-    assert list(known["mean"]) == ["psnr", "ssim", "depth_error"]
+    assert list(known["mean"]) == ["psnr", "ssim", "flip", "depth_error"]
+
+
+def test_what_is_not_installed_or_given_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    field = tiny_field()
+    scene = scene_of(field, depth=False)
+    monkeypatch.setattr(evaluation, "has_flip", lambda: False)
+    result = evaluate(field, scene)
+    assert list(result.mean) == ["psnr", "ssim"]
+    assert "FLIP" not in str(result)
+    pairs = []
+
+    def distance(rgb: np.ndarray, target: np.ndarray) -> float:
+        pairs.append((rgb.shape, target.shape))
+        return 0.125 * len(pairs)
+
+    result = evaluate(field, scene, "train", lpips=distance)
+    assert pairs == [((12, 16, 3), (12, 16, 3))] * 3
+    assert [image.lpips for image in result.images] == [0.125, 0.25, 0.375]
+    assert result.mean["lpips"] == 0.25
+    assert "LPIPS" in str(result) and "0.2500" in str(result)
+
+
+def test_a_scene_that_can_be_photographed_anew_is() -> None:
+    field = tiny_field()
+    scene = scene_of(field, depth=False)
+
+    def photograph(camera: Camera) -> np.ndarray:
+        return np.round(field.render(camera).rgb * 255.0).astype(np.uint8)
+
+    result = evaluate(field, replace(scene, photograph=photograph))
+    floaters = json.loads(result.to_json())["floaters"]
+    assert floaters["pulled_views"] == 3
+    assert floaters["pulled_psnr"] > 55.0  # rounding to 8 bits
+    assert "pulled back by 0.6 scene units" in str(result)
 
 
 def test_alpha_is_seen_over_the_background_of_the_field() -> None:
@@ -94,10 +131,11 @@ def test_alpha_is_seen_over_the_background_of_the_field() -> None:
 def test_the_table_names_every_image_and_the_mean() -> None:
     field = tiny_field()
     table = str(evaluate(field, scene_of(field, depth=True), split="train")).splitlines()
-    assert len(table) == 5
+    assert len(table) == 6
     assert "PSNR" in table[0]
     assert [line.split()[0] for line in table[1:4]] == [f"images/{i}.png" for i in range(3)]
     assert table[4].startswith("mean")
+    assert table[5].startswith("within 0.3 scene units of the training cameras")
 
 
 def test_a_missing_split_is_named_with_those_that_exist() -> None:

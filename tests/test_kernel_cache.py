@@ -6,7 +6,9 @@ import hashlib
 from pathlib import Path
 
 import pytest
+import warp as wp
 
+from warpnerf import kernel_cache
 from warpnerf.kernel_cache import SUMS, DamagedKernelError, _seal, _verify
 
 CODE, META, SOURCE = "a.cpu.o", "a.meta", "a.cpp"
@@ -66,3 +68,32 @@ def test_a_folder_that_is_not_there_is_neither_damaged_nor_made(tmp_path: Path) 
     _verify(tmp_path / "none")
     _seal(tmp_path / "none")
     assert not (tmp_path / "none").exists()
+
+
+class Module:
+    """What is asked of Warp's modules."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def get_module_identifier(self, block_dim: int) -> str:
+        return self.folder.name
+
+    def load(self, device: object, block_dim: int) -> None:
+        self.folder.mkdir(exist_ok=True)
+        (self.folder / "a.cpu0.o").write_text("compiled")
+
+
+def test_compiling_is_announced_once_and_reading_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+    monkeypatch.setattr(kernel_cache._log, "info", said.append)
+    monkeypatch.setattr(kernel_cache, "_said", False)
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    cpu = wp.get_device("cpu")
+    (tmp_path / "cached").mkdir()
+    (tmp_path / "cached" / "a.cpu0.o").write_text("compiled")
+    for name, times in (("cached", 0), ("first", 1), ("second", 1), ("first", 1)):
+        kernel_cache._load(Module(tmp_path / name), cpu)
+        assert said == ["compiling kernels (once; later runs start at once)"] * times

@@ -1,13 +1,14 @@
-"""PSNR by hand, SSIM against scikit-image."""
+"""PSNR by hand, SSIM against scikit-image, FLIP by its definition's ends."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from flip_evaluator import evaluate
 from skimage.metrics import structural_similarity
 
 from warpnerf.checks import InputError
-from warpnerf.metrics import psnr, ssim
+from warpnerf.metrics import flip, has_flip, psnr, ssim
 
 
 def images(seed: int, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
@@ -44,7 +45,7 @@ def test_equal_images_are_alike() -> None:
     assert ssim(rgb, rgb) == pytest.approx(1.0, abs=1e-12)
 
 
-@pytest.mark.parametrize("metric", [psnr, ssim])
+@pytest.mark.parametrize("metric", [psnr, ssim, flip])
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 @pytest.mark.parametrize("which", [0, 1])
 def test_not_finite_is_refused(metric, bad: float, which: int) -> None:
@@ -54,7 +55,7 @@ def test_not_finite_is_refused(metric, bad: float, which: int) -> None:
         metric(*pair)
 
 
-@pytest.mark.parametrize("metric", [psnr, ssim])
+@pytest.mark.parametrize("metric", [psnr, ssim, flip])
 def test_differing_shapes_are_refused(metric) -> None:
     with pytest.raises(InputError, match=r"12, 12, 3.*12, 13, 3"):
         metric(np.zeros((12, 12, 3)), np.zeros((12, 13, 3)))
@@ -63,3 +64,22 @@ def test_differing_shapes_are_refused(metric) -> None:
 def test_ssim_refuses_what_is_smaller_than_its_window() -> None:
     with pytest.raises(InputError, match="11 x 11"):
         ssim(np.zeros((10, 30, 3)), np.zeros((10, 30, 3)))
+
+
+def test_flip_is_that_of_its_package() -> None:
+    """Equal images, a known pair, and which image is the reference."""
+    rgb, truth = images(0, 24, 32)
+    assert has_flip()
+    assert flip(truth, truth) == pytest.approx(0.0, abs=1e-6)
+    black, white = np.zeros((24, 32, 3)), np.ones((24, 32, 3))
+    # A difference of lightness by 100 is among the largest there are.
+    assert 0.95 < flip(white, black) <= 1.0
+    expected = evaluate(truth.astype(np.float32), rgb.astype(np.float32), "LDR")[1]
+    assert 0.05 < expected < 0.9
+    assert flip(rgb, truth) == pytest.approx(expected, abs=1e-7)
+
+
+def test_flip_without_its_package_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("warpnerf.metrics.has_flip", lambda: False)
+    with pytest.raises(InputError, match="pip install flip-evaluator"):
+        flip(np.zeros((12, 12, 3)), np.zeros((12, 12, 3)))

@@ -16,6 +16,7 @@ import tyro
 
 from warpnerf import __version__
 from warpnerf.checks import InputError
+from warpnerf.cli_machine import check_command, require_writable, warmup_command, write_json
 from warpnerf.config import PRESETS, Scaling, TrainConfig
 from warpnerf.stop import Stopped, StopRequest, raise_when_asked
 
@@ -115,6 +116,7 @@ def eval_command(
     /,
     scene: str | None = None,
     split: Literal["test", "train", "val", "all"] = "test",
+    lpips: Path | None = None,
     json: Path | None = None,
     device: str = "cpu",
     threads: int | None = None,
@@ -125,17 +127,21 @@ def eval_command(
         folder: Output folder of a training run.
         scene: Other photographs in the same coordinates, reduced as those of the training were.
         split: Which views.
+        lpips: Weights of LPIPS, to measure it as well; see warpnerf/lpips.py for the file.
         json: Also write the figures to this file.
         device: cpu, cuda, cuda:1, ...
         threads: CPU threads; by default one per core.
     """
-    from warpnerf.checkpoint import write_atomically
     from warpnerf.data import load_scene
     from warpnerf.evaluation import evaluate, require_measurable
     from warpnerf.run import Run
 
-    if json is not None and not json.parent.is_dir():
-        raise InputError(f"--json {json}: its folder does not exist; make it first.")
+    require_writable(json)
+    distance = None
+    if lpips is not None:
+        from warpnerf.lpips import Lpips
+
+        distance = Lpips(lpips)
     run = Run(folder)
     config = run.read_config()
     field, notes = run.load_field(device, threads)
@@ -143,13 +149,10 @@ def eval_command(
         print(f"warpnerf: note: {note}", file=sys.stderr)
     views = load_scene(scene or config.scene, downscale=config.downscale)
     require_measurable(views, split)
-    result = evaluate(field, views, split)
+    result = evaluate(field, views, split, lpips=distance)
     print(result)
     if json is not None:
-        try:
-            write_atomically(json, result.to_json().encode())
-        except OSError as error:
-            raise InputError(f"--json {json} cannot be written: {error.strerror}.") from error
+        write_json(json, result.to_json())
     return 0
 
 
@@ -211,8 +214,6 @@ def _read(source: str, downscale: int) -> Scene:
 
 def _train(run: Run, scene: Scene, trainer: Trainer) -> int:
     """Train to the end, or until asked to stop; look at the test views."""
-    if trainer.fraction < 1.0:
-        print("compiling kernels (once; later runs start at once)", flush=True)
     with StopRequest() as stop:
         try:
             with _reporter(trainer.config) as report:
@@ -272,6 +273,13 @@ def _describe(scene: Scene, content_distance: float, config: TrainConfig) -> Non
 
 def _absolute(source: str) -> str:
     return source if source.startswith("builtin:") else str(Path(source).resolve())
+
+
+class _Printer(logging.Handler):
+    """Prints what modules below have to say."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        print(record.getMessage(), flush=True)
 
 
 class _reporter:
@@ -338,12 +346,20 @@ def main(arguments: list[str] | None = None) -> int:
     raise_when_asked()
     warnings.filterwarnings("ignore", module="PIL")  # what matters in an image is refused
     logging.getLogger("PIL").setLevel(logging.CRITICAL)
+    own = logging.getLogger("warpnerf")
+    own.handlers, own.propagate = [_Printer()], False
+    own.setLevel(logging.INFO)
     warnings.formatwarning = lambda message, *_: f"warpnerf: warning: {message}.\n"
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # file names may hold anything
     try:
         return tyro.extras.subcommand_cli_from_dict(
-            {"train": train_command, "eval": eval_command},
+            {
+                "train": train_command,
+                "eval": eval_command,
+                "check": check_command,
+                "warmup": warmup_command,
+            },
             prog="warpnerf",
             description="Voxel-grid radiance fields from posed photographs, without floaters.",
             args=arguments,

@@ -5,16 +5,32 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from warpnerf.checks import InputError
-from warpnerf.metrics import SSIM_WINDOW, psnr, ssim
+from warpnerf.metrics import SSIM_WINDOW, flip, has_flip, psnr, ssim
+from warpnerf.nearness import Nearness, measure_nearness
 from warpnerf.scene import Scene, View, require_split
+from warpnerf.terminal import table_text
 
 if TYPE_CHECKING:
     from warpnerf.field import Field, Rendering
+
+
+Distance = Callable[[np.ndarray, np.ndarray], float]
+"""Of a rendering and a photograph, both [H, W, 3] in [0, 1]."""
+
+HEADINGS = {
+    "psnr": ("PSNR", ".2f"),
+    "ssim": ("SSIM", ".4f"),
+    "flip": ("FLIP", ".4f"),
+    "lpips": ("LPIPS", ".4f"),
+    "depth_error": ("depth error", ".4f"),
+}
+"""Heading and format of each figure in a table."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,51 +43,55 @@ class ImageMetrics:
     """dB."""
     ssim: float
     """At most 1."""
+    flip: float | None = None
+    """0 for equal images, at most 1; where the package flip-evaluator is installed."""
+    lpips: float | None = None
+    """0 for equal images; where its weights were given."""
     depth_error: float | None = None
     """Mean |depth - true depth|, scene units, over the pixels whose true depth is known."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """The figures of all views of a split."""
+    """The figures of all views of a split, and those of the space before the training cameras."""
 
     images: tuple[ImageMetrics, ...]
     """In the scene's order."""
+    nearness: Nearness
+    """Of floaters."""
 
     @property
     def mean(self) -> dict[str, float]:
-        """Means over the images, by name."""
-        means = {
-            "psnr": float(np.mean([image.psnr for image in self.images])),
-            "ssim": float(np.mean([image.ssim for image in self.images])),
-        }
-        errors = [image.depth_error for image in self.images if image.depth_error is not None]
-        if errors:
-            means["depth_error"] = float(np.mean(errors))
+        """Means over the images that have a figure, by name."""
+        means = {}
+        for name in HEADINGS:
+            values = [getattr(image, name) for image in self.images]
+            known = [value for value in values if value is not None]
+            if known:
+                means[name] = float(np.mean(known))
         return means
 
     def to_json(self) -> str:
-        """{"mean": {"psnr": ..., "ssim": ...}, "images": [{"name": ..., ...}, ...]}."""
+        """{"mean": {"psnr": ..., ...}, "floaters": {...}, "images": [{"name": ..., ...}, ...]}."""
         images = [
             {key: value for key, value in vars(image).items() if value is not None}
             for image in self.images
         ]
-        return json.dumps({"mean": self.mean, "images": images}, indent=2) + "\n"
+        content = {"mean": self.mean, "floaters": self.nearness.to_dict(), "images": images}
+        return json.dumps(content, indent=2) + "\n"
 
     def __str__(self) -> str:
-        """A table, the means last."""
-        width = max(len("mean"), *(len(image.name) for image in self.images))
-        with_depth = "depth_error" in self.mean
-        lines = [f"{'image':{width}}   PSNR    SSIM" + ("  depth error" if with_depth else "")]
-        for image in self.images:
-            lines.append(f"{image.name:{width}}  {image.psnr:5.2f}  {image.ssim:6.4f}")
-            if image.depth_error is not None:
-                lines[-1] += f"  {image.depth_error:11.4f}"
+        """A table, the means last, and what is known of floaters."""
         mean = self.mean
-        lines.append(f"{'mean':{width}}  {mean['psnr']:5.2f}  {mean['ssim']:6.4f}")
-        if with_depth:
-            lines[-1] += f"  {mean['depth_error']:11.4f}"
-        return "\n".join(lines)
+
+        def cells(name: str, figures: Callable[[str], float | None]) -> list[str]:
+            values = ((figures(key), HEADINGS[key][1]) for key in mean)
+            return [name, *("" if value is None else format(value, how) for value, how in values)]
+
+        rows = [cells(image.name, partial(getattr, image)) for image in self.images]
+        rows.append(cells("mean", mean.get))
+        table = table_text(["image", *(HEADINGS[key][0] for key in mean)], rows)
+        return f"{table}\n{self.nearness}"
 
 
 def evaluate(
@@ -79,6 +99,7 @@ def evaluate(
     scene: Scene,
     split: str = "test",
     on_image: Callable[[View, np.ndarray, Rendering], None] | None = None,
+    lpips: Distance | None = None,
 ) -> Evaluation:
     """Render a split's views and hold them against the photographs.
 
@@ -88,6 +109,7 @@ def evaluate(
         split: train, val, test, or all.
         on_image: Called with each view, its truth [H, W, 3] in [0, 1] over the field's background,
             and its rendering.
+        lpips: A ``warpnerf.lpips.Lpips``, if LPIPS is wanted.
 
     Raises:
         InputError: The scene has no such split.
@@ -107,12 +129,14 @@ def evaluate(
                 name=view.name,
                 psnr=psnr(rgb, target),
                 ssim=ssim(rgb, target),
+                flip=flip(rgb, target) if has_flip() else None,
+                lpips=None if lpips is None else lpips(rgb, target),
                 depth_error=depth_error,
             )
         )
         if on_image is not None:
             on_image(view, target, rendering)
-    return Evaluation(images=tuple(images))
+    return Evaluation(images=tuple(images), nearness=measure_nearness(field, scene))
 
 
 def require_measurable(scene: Scene, split: str) -> None:

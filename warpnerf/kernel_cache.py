@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import atexit
 import hashlib
+import logging
 import os
 import shutil
 import tempfile
@@ -24,7 +25,9 @@ from warpnerf.checks import InputError
 SUMS = "SHA256SUMS"
 COMPILED = (".o", ".cubin", ".ptx", ".meta")
 
+_log = logging.getLogger("warpnerf")
 _temporary: Path | None = None
+_said = False
 
 
 class DamagedKernelError(Exception):
@@ -65,8 +68,30 @@ def _load(module: wp.Module, device: wp.Device) -> None:
     block_dim = 256 if device.is_cuda else 1
     folder = Path(wp.config.kernel_cache_dir) / module.get_module_identifier(block_dim)
     _verify(folder)
+    if not _is_compiled(folder, device):
+        _say_once()
     module.load(device, block_dim=block_dim)
     _seal(folder)
+
+
+def is_compiled(kernel: wp.Kernel, device: wp.Device) -> bool:
+    """Whether a kernel's module is in the cache for a device, as far as names of files tell."""
+    block_dim = 256 if device.is_cuda else 1
+    name = kernel.module.get_module_identifier(block_dim)
+    return _is_compiled(Path(wp.config.kernel_cache_dir) / name, device)
+
+
+def _is_compiled(folder: Path, device: wp.Device) -> bool:
+    pattern = f"*.sm{device.arch}*.*" if device.is_cuda else "*.o"
+    return any(path.suffix in COMPILED for path in folder.glob(pattern))
+
+
+def _say_once() -> None:
+    """Say what takes so long, once in a process."""
+    global _said
+    if not _said:
+        _log.info("compiling kernels (once; later runs start at once)")
+    _said = True
 
 
 def _leave_cache(error: Exception) -> None:

@@ -1,7 +1,8 @@
-"""How close a rendering is to its photograph."""
+"""How close a rendering is to its photograph: PSNR, SSIM, and FLIP where its package is."""
 
 from __future__ import annotations
 
+import importlib.util
 import math
 
 import numpy as np
@@ -58,6 +59,33 @@ def ssim(rgb: np.ndarray, target: np.ndarray) -> float:
         (mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2)
     )
     return float(similarity.mean())
+
+
+def has_flip() -> bool:
+    """Whether the package that computes FLIP is installed: ``pip install warpnerf[metrics]``."""
+    return importlib.util.find_spec("flip_evaluator") is not None
+
+
+def flip(rgb: np.ndarray, target: np.ndarray) -> float:
+    """LDR-FLIP, mean over pixels: the difference seen when one image takes the other's place.
+
+    Between 0, for equal images, and 1; of images 0.7 m away on a screen 0.7 m and 3840 pixels wide,
+    67 pixels to a degree. Source: Andersson et al. 2020, by the authors' package flip-evaluator.
+
+    Args:
+        rgb: [H, W, 3] in [0, 1], sRGB.
+        target: The same shape.
+
+    Raises:
+        InputError: Shapes differ, a value is not finite, or the package is not installed.
+    """
+    a, b = _checked(rgb, target)
+    if not has_flip():
+        raise InputError("FLIP needs its package; install it with: pip install flip-evaluator.")
+    from flip_evaluator import evaluate
+
+    reference, test = (np.ascontiguousarray(image, np.float32) for image in (b, a))
+    return float(evaluate(reference, test, "LDR", applyMagma=False)[1])
 
 
 def _checked(rgb: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

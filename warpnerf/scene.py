@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -82,6 +82,9 @@ class Scene:
     """How the scene was understood: its split, what was estimated; a line each."""
     warnings: tuple[str, ...] = field(default=())
     """What is odd and may be a mistake: missing files, duplicates, unused keys; a line each."""
+    photograph: Callable[[Camera], np.ndarray | None] | None = None
+    """What another camera sees, [H, W, 3] uint8 rgb, or None where it cannot stand; for scenes that
+    can be photographed anew."""
 
     def __post_init__(self) -> None:
         """Refuse what nothing can be trained on.

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
-from warpnerf_kernels import interp, occupancy
 from warpnerf_kernels.types import vec4
 
 from warpnerf.checks import InputError
@@ -23,6 +22,7 @@ from warpnerf.rays import PixelSampler
 from warpnerf.render import Steps, TrainingPass
 from warpnerf.scene import Scene
 from warpnerf.state import Progress, TrainingState, scene_digest
+from warpnerf.warmup import training_kernels
 
 FAR_BOXES = 64.0
 """How far an unbounded scene is sampled, in half edges of its box; beyond lies the background."""
@@ -141,8 +141,6 @@ class Trainer:
             self._restore(resume)
         self._occupied = self.free.share()
         self._pass = self._training_pass()
-        for kernel in (occupancy.mark_occupied, interp.resample):  # of later steps; not timed then
-            self.workers.load(kernel)
 
     def run(
         self,
@@ -186,6 +184,9 @@ class Trainer:
     def step(self) -> None:
         """Draw a batch and update the grid; grow the grid and look for free space when due."""
         config = self.config
+        if self._started is None:  # compiling is not training
+            for kernel in self._kernels():
+                self.workers.load(kernel)
         fraction = self.fraction
         self._grow(fraction)
         if self.steps_done % config.occupancy_every == 0:
@@ -204,7 +205,7 @@ class Trainer:
             config.optim,
             self.workers,
         )
-        if self._started is None:  # compiling is not training
+        if self._started is None:  # nor is the first step, in which memory is first touched
             self._started = time.perf_counter() - self._seconds
         self._seconds = time.perf_counter() - self._started
 
@@ -339,6 +340,11 @@ class Trainer:
             self.config.jacobian,
             self.grid.contraction,
             self.workers,
+        )
+
+    def _kernels(self) -> list[wp.Kernel]:
+        return training_kernels(
+            self.grid.contraction, self.config.scaling, self.config.jacobian, self.workers.device
         )
 
     def _grow(self, fraction: float) -> None:

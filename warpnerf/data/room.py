@@ -309,6 +309,11 @@ def room_scene(downscale: int = 1) -> Scene:
         raise InputError(f"downscale must be a whole number from 1 to {HEIGHT}, not {downscale}.")
     tracer = _tracer()
     samples = min(downscale + 1, 4)  # small images hold more detail in each pixel
+
+    def photograph(camera: Camera) -> np.ndarray | None:
+        inside = first_hit(camera.position[None], camera.forward[None])[0] > 0.0
+        return tracer.image(camera, samples) if inside else None
+
     views = []
     for kind, poses in (("test", _TEST), ("train", tuple(_train_poses()))):
         for k, (eye, target) in enumerate(poses):
@@ -331,4 +336,5 @@ def room_scene(downscale: int = 1) -> Scene:
             f"content distance {content_distance:.3g}: median of the true depth over the training "
             "views, which look in, out and close, at no common point",
         ),
+        photograph=photograph,
     )

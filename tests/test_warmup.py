@@ -1,0 +1,52 @@
+"""What is compiled ahead is what trainings use."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from test_determinism import small_scene
+
+from warpnerf.config import GridConfig, TrainConfig
+from warpnerf.training import Trainer
+from warpnerf.warmup import rendering_kernels, training_kernels, warm_up
+
+
+@pytest.mark.parametrize("contraction", ["none", "linf"])
+@pytest.mark.parametrize("scaling", ["none", "quadratic", "clamped"])
+def test_a_training_loads_no_other_kernels(contraction: Any, scaling: Any, device: str) -> None:
+    config = TrainConfig(
+        steps=206,
+        rays_per_step=64,
+        scaling=scaling,
+        device=device,
+        grid=GridConfig(voxels=600, grow_at=(0.5,), contraction=contraction),
+    )
+    trainer = Trainer(small_scene(), config)
+    assert not trainer.workers._loaded  # a scene is described before anything is compiled
+    where = trainer.workers.device
+    needed = training_kernels(contraction, scaling, "none", where)
+    trainer.step()
+    assert trainer.workers._loaded == set(needed)
+    trainer.run()
+    assert trainer.grid.size != Trainer(small_scene(), config).grid.size
+    modules = {kernel.module for kernel in needed}
+    assert {kernel.module for kernel in trainer.workers._loaded} == modules
+    trainer.field().render(small_scene().cameras[0])
+    modules |= {kernel.module for kernel in rendering_kernels(contraction, where)}
+    assert {kernel.module for kernel in trainer.workers._loaded} == modules
+
+
+def test_warm_up_covers_the_presets_and_is_done_once(device: str) -> None:
+    shown: list[Any] = []
+    first = warm_up(device, shown.append)
+    assert first == shown
+    names = [kernel.name for kernel in first]
+    assert len(set(names)) == len(names)
+    for scaling in ("none", "quadratic", "clamped"):
+        assert f"render train, scaling {scaling}" in names
+        assert f"render train, space folded in, scaling {scaling}" in names
+    assert {"render forward", "render forward, space folded in", "adam step"} < set(names)
+    again = warm_up(device)
+    assert [kernel.name for kernel in again] == names
+    assert not any(kernel.compiled for kernel in again)
