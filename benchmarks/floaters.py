@@ -16,13 +16,12 @@ import dataclasses
 from pathlib import Path
 
 import numpy as np
-from workload import machine, write_record
+from measuring import RESULTS, machine, write_record
 
 import warpnerf as wn
 from warpnerf.data.room import first_hit
 from warpnerf.pictures import comparison, write_png
 
-RESULTS = Path(__file__).parent / "results"
 N_DIRECTIONS = 2000
 
 

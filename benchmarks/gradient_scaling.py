@@ -24,25 +24,18 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import asdict
-from pathlib import Path
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 import torch
 import warp as wp
-from torch_pipeline import Choices, ScaleGradient, TorchPipeline, fastest_by_threads
+from candidates.torch_eager import Choices, ScaleGradient, TorchPipeline, fastest
+from measuring import Stopwatch, machine, median_interval, options, write_record
 from warpnerf_kernels import contraction
 from warpnerf_kernels import render as kernels
 from warpnerf_kernels.types import real, vec3
-from workload import (
-    Stopwatch,
-    Workload,
-    machine,
-    make_workload,
-    median_interval,
-    write_record,
-)
+from workload import Workload, make_workload
 
 from warpnerf.config import Scaling
 from warpnerf.grid import FreeCells
@@ -149,7 +142,8 @@ class WarpAdjoint:
 def check(ours: WarpAdjoint, theirs: dict[Scaling, TorchPipeline]) -> None:
     """Raise SystemExit unless all launches have the gradient that torch has."""
     for scaling, pipeline in theirs.items():
-        expected = pipeline.training_step()[0].permute(1, 2, 3, 0).cpu().numpy()
+        pipeline.step()
+        expected = pipeline.gradient()
         for launch in (ours.backward(scaling), ours.train(scaling)):
             error = np.abs(ours.gradient_of(launch) - expected).max() / np.abs(expected).max()
             if not error < 1e-4:
@@ -207,12 +201,9 @@ class Pairs:
             "pairs": len(self._times),
             "without_us": self.without_us(),
             "with_us": 1e6 * float(np.median([t[1] for t in self._times])),
-            "difference_us": dict(zip(("low", "median", "high"), difference, strict=True)),
+            "difference_us": difference,
             "backward_us": backward_us,
-            "share_of_backward": {
-                key: value / backward_us
-                for key, value in zip(("low", "median", "high"), difference, strict=True)
-            },
+            "share_of_backward": {key: value / backward_us for key, value in difference.items()},
         }
 
 
@@ -250,13 +241,11 @@ def has_counters() -> bool:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--device", default="cpu", help="cpu, cuda:0")
+    parser = options(__doc__)
     parser.add_argument("--grid", type=int, default=64, help="nodes along each axis")
     parser.add_argument("--pairs", type=int, default=200)
     parser.add_argument("--repeats", type=int, default=2, help="of each side in a pair")
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--output", type=Path, help="where the record goes")
     parser.add_argument("--launch", nargs=2, metavar=("SCALING", "N"), help=argparse.SUPPRESS)
     args = parser.parse_args()
     on_cuda = args.device.startswith("cuda")
@@ -269,19 +258,22 @@ def main() -> None:
 
     stopwatch = Stopwatch(args.device)
     ours = WarpAdjoint(work, args.device, args.threads)
-    candidates = fastest_by_threads(work, True, args.threads, args.device, stopwatch.seconds)
+    # More threads are not always faster.
+    counts = [1] if on_cuda else sorted({1, args.threads})
+    candidates = [fastest(work, n, args.device) for n in counts]
     times = [
-        np.median([stopwatch.seconds(candidate.training_step) for _ in range(5)])
-        for candidate in candidates
+        np.median([stopwatch.seconds(candidate.step) for _ in range(5)]) for candidate in candidates
     ]
     best: Choices = candidates[int(np.argmin(times))].choices
     scalings: tuple[Scaling, ...] = ("none", "clamped")
-    theirs = {s: TorchPipeline(work, s != "none", best, args.device) for s in scalings}
+    theirs = {
+        s: TorchPipeline(replace(work, scaled=s != "none"), best, args.device) for s in scalings
+    }
     check(ours, theirs)
 
     def torch_backward(pipeline: TorchPipeline) -> Call:
         loss = pipeline.loss()
-        return lambda: pipeline.gradient(loss, keep_graph=True)
+        return lambda: pipeline.backward(loss, keep_graph=True)
 
     plain = ours.backward("none")
     backward = Pairs("render_backward", plain, ours.backward("clamped"), stopwatch)

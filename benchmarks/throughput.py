@@ -1,181 +1,232 @@
-"""Forward + loss + scaled adjoint of 4096 random rays x 256 steps, against the best eager torch.
+"""A training step's gradient, as everybody would compute it: milliseconds, and who is how fast.
 
     python benchmarks/throughput.py
 
-Both sides do the same work in the same run, round by round in turn: march, composite, squared
-error, adjoint into a zeroed gradient, clamped distance scaling (torch: the paper's operation). They
-are first checked against each other. Torch runs on one thread and on as many as warpnerf, and in
-each round its faster time counts: on the CPU it is not always the second. `inside`: all 256 samples
-of each ray lie in the box; `crossing`: rays from outside, about two thirds of the steps in the box.
-Also reports what memory a step needs besides grid and gradient, as the number of steps grows.
+4096 rays x 256 steps, 4 channels: march, composite, squared error, adjoint scaled by distance, and
+a gradient of the grid that is zeroed, added up and ready to be used. warpnerf against eager torch,
+torch.compile, numba, Taichi and Dr.Jit where installed (`pip install ".[bench]"`), each on one and
+two threads; candidates/ holds them. A case is one workload:
+
+    random   single pixels of random cameras around the box, two thirds of the steps in it
+    patches  8 x 8 neighbouring pixels of each camera
+    dense    random values everywhere
+    sphere   a solid sphere in empty space, which may be skipped: where it is free is given to all
+
+All are checked against each other before anything is timed. Then they take turns, in an order that
+changes from round to round; in a turn the better of two steps counts. Ratios are formed within a
+round; all figures are medians over the rounds with 95 % intervals from order statistics. With two
+threads allowed, the better of one and two threads counts for each candidate, round by round: more
+are not always faster. Compile time is not in it. Beside it what the machine could do (roofline.py),
+and what memory a step needs besides grid and gradient, as the number of steps grows.
 """
 
 from __future__ import annotations
 
 import argparse
-import os
-from collections.abc import Callable
-from dataclasses import asdict
-from pathlib import Path
+import gc
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from typing import Any
 
+import candidates
 import numpy as np
-import warp as wp
-from torch_pipeline import TorchPipeline, fastest_by_threads
-from workload import (
-    Rays,
+import roofline
+from candidates import Candidate, Load, torch_eager
+from candidates.warpnerf_step import WarpStep
+from measuring import (
     Stopwatch,
-    Workload,
+    default_threads,
     machine,
-    make_workload,
-    quartiles,
+    median_interval,
+    options,
+    show,
     write_record,
 )
-
-from warpnerf.grid import FreeCells
-from warpnerf.parallel import Workers
-from warpnerf.render import TrainingPass, render_rays
+from plotting import plot_throughput
+from workload import Rays, Scene, Workload, make_workload
 
 TOLERANCE = 1e-4
-"""Of the largest value: by how much the two sides may differ."""
+"""Of the largest value: by how much candidates may differ from the first."""
+OURS = "warpnerf"
 
 
-class WarpStep:
-    """A workload's training step in warpnerf."""
+@dataclass(frozen=True)
+class Case:
+    """One workload."""
 
-    def __init__(self, work: Workload, device: str, threads: int) -> None:
-        """Load a workload."""
-        self._workers = Workers(device, threads)
-        self._grid = work.voxel_grid(self._workers)
-        self._free = FreeCells.none(self._workers)
-        self._steps = work.steps()
-        self._batch = work.batch(self._workers)
-        self._pass = TrainingPass(
-            self._batch.count,
-            self._grid.values.shape[0],
-            "clamped",
-            "none",
-            "none",
-            self._workers,
+    rays: Rays
+    grid: int
+    scene: Scene = "dense"
+    scaled: bool = True
+
+    def __str__(self) -> str:
+        """In words."""
+        scaling = "scaled" if self.scaled else "not scaled"
+        return f"{self.rays} rays, {self.grid}^3, {self.scene}, {scaling}"
+
+    def workload(self, n_rays: int, n_steps: int) -> Workload:
+        """Make it."""
+        return make_workload(
+            self.rays, self.grid, n_rays, n_steps, scene=self.scene, scaled=self.scaled
         )
 
-    def __call__(self) -> None:
-        """Forward, loss and adjoint into a zeroed gradient."""
-        self.zero()
-        self._pass.run(self._grid, self._free, self._steps, self._batch)
 
-    def zero(self) -> None:
-        """The zeroing alone, of all nodes; in training, the optimiser zeroes what was touched."""
-        self._pass.gradients.rows.zero_()
-        self._pass.gradients.touched.zero_()
-
-    def gradient(self) -> np.ndarray:
-        """[X, Y, Z, 4]"""
-        return self._pass.gradients.rows.numpy().sum(axis=0).reshape(*self._grid.size, 4)
-
-    def rgb(self) -> np.ndarray:
-        """[n_rays, 3]"""
-        batch = self._batch
-        return render_rays(
-            self._grid,
-            self._free,
-            self._steps,
-            batch.origins,
-            batch.directions,
-            batch.offsets,
-            batch.background,
-            self._workers,
-        ).rgb.numpy()
-
-    def n_samples(self) -> int:
-        """Visited steps of the last call."""
-        return int(self._pass.n_samples.numpy().sum())
-
-    def scratch_bytes(self) -> int:
-        """All arrays of the training pass but the gradient."""
-        arrays = [*vars(self._pass).values(), self._pass.gradients.touched]
-        return sum(array.capacity for array in arrays if isinstance(array, wp.array))
+def make_cases(grids: Sequence[int]) -> list[Case]:
+    """Every grid once, and on the last everything else once."""
+    last = grids[-1]
+    return [
+        *(Case("random", grid) for grid in grids),
+        Case("patches", last),
+        Case("random", last, scene="sphere"),
+        Case("random", last, scaled=False),
+    ]
 
 
-def check(ours: WarpStep, theirs: TorchPipeline) -> dict[str, float]:
-    """Greatest differences of colours and gradient, as shares of the largest value.
+def check(runs: dict[tuple[str, int], Candidate]) -> dict[str, dict[str, float]]:
+    """Run all, and compare them with the first.
+
+    Args:
+        runs: By name and number of threads.
+
+    Returns:
+        For each, the greatest differences in colours and gradient, as shares of the largest value.
 
     Raises:
-        SystemExit: The two do not compute the same.
+        SystemExit: One does not compute the same.
     """
-    ours()
-    rgb = theirs.render().detach().cpu().numpy()
-    gradient = theirs.training_step()[0].permute(1, 2, 3, 0).cpu().numpy()
-    differences = {
-        "rgb": float(np.abs(ours.rgb() - rgb).max() / np.abs(rgb).max()),
-        "gradient": float(np.abs(ours.gradient() - gradient).max() / np.abs(gradient).max()),
-    }
-    for what, difference in differences.items():
-        if not difference < TOLERANCE:
-            raise SystemExit(
-                f"throughput: the two sides differ in {what} by {difference:.1e} of the largest "
-                f"value (allowed: {TOLERANCE}); there is nothing to time."
-            )
+    expected: dict[str, np.ndarray] = {}
+    differences: dict[str, dict[str, float]] = {}
+    for (name, threads), run in runs.items():
+        run.step()
+        run.step()  # a gradient that is not zeroed would show
+        found = {"rgb": run.rgb(), "gradient": run.gradient()}
+        expected = expected or {what: values.copy() for what, values in found.items()}
+        by_value = differences[f"{name}, {threads} threads"] = {}
+        for what, values in found.items():
+            largest = np.abs(expected[what]).max()
+            difference = by_value[what] = float(np.abs(values - expected[what]).max() / largest)
+            if not difference < TOLERANCE:
+                raise SystemExit(
+                    f"throughput: {name} on {threads} threads differs in {what} by "
+                    f"{difference:.1e} of the largest value (allowed: {TOLERANCE}); there is "
+                    "nothing to time."
+                )
     return differences
 
 
-class Case:
-    """Both sides of one workload."""
+def race(runs: dict[tuple[str, int], Candidate], rounds: int, device: str) -> list[dict]:
+    """Seconds of each run, in each round."""
+    stopwatch = Stopwatch(device)
+    order = list(runs)
+    seconds = []
+    for turn in range(rounds):
+        first = turn % len(order)
+        turns = order[first:] + order[:first]
+        if turn % 2:
+            turns.reverse()
+        seconds.append({key: stopwatch.better_of_two(runs[key].step) for key in turns})
+    return seconds
 
-    def __init__(
-        self, rays: Rays, grid: int, threads: int, args: argparse.Namespace, stopwatch: Stopwatch
-    ) -> None:
-        """Load, check and choose."""
-        self._stopwatch = stopwatch
-        work = make_workload(rays, grid, args.rays, args.steps)
-        self._ours = WarpStep(work, args.device, threads)
-        self._theirs = fastest_by_threads(work, True, threads, args.device, stopwatch.seconds)
-        self._rounds: list[dict[str, float]] = []
-        self._case = {
-            "rays": rays,
-            "grid": grid,
+
+def summarise(
+    seconds: list[dict[tuple[str, int], float]], threads: int, n_samples: int
+) -> dict[str, dict[str, Any]]:
+    """For each candidate, what it needs with up to that many threads."""
+    names = dict.fromkeys(name for name, _ in seconds[0])
+    best = {
+        name: [min(s for (n, t), s in r.items() if n == name and t <= threads) for r in seconds]
+        for name in names
+    }
+    return {
+        name: {
+            "ms": median_interval(1e3 * s for s in best[name]),
+            "ns_per_sample": median_interval(1e9 * s / n_samples for s in best[name]),
+            "over_warpnerf": median_interval(
+                s / ours for s, ours in zip(best[name], best[OURS], strict=True)
+            ),
+            "over_one_thread": median_interval(
+                r[name, min(t for _, t in r)] / s for r, s in zip(seconds, best[name], strict=True)
+            ),
+        }
+        for name in names
+    }
+
+
+def run_case(
+    case: Case,
+    found: dict[str, Load],
+    args: argparse.Namespace,
+    machines: dict[int, roofline.Machine],
+) -> dict[str, Any]:
+    """Load, check, time and describe one case."""
+    work = case.workload(args.rays, args.steps)
+    needed = roofline.needs(work)
+    print(f"\n{case}: {needed.n_samples} samples")
+    runs = {(n, t): load(work, t, args.device) for n, load in found.items() for t in args.threads}
+    differences = check(runs)
+    seconds = race(runs, args.rounds, args.device)
+    rows = []
+    for threads in args.threads:
+        row: dict[str, Any] = {
             "threads": threads,
-            "differences": [check(self._ours, theirs) for theirs in self._theirs],
-            "n_samples": self._ours.n_samples(),
-            "torch_choices": [asdict(theirs.choices) for theirs in self._theirs],
+            "candidates": summarise(seconds, threads, needed.n_samples),
         }
+        if threads in machines:
+            bound = roofline.bounds(work, needed, machines[threads])
+            row["bounds_ms"] = {key: 1e3 * value for key, value in asdict(bound).items()}
+            row["least_ms"] = 1e3 * bound.least
+        rows.append(row)
+        print_row(row)
+    return {
+        "name": str(case),
+        **asdict(case),
+        **asdict(needed),
+        "differences": differences,
+        "rows": rows,
+    }
 
-    def round(self) -> None:
-        """Time each side, in alternating order."""
-        sides: list[tuple[str, Callable[[], object]]] = [("warpnerf", self._ours)]
-        for theirs in self._theirs:
-            sides.append((f"torch {theirs.choices.threads}", theirs.training_step))
-        if len(self._rounds) % 2:
-            sides.reverse()
-        # The better of two in a row: the first finds the caches, and the cores, as the other
-        # side left them.
-        times = {
-            name: min(self._stopwatch.seconds(side), self._stopwatch.seconds(side))
-            for name, side in sides
-        }
-        times["torch"] = min(times[name] for name, _ in sides if name != "warpnerf")
-        times["zero"] = self._stopwatch.seconds(self._ours.zero)
-        self._rounds.append(times)
 
-    def record(self) -> dict[str, Any]:
-        """Medians and quartiles of the rounds."""
-        n = self._case["n_samples"]
-        ours = [r["warpnerf"] for r in self._rounds]
-        return {
-            **self._case,
-            "rounds": len(self._rounds),
-            "warpnerf_ms": quartiles([1e3 * t for t in ours]),
-            "warpnerf_zeroing_ms": quartiles([1e3 * r["zero"] for r in self._rounds]),
-            "torch_ms": quartiles([1e3 * r["torch"] for r in self._rounds]),
-            "torch_ms_by_threads": {
-                theirs.choices.threads: quartiles(
-                    [1e3 * r[f"torch {theirs.choices.threads}"] for r in self._rounds]
-                )
-                for theirs in self._theirs
-            },
-            "ratio": quartiles([r["torch"] / r["warpnerf"] for r in self._rounds]),
-            "warpnerf_ns_per_sample": quartiles([1e9 * t / n for t in ours]),
-        }
+def print_row(row: dict[str, Any]) -> None:
+    """One number of threads of one case, a line each candidate."""
+    print(
+        f"  {'threads: ' + str(row['threads']):16s}{'ms':22s}over warpnerf         times one thread"
+    )
+    for name, figures in row["candidates"].items():
+        print(
+            f"  {name:16s}{show(figures['ms'], 1):22s}{show(figures['over_warpnerf'], 2):22s}"
+            f"{show(figures['over_one_thread'], 2)}",
+            flush=True,
+        )
+
+
+def print_summary(records: list[dict[str, Any]]) -> None:
+    """The medians again, all cases under each other; and how far warpnerf is from the bounds."""
+    names = list(records[0]["rows"][0]["candidates"])
+    print("\nmedian ms of warpnerf, and how many times as long the others take\n")
+    print(f"{'':38s}threads" + "".join(f"{name:>15s}" for name in names))
+    for record in records:
+        for row in record["rows"]:
+            line = f"{record['name']:38s}{row['threads']:7d}"
+            for name, figures in row["candidates"].items():
+                if name == OURS:
+                    line += f"{figures['ms']['median']:15.1f}"
+                else:
+                    line += f"{figures['over_warpnerf']['median']:15.2f}"
+            print(line)
+    if "bounds_ms" not in records[0]["rows"][0]:
+        return
+    print("\nwarpnerf beside what the machine could do (see roofline.py), ms\n")
+    columns = ("arithmetic", "traffic", "walk", "cached")
+    head = "".join(f"{column:>12s}" for column in ("warpnerf", *columns, "over bound"))
+    print(f"{'':38s}threads{head}")
+    for record in records:
+        for row in record["rows"]:
+            ours = row["candidates"][OURS]["ms"]["median"]
+            print(
+                f"{record['name']:38s}{row['threads']:7d}{ours:12.1f}"
+                + "".join(f"{row['bounds_ms'][column]:12.1f}" for column in columns)
+                + f"{ours / row['least_ms']:12.1f}"
+            )
 
 
 def memory(grid: int, args: argparse.Namespace) -> list[dict[str, int]]:
@@ -183,64 +234,15 @@ def memory(grid: int, args: argparse.Namespace) -> list[dict[str, int]]:
     rows = []
     for n_steps in (args.steps // 2, args.steps, 2 * args.steps):
         work = make_workload("inside", grid, args.rays, n_steps)
-        ours = WarpStep(work, args.device, args.threads[-1])
-        ours()
-        seconds = Stopwatch(args.device).seconds
-        theirs = fastest_by_threads(work, True, 1, args.device, seconds, rounds=1)[0]
+        theirs = torch_eager.fastest(work, 1, args.device, rounds=1)
         rows.append(
             {
                 "n_steps": n_steps,
-                "n_samples": ours.n_samples(),
-                "warpnerf_bytes": ours.scratch_bytes(),
+                "n_samples": len(work.origins) * n_steps,
+                "warpnerf_bytes": WarpStep(work, args.threads[-1], args.device).scratch_bytes(),
                 "torch_bytes": theirs.saved_bytes(),
             }
         )
-    return rows
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--device", default="cpu", help="cpu, cuda:0")
-    parser.add_argument("--grids", type=int, nargs="+", default=[64, 160], help="nodes per axis")
-    parser.add_argument(
-        "--threads",
-        type=int,
-        nargs="+",
-        default=sorted({1, min(2, os.cpu_count() or 1)}),
-        help="CPU threads of both sides",
-    )
-    parser.add_argument("--rays", type=int, default=4096)
-    parser.add_argument("--steps", type=int, default=256, help="per ray")
-    parser.add_argument("--rounds", type=int, default=15)
-    parser.add_argument("--output", type=Path, help="where the record goes")
-    args = parser.parse_args()
-    if args.device.startswith("cuda"):
-        args.threads = [1]
-
-    stopwatch = Stopwatch(args.device)
-    kinds: tuple[Rays, ...] = ("inside", "crossing")
-    cases = [
-        Case(rays, grid, threads, args, stopwatch)
-        for grid in args.grids
-        for rays in kinds
-        for threads in args.threads
-    ]
-    for _ in range(args.rounds):
-        for case in cases:
-            case.round()
-    records = [case.record() for case in cases]
-    print(f"{args.rays} rays x {args.steps} steps, {args.rounds} rounds; median [quartiles]\n")
-    print(
-        "grid  rays      threads   samples    "
-        f"{'warpnerf ms':21s}  {'torch ms':21s}  torch / warpnerf"
-    )
-    for r in records:
-        print(
-            f"{r['grid']:4d}  {r['rays']:8s}  {r['threads']:7d}  {r['n_samples']:8d}    "
-            f"{_show(r['warpnerf_ms'], 1):21s}  {_show(r['torch_ms'], 1):21s}  "
-            f"{_show(r['ratio'], 2)}"
-        )
-    rows = memory(args.grids[0], args)
     print("\nmemory of a step besides grid and gradient (torch: held between the passes)\n")
     print("steps    samples    warpnerf MB    torch MB")
     for row in rows:
@@ -248,21 +250,59 @@ def main() -> None:
             f"{row['n_steps']:5d}  {row['n_samples']:9d}    {row['warpnerf_bytes'] / 1e6:11.2f}"
             f"    {row['torch_bytes'] / 1e6:8.1f}"
         )
+    return rows
+
+
+def main() -> None:
+    parser = options(__doc__)
+    parser.add_argument(
+        "--grids", type=int, nargs="+", default=[64, 128, 160], help="nodes per axis"
+    )
+    parser.add_argument(
+        "--threads", type=int, nargs="+", default=default_threads(), help="CPU threads, from 1 up"
+    )
+    parser.add_argument(
+        "--without", nargs="+", default=[], choices=list(candidates.MODULES)[1:], metavar="NAME"
+    )
+    parser.add_argument("--rays", type=int, default=4096)
+    parser.add_argument("--steps", type=int, default=256, help="per ray")
+    parser.add_argument("--rounds", type=int, default=15)
+    args = parser.parse_args()
+    on_cuda = args.device.startswith("cuda")
+    if on_cuda:
+        args.threads = [1]
+
+    found, missing = candidates.find(args.device)
+    missing |= {name: "not wanted" for name in args.without if found.pop(name, None)}
+    print(
+        f"{args.rays} rays x {args.steps} steps, {args.rounds} rounds; median [95 % interval]\n"
+        f"compared: {', '.join(found)}"
+    )
+    for name, reason in missing.items():
+        print(f"left out: {name}, {reason}")
+    machines = {} if on_cuda else {t: roofline.measure(t, args.grids) for t in args.threads}
+    for measured in machines.values():
+        print(roofline.describe(measured))
+    records = []
+    for case in make_cases(args.grids):
+        records.append(run_case(case, found, args, machines))
+        gc.collect()
+    print_summary(records)
     record = {
         "benchmark": "throughput",
         "machine": machine(args.device, max(args.threads)),
         "n_rays": args.rays,
         "n_steps": args.steps,
-        "quantiles": [0.25, 0.5, 0.75],
+        "rounds": args.rounds,
+        "left_out": missing,
+        "roofline": [asdict(measured) for measured in machines.values()],
+        "operations_per_sample": roofline.OPERATIONS,
         "cases": records,
-        "memory": rows,
+        "memory": memory(args.grids[0], args),
     }
-    print(f"\nrecord: {write_record(record, args.output, 'throughput', args.device)}")
-
-
-def _show(three: tuple[float, float, float], digits: int) -> str:
-    low, middle, high = three
-    return f"{middle:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+    path = write_record(record, args.output, "throughput", args.device)
+    print(f"\nrecord: {path}")
+    print(plot_throughput(record, path.with_suffix(".png")))
 
 
 if __name__ == "__main__":

@@ -1,27 +1,19 @@
-"""What the benchmarks render and how they time it: rays, a random grid, the machine, medians.
+"""What the benchmarks render: rays through a voxel grid, and the colours they should see.
 
-Nothing here is measured; see gradient_scaling.py and throughput.py.
+Nothing here is measured; measuring.py keeps the time.
 """
 
 from __future__ import annotations
 
-import datetime
-import json
 import math
-import os
-import platform
-import sys
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import warp as wp
 from warpnerf_kernels.types import real, vec3, vec4
 
-from warpnerf.grid import VoxelGrid
+from warpnerf.grid import FreeCells, VoxelGrid
 from warpnerf.parallel import Workers
 from warpnerf.rays import RayBatch
 from warpnerf.render import Steps
@@ -31,19 +23,35 @@ BOX = np.ones(3)
 DENSITY_SHIFT = -1.0
 """Of a grid of standard normal raw values: half of the light crosses the box."""
 INSIDE_LENGTH = 1.5
-"""What of a ray is sampled, all of it in the box, scene units."""
+"""What of a ray is sampled where all of it lies in the box, scene units."""
 CAMERA_DISTANCE = 1.6
 """Of the cameras of crossing rays from the centre, scene units."""
+PATCH = 8
+"""Edge of a patch, pixels."""
+PIXEL = 0.002
+"""Angle from a pixel to the next: an image 400 pixels wide sees 44 degrees."""
+SPHERE_RADIUS = 0.6
+"""Of the solid sphere, scene units: a ninth of the box."""
+SPHERE_DENSITY = 40.0
+"""Mean raw density in the sphere: half of the light passes one or two of the usual steps."""
+EMPTY_DENSITY = -15.0
+"""Raw density around the sphere: no light is lost."""
+ALPHA_MIN = 1e-2
+"""A cell is free where no step is more opaque; as in training."""
 
-Rays = Literal["inside", "crossing"]
+Rays = Literal["inside", "random", "patches"]
+Scene = Literal["dense", "sphere"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Workload:
-    """Rays through a grid and what they should see, as arrays that both sides load."""
+    """Rays through a grid and what they should see, as arrays that every candidate loads."""
 
     values: np.ndarray
     """[X, Y, Z, 4] float32 raw density, raw rgb."""
+    free: np.ndarray
+    """[MX, MY, MZ] uint8, over the box: cells from each to the nearest needing samples, diagonal
+    neighbours being one apart; 0 there. Nobody has to look: free cells hold no density."""
     origins: np.ndarray
     """[n_rays, 3] float32, scene units."""
     directions: np.ndarray
@@ -54,20 +62,28 @@ class Workload:
     """Steps along each ray, from near = 0 on."""
     step: float
     """Their length, scene units."""
+    scaled: bool = True
+    """Whether gradients are scaled by distance: min(1, (t / content_distance)^2)."""
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """rgb in [0, 1]."""
     content_distance: float = 1.0
     """Scene units; most rays have samples on both sides of it."""
 
+    @property
+    def skips(self) -> bool:
+        """Whether anything is free."""
+        return bool(self.free.any())
+
     def voxel_grid(self, workers: Workers) -> VoxelGrid:
         """The grid as warpnerf takes it."""
-        size = self.values.shape[:3]
-        return VoxelGrid(
-            values=wp.array(self.values.reshape(-1, 4), dtype=vec4, device=workers.device),
+        return voxel_grid(self.values, workers)
+
+    def free_cells(self, workers: Workers) -> FreeCells:
+        """The free cells as warpnerf takes them."""
+        size = self.free.shape
+        return FreeCells(
+            distance=wp.array(self.free.ravel(), dtype=wp.uint8, device=workers.device),
             size=(size[0], size[1], size[2]),
-            box_min=-BOX,
-            box_max=BOX,
-            density_shift=DENSITY_SHIFT,
         )
 
     def steps(self) -> Steps:
@@ -85,126 +101,115 @@ class Workload:
             target_rgb=wp.array(self.target_rgb, dtype=vec3, device=workers.device),
         )
 
+    def positions(self) -> tuple[np.ndarray, np.ndarray]:
+        """All steps of all rays in scene units, [n_rays, n_steps, 3] float32, and which of them
+        need sampling, [n_rays, n_steps].
+        """
+        t = ((np.arange(self.n_steps) + 0.5) * self.step).astype(np.float32)
+        q = self.origins[:, None] + t[:, None] * self.directions[:, None]
+        needed = (np.abs(q) <= 1.0).all(axis=2)
+        cells = np.array(self.free.shape)
+        i, j, k = np.clip(((q + 1.0) * (0.5 * cells)).astype(int), 0, cells - 1).transpose(2, 0, 1)
+        return q, needed & (self.free[i, j, k] == 0)
 
-def make_workload(rays: Rays, grid: int, n_rays: int, n_steps: int, seed: int = 0) -> Workload:
-    """Random rays through a grid^3 of standard normal raw values.
+
+def voxel_grid(values: np.ndarray, workers: Workers) -> VoxelGrid:
+    """Raw values [X, Y, Z, 4] over the box as warpnerf takes them."""
+    size = values.shape[:3]
+    return VoxelGrid(
+        values=wp.array(values.reshape(-1, 4), dtype=vec4, device=workers.device),
+        size=(size[0], size[1], size[2]),
+        box_min=-BOX,
+        box_max=BOX,
+        density_shift=DENSITY_SHIFT,
+    )
+
+
+def make_workload(
+    rays: Rays,
+    grid: int,
+    n_rays: int,
+    n_steps: int,
+    *,
+    scene: Scene = "dense",
+    scaled: bool = True,
+    seed: int = 0,
+) -> Workload:
+    """Rays through a grid^3 of raw values.
 
     Args:
-        rays: inside: cameras in the box, all n_steps samples of a ray too. crossing: cameras on a
-            sphere around the box look into it, and the steps reach to its far corner.
+        rays: inside: cameras in the box, all n_steps samples of a ray too. random: single pixels of
+            cameras on a sphere around the box that look into it; the steps reach to its far corner.
+            patches: the same, each camera with a patch of 8 x 8 neighbouring pixels.
         grid: Nodes along each axis.
         n_rays: Number of rays.
         n_steps: Steps along each.
+        scene: dense: standard normal raw values everywhere. sphere: a solid sphere in empty space.
+        scaled: Whether gradients are scaled by distance.
         seed: Of all that is random.
     """
     rng = np.random.default_rng(seed)
     reach = INSIDE_LENGTH if rays == "inside" else CAMERA_DISTANCE + math.sqrt(3.0)
     step = reach / n_steps
-    many = 2 * n_rays + 64
+    group = PATCH * PATCH if rays == "patches" else 1
+    many = 2 * -(-n_rays // group) + 64
     if rays == "inside":
-        directions = _unit(rng.normal(size=(many, 3)))
+        directions = _unit(rng.normal(size=(many, 1, 3)))
         # Uniform among the places from which the whole length fits into the box.
         room = 2.0 - 1e-3 - np.abs(directions) * reach
         first = np.where(directions < 0, 1.0 - 5e-4 - room, -1.0 + 5e-4)
-        origins = first + rng.uniform(size=(many, 3)) * room
+        origins = first + rng.uniform(size=room.shape) * room
     else:
-        origins = CAMERA_DISTANCE * _unit(rng.normal(size=(many, 3)))
-        directions = _unit(rng.uniform(-0.6, 0.6, size=(many, 3)) - origins)
-    # Which side of the box's face a sample lies on must not hang on rounding: the two sides round
-    # differently, and a sample more or less is no error of either.
+        origins = CAMERA_DISTANCE * _unit(rng.normal(size=(many, 1, 3)))
+        directions = _unit(rng.uniform(-0.6, 0.6, size=origins.shape) - origins)
+        if rays == "patches":
+            directions = _patch(directions, _unit(rng.normal(size=origins.shape)))
+        origins = np.broadcast_to(origins, directions.shape)
+    # Which side of the box's face a sample lies on must not hang on rounding: candidates round
+    # differently, and a sample more or less is no error of any.
     origins, directions = origins.astype(np.float32), directions.astype(np.float32)
     t = (np.arange(n_steps) + 0.5) * step
-    q = origins[:, None].astype(float) + t[:, None] * directions[:, None]
-    clear = (np.abs(np.abs(q) - 1.0) > 1e-5).all(axis=(1, 2))
+    q = origins[:, :, None].astype(float) + t[:, None] * directions[:, :, None]
+    clear = (np.abs(np.abs(q) - 1.0) > 1e-5).all(axis=(1, 2, 3))
+    values = rng.normal(size=(grid, grid, grid, 4)).astype(np.float32)
+    free = np.zeros((1, 1, 1), np.uint8)
+    if scene == "sphere":
+        values[..., 0] = np.where(_in_sphere(grid), SPHERE_DENSITY + values[..., 0], EMPTY_DENSITY)
+        free = free_distances(values, step)
     return Workload(
-        values=rng.normal(size=(grid, grid, grid, 4)).astype(np.float32),
-        origins=origins[clear][:n_rays],
-        directions=directions[clear][:n_rays],
+        values=values,
+        free=free,
+        origins=origins[clear].reshape(-1, 3)[:n_rays],
+        directions=directions[clear].reshape(-1, 3)[:n_rays],
         target_rgb=rng.uniform(size=(n_rays, 3)).astype(np.float32),
         n_steps=n_steps,
         step=step,
+        scaled=scaled,
     )
+
+
+def free_distances(values: np.ndarray, step: float) -> np.ndarray:
+    """Distances to the nearest cell that needs sampling, as in Workload.free."""
+    workers = Workers("cpu", 1)
+    march = Steps(near=0.0, far=1e30, step=step).struct()
+    free = FreeCells.of(voxel_grid(values, workers), workers, march, ALPHA_MIN)
+    return free.distance.numpy().reshape(free.size)
+
+
+def _patch(centre: np.ndarray, roll: np.ndarray) -> np.ndarray:
+    """Directions of a patch's pixels around its centre [n, 1, 3]: [n, 64, 3]; roll turns it."""
+    right = _unit(np.cross(centre, roll))
+    up = np.cross(right, centre)
+    at = PIXEL * (np.arange(PATCH) - 0.5 * (PATCH - 1))
+    x, y = (a.reshape(1, -1, 1) for a in np.meshgrid(at, at))
+    return _unit(centre + x * right + y * up)
+
+
+def _in_sphere(grid: int) -> np.ndarray:
+    """Which nodes of a grid^3 over the box lie in the sphere, [X, Y, Z]."""
+    squares = np.linspace(-1.0, 1.0, grid) ** 2
+    return squares[:, None, None] + squares[:, None] + squares < SPHERE_RADIUS**2
 
 
 def _unit(x: np.ndarray) -> np.ndarray:
     return x / np.linalg.norm(x, axis=-1, keepdims=True)
-
-
-class Stopwatch:
-    """Times calls on a device; on CUDA many in a row, so that launching hides behind working."""
-
-    def __init__(self, device: str) -> None:
-        """For a device as Warp names it."""
-        self._cuda = device.startswith("cuda")
-        self._calls = 20 if self._cuda else 1
-
-    def seconds(self, call: Callable[[], object]) -> float:
-        """Of one call."""
-        self._synchronize()
-        begin = time.perf_counter()
-        for _ in range(self._calls):
-            call()
-        self._synchronize()
-        return (time.perf_counter() - begin) / self._calls
-
-    def _synchronize(self) -> None:
-        if self._cuda:
-            wp.synchronize()  # the whole device: torch's stream too
-
-
-def quartiles(values: list[float]) -> tuple[float, float, float]:
-    """Lower quartile, median, upper quartile."""
-    low, middle, high = np.quantile(values, [0.25, 0.5, 0.75])
-    return float(low), float(middle), float(high)
-
-
-def median_interval(values: list[float]) -> tuple[float, float, float]:
-    """Median and its 95 % interval, from order statistics: no assumption on the distribution.
-
-    Returns:
-        Lower end, median, upper end. With fewer than 6 values the ends are the least and greatest,
-        which cover less than 95 %.
-    """
-    ordered = sorted(values)
-    n = len(ordered)
-    low = max(0, math.floor((n - 1.96 * math.sqrt(n)) / 2.0) - 1)
-    return ordered[low], float(np.median(ordered)), ordered[n - 1 - low]
-
-
-def machine(device: str, threads: int) -> dict[str, Any]:
-    """What a record says about where it was made."""
-    import torch
-
-    return {
-        "cpu": _cpu_model(),
-        "cores": os.cpu_count(),
-        "threads": threads,
-        "device": device,
-        "gpu": wp.get_device(device).name if device.startswith("cuda") else None,
-        "load_average": os.getloadavg() if hasattr(os, "getloadavg") else None,
-        "python": platform.python_version(),
-        "warp": wp.config.version,
-        "torch": torch.__version__,
-        "system": platform.platform(),
-        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "command": " ".join(["python", *sys.argv]),
-    }
-
-
-def _cpu_model() -> str:
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()
-
-
-def write_record(record: dict[str, Any], output: Path | None, name: str, device: str) -> Path:
-    """Write a record to `output`, or else to results/<name>_<device>.json beside this file."""
-    if output is None:
-        output = Path(__file__).parent / "results" / f"{name}_{device.replace(':', '')}.json"
-    output.parent.mkdir(parents=True, exist_ok=True)
-    output.write_text(json.dumps(record, indent=2) + "\n")
-    return output

@@ -1,24 +1,36 @@
-"""The benchmarks run, check their two sides against each other, and write complete records."""
+"""The benchmarks run, check their sides against each other, and write complete records."""
 
+import dataclasses
 import json
+import math
+import os
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
+import pytest
+
 ROOT = Path(__file__).parent.parent
+sys.path.insert(0, str(ROOT / "benchmarks"))
+
+import candidates  # noqa: E402
+import roofline  # noqa: E402
+import throughput  # noqa: E402
+import workload  # noqa: E402
+from candidates.warpnerf_step import WarpStep  # noqa: E402
 
 
 def run(script, output, *options):
     command = [sys.executable, str(ROOT / "benchmarks" / script), "--output", str(output)]
-    # In the folder that holds both packages, whether they are installed or not.
-    code = "import runpy, sys; sys.path[:0] = sys.argv.pop(1).split(':'); sys.argv = sys.argv[1:]; "
-    code += "runpy.run_path(sys.argv[0], run_name='__main__')"
-    path = f"{ROOT / 'benchmarks'}:{ROOT}:{ROOT / 'kernels'}"
+    # The packages beside the benchmarks, whether any are installed or not.
+    path = os.pathsep.join([str(ROOT), str(ROOT / "kernels")])
     done = subprocess.run(
-        [sys.executable, "-c", code, path, *command[1:], *options],
+        [*command, *options],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=240,
+        env={**os.environ, "PYTHONPATH": path},
     )
     assert done.returncode == 0, done.stderr
     record = json.loads(output.read_text())
@@ -26,12 +38,16 @@ def run(script, output, *options):
     for field in ("cpu", "cores", "threads", "device", "python", "warp", "torch", "date"):
         assert record["machine"][field]
     assert script in record["machine"]["command"]
-    return record
+    return record, done.stdout
+
+
+def is_interval(figures):
+    return 0 < figures["low"] <= figures["median"] <= figures["high"]
 
 
 def test_gradient_scaling(tmp_path):
     options = ("--pairs", "2", "--repeats", "1", "--grid", "8")
-    record = run("gradient_scaling.py", tmp_path / "record.json", *options)
+    record, _ = run("gradient_scaling.py", tmp_path / "record.json", *options)
     assert record["n_samples"] == 300_000
     assert record["grid"] == 8
     assert [result["name"] for result in record["results"]] == [
@@ -51,18 +67,149 @@ def test_gradient_scaling(tmp_path):
 
 
 def test_throughput(tmp_path):
-    options = ("--grids", "8", "--rays", "64", "--steps", "16", "--rounds", "2")
-    record = run("throughput.py", tmp_path / "record.json", "--threads", "1", "2", *options)
-    assert len(record["cases"]) == 4
+    options = ("--grids", "8", "12", "--rays", "64", "--steps", "16", "--rounds", "2")
+    options += ("--threads", "1", "2", "--without", "torch.compile")
+    record, printed = run("throughput.py", tmp_path / "record.json", *options)
+    compared = {"warpnerf", "torch"} | (
+        set(candidates.MODULES) - {"torch.compile"} - set(record["left_out"])
+    )
+    assert "torch.compile" in record["left_out"]
+    for name, reason in record["left_out"].items():
+        assert f"left out: {name}, {reason}" in printed
+    assert [
+        (case["rays"], case["grid"], case["scene"], case["scaled"]) for case in record["cases"]
+    ] == [
+        ("random", 8, "dense", True),
+        ("random", 12, "dense", True),
+        ("patches", 12, "dense", True),
+        ("random", 12, "sphere", True),
+        ("random", 12, "dense", False),
+    ]
     for case in record["cases"]:
-        assert case["rounds"] == 2
         assert 0 < case["n_samples"] <= 64 * 16
-        assert [choice["threads"] for choice in case["torch_choices"]] == [1, 2][: case["threads"]]
-        assert all(max(d.values()) < 1e-4 for d in case["differences"])
-        for field in ("warpnerf_ms", "warpnerf_zeroing_ms", "torch_ms", "ratio"):
-            low, middle, high = case[field]
-            assert 0 < low <= middle <= high
+        assert set(case["differences"]) == {
+            f"{name}, {threads} threads" for name in compared for threads in (1, 2)
+        }
+        assert all(max(d.values()) < 1e-4 for d in case["differences"].values())
+        assert [row["threads"] for row in case["rows"]] == [1, 2]
+        for row in case["rows"]:
+            assert set(row["candidates"]) == compared
+            for figures in row["candidates"].values():
+                assert all(is_interval(interval) for interval in figures.values())
+            assert row["candidates"]["warpnerf"]["over_warpnerf"]["median"] == 1.0
+            bounds = row["bounds_ms"]
+            assert 0 < row["least_ms"] == max(bounds["arithmetic"], bounds["traffic"])
     rows = record["memory"]
     assert [row["n_samples"] for row in rows] == [64 * 8, 64 * 16, 64 * 32]
     assert len({row["warpnerf_bytes"] for row in rows}) == 1
     assert rows[0]["torch_bytes"] < rows[1]["torch_bytes"] < rows[2]["torch_bytes"]
+    plot = tmp_path / "record.png"
+    assert plot.exists() == (f"plot: {plot}" in printed)
+    assert plot.exists() or "no plot: matplotlib is not installed" in printed
+
+
+def test_rendering(tmp_path):
+    options = ("--grid", "24", "--pixels", "16", "--rounds", "2", "--threads", "2")
+    record, _ = run("rendering.py", tmp_path / "record.json", *options)
+    (row,) = record["rows"]
+    assert row["grid"] == [24, 24, 24] and 0.3 < row["free"] < 1
+    assert row["difference"] < 2e-3
+    assert is_interval(row["torch_over_warpnerf"])
+    for name in ("warpnerf", "torch"):
+        assert 0 < row[name]["n_samples"] < 16 * 16 * 80
+        for key in ("ms", "rays_per_second", "samples_per_second"):
+            assert is_interval(row[name][key])
+
+
+def test_compiled_torch_agrees():
+    """Apart from the rest, for it takes long to compile."""
+    load = candidates.find("cpu")[0].get("torch.compile")
+    if load is None:
+        assert candidates.find("cpu")[1]["torch.compile"] == "there is no C++ compiler"
+        return
+    work = workload.make_workload("random", 8, 16, 12, scene="sphere")
+    differences = throughput.check(
+        {("warpnerf", 2): WarpStep(work, 2, "cpu"), ("torch.compile", 1): load(work, 1, "cpu")}
+    )
+    assert set(differences) == {"warpnerf, 2 threads", "torch.compile, 1 threads"}
+
+
+class Wrong:
+    """A candidate that forgets to zero its gradient, or has another fault."""
+
+    def __init__(self, work, fault):
+        self._right = WarpStep(work, 1, "cpu")
+        self._fault = fault
+        self._steps = 0
+
+    def step(self):
+        self._right.step()
+        self._steps += 1
+
+    def gradient(self):
+        gradient = self._right.gradient().copy()
+        if self._fault == "not zeroed":
+            gradient *= self._steps
+        if self._fault == "one node":
+            gradient[tuple(np.argwhere(gradient)[0])] += 1e-3 * np.abs(gradient).max()
+        if self._fault == "not a number":
+            gradient[0, 0, 0, 0] = math.nan
+        return gradient
+
+    def rgb(self):
+        return self._right.rgb() + (1e-3 if self._fault == "rgb" else 0.0)
+
+
+@pytest.mark.parametrize("fault", ["not zeroed", "one node", "not a number", "rgb"])
+def test_who_computes_something_else_is_not_timed(fault):
+    work = workload.make_workload("random", 8, 64, 16)
+    runs = {("warpnerf", 1): WarpStep(work, 1, "cpu"), ("other", 1): Wrong(work, fault)}
+    with pytest.raises(SystemExit, match=r"other on 1 threads differs in (gradient|rgb)"):
+        throughput.check(runs)
+    throughput.check(runs | {("other", 1): Wrong(work, "none")})
+
+
+@pytest.mark.parametrize("rays", ["inside", "random", "patches"])
+def test_free_cells_change_nothing(rays):
+    work = workload.make_workload(rays, 32, 128, 48, scene="sphere")
+    assert 0.3 < (work.free > 0).mean() < 0.95
+    everywhere = dataclasses.replace(work, free=np.zeros((1, 1, 1), np.uint8))
+    assert work.skips and not everywhere.skips
+    assert work.positions()[1].sum() < 0.8 * everywhere.positions()[1].sum()
+    runs = [WarpStep(w, 2, "cpu") for w in (work, everywhere)]
+    for step in runs:
+        step.step()
+    # Where one lies on a cell's face is a matter of rounding.
+    assert runs[0].n_samples() == pytest.approx(work.positions()[1].sum(), rel=1e-2)
+    skipped, full = (step.gradient() for step in runs)
+    assert np.abs(full).max() > 1e-4
+    assert np.abs(skipped - full).max() < 1e-5 * np.abs(full).max()
+
+
+def test_patches_are_neighbouring_pixels_of_one_camera():
+    work = workload.make_workload("patches", 4, 128, 8)
+    for first in (0, 64):
+        origins = work.origins[first : first + 64]
+        assert (origins == origins[0]).all()
+        d = work.directions[first : first + 64].reshape(8, 8, 3).astype(float)
+        assert np.allclose(np.linalg.norm(d, axis=2), 1.0, atol=1e-6)
+        for step in (np.diff(d, axis=0), np.diff(d, axis=1)):
+            assert np.allclose(np.linalg.norm(step, axis=2), workload.PIXEL, rtol=1e-2)
+    assert (work.origins[0] != work.origins[64]).any()
+
+
+def test_needs_counts_lines():
+    """Against sets of lines, sample by sample."""
+    work = workload.make_workload("random", 9, 130, 20, scene="sphere")
+    q, needed = work.positions()
+    groups = {}
+    for ray, step in np.argwhere(needed):
+        i, j, k = np.minimum((q[ray, step].astype(float) + 1) * 4, 7).astype(int)
+        lines = groups.setdefault(ray // 64, set())
+        for corner in np.ndindex(2, 2, 2):
+            x, y, z = np.array([i, j, k]) + corner
+            lines.add(((x * 9 + y) * 9 + z) * 16 // 64)
+    needs = roofline.needs(work)
+    assert needs.n_samples == needed.sum() > 100
+    assert needs.lines == len(set().union(*groups.values()))
+    assert needs.lines_by_rays == sum(len(lines) for lines in groups.values()) > needs.lines
