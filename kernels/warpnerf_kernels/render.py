@@ -64,7 +64,7 @@ def render_forward_kernel(variant: Variant) -> wp.Kernel:
         offsets: wp.array(dtype=real),  # [n_rays] or [1], in [0, 1)
         background: wp.array(dtype=vec3),  # [n_rays] or [1], rgb in [0, 1]
         # scratch
-        capacity: int,  # of kept, for each worker
+        capacity: int,  # of kept, for each worker: 1 in packs, else 0; nothing is kept
         kept: wp.array(dtype=Kept),  # [n_workers * capacity]
         # out
         out_rgb: wp.array(dtype=vec3),  # [n_rays] with background
@@ -119,7 +119,7 @@ def render_backward_kernel(variant: Variant) -> wp.Kernel:
         adj_opacity: wp.array(dtype=real),  # [n_rays]
         adj_depth: wp.array(dtype=real),  # [n_rays]
         # scratch
-        capacity: int,  # of kept, for each worker
+        capacity: int,  # of kept, for each worker: 1 in packs, else 0; nothing is kept
         kept: wp.array(dtype=Kept),  # [n_workers * capacity]
         # out
         adj_values: wp.array2d(dtype=vec4),  # [n_workers, X * Y * Z], added to
