@@ -197,6 +197,12 @@ class Kernels:
 
     def backward(self, p: Problem, scaling: str = "none", jacobian: str = "none") -> Float64:
         """The gradient [X, Y, Z, 4] of the outputs' product with the problem's adjoints."""
+        return total_gradient(*self.backward_rows(p, scaling, jacobian)).reshape(p.raw.shape)
+
+    def backward_rows(
+        self, p: Problem, scaling: str = "none", jacobian: str = "none"
+    ) -> tuple[wp.array, wp.array]:
+        """The same in a row for each worker [n_workers, n_nodes], and the tiles' flags."""
         gradients = self.zeros((self.workers.count, p.raw[..., 0].size), self.types.vec4)
         touched = self.touched(*gradients.shape)
         variant = self.variant(p, scaling, jacobian)
@@ -214,7 +220,7 @@ class Kernels:
             gradients,
             touched,
         )
-        return total_gradient(gradients, touched).reshape(p.raw.shape)
+        return gradients, touched
 
     def touched(self, n_workers: int, n_nodes: int, value: int = 0) -> wp.array:
         """Flags of the tiles of nodes that have a gradient."""

@@ -102,6 +102,21 @@ def test_capacity_changes_nothing(packed: Kernels) -> None:
                 assert np.array_equal(gradient, in_one_slot[1])
 
 
+def test_workers_add_to_rows_of_their_own(packed: Kernels, on_cpu: None) -> None:
+    """The first row holds the gradient of the first half of the rays, and so on."""
+    p = make_problem(6, n_rays=20)
+    rows = Kernels("float32", "cpu", threads=2, packed=True).backward_rows(p)[0].numpy()
+    for row, mine in zip(rows, (np.arange(20) < 10, np.arange(20) >= 10), strict=True):
+        adjoints = {
+            "adj_rgb": p.adj_rgb * mine[:, None],
+            "adj_opacity": p.adj_opacity * mine,
+            "adj_depth": p.adj_depth * mine,
+        }
+        assert row.any()
+        expected = packed.backward(replace(p, **adjoints))
+        assert np.array_equal(row.reshape(p.raw.shape), expected)
+
+
 def test_limits_of_the_scaling(packed: Kernels) -> None:
     for seed in range(N_SEEDS):
         p = make_problem(seed)
@@ -122,18 +137,21 @@ def test_limits_of_the_scaling(packed: Kernels) -> None:
 
 
 def test_activations_over_their_whole_range(packed: Kernels) -> None:
-    """One sample in a grid of one value: opacity and colour are the activations themselves."""
+    """One sample in a uniform grid: opacity and colour are the activations themselves."""
     step = 0.25
     p = make_problem(0, n_rays=1, size=(2, 2, 2), origins=np.zeros((1, 3)))
     p = replace(p, background=np.zeros((1, 3)), density_shift=0.0)
     p = replace(p, steps=Steps(near=0.0, far=step, step=step))
-    for raw in [*np.linspace(-80.0, 80.0, 161), *np.linspace(-2.0, 2.0, 101)]:
+    far, wide = np.linspace(-500.0, 500.0, 21), np.linspace(-80.0, 80.0, 161)
+    thin = np.linspace(-4.0, -3.0, 41)  # an optical depth of 0.01, where formulas change
+    for raw in [*far, *wide, *thin, *np.linspace(-2.0, 2.0, 101)]:
         value = float(np.float32(raw))
-        out = packed.forward(replace(p, raw=np.full_like(p.raw, value)))
+        rgb = np.array([value, -value, 0.5 * value])
+        out = packed.forward(replace(p, raw=np.broadcast_to([value, *rgb], p.raw.shape)))
         opacity = -np.expm1(-step * np.logaddexp(0.0, value))
         np.testing.assert_allclose(out.opacity, opacity, rtol=4e-7, atol=6e-8)
-        colour = opacity / (1.0 + np.exp(-value))
-        np.testing.assert_allclose(out.rgb, np.full((1, 3), colour), rtol=8e-7, atol=6e-8)
+        colour = opacity / (1.0 + np.exp(-rgb))
+        np.testing.assert_allclose(out.rgb[0], colour, rtol=8e-7, atol=6e-8)
 
 
 def test_thin_media_keep_their_digits(packed: Kernels) -> None:

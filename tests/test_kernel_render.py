@@ -293,6 +293,22 @@ def test_a_sample_at_content_distance_keeps_its_gradient_exactly(kernels32: Kern
     assert np.array_equal(kernels32.backward(twice, "clamped"), 0.25 * plain)
 
 
+def test_nothing_flows_back_from_behind_an_opaque_wall(kernels32: Kernels) -> None:
+    """What lies behind is shed by subtraction: of its rounding, nothing may reach unlit nodes."""
+    for seed in range(N_SEEDS):
+        p = make_problem(seed, size=(9, 4, 4), density_scale=10.0)
+        raw = p.raw.astype(np.float32).astype(np.float64)
+        raw[..., 0] -= 4.0
+        raw[4, ..., 0] = 300.0
+        directions = unit(p.directions * [0.2, 0.2, 0.2] + [1.0, 0.0, 0.0])
+        p = replace(p, raw=raw, origins=0.3 * p.origins - [1.5, 0.0, 0.0], directions=directions)
+        through = replace(p, density_scale=1e-3)  # rays do get there
+        assert kernels32.backward(through)[6:].any()
+        gradient = kernels32.backward(p)
+        assert_close(gradient, oracle_gradient(p), 1e-5)
+        assert not gradient[6:].any()
+
+
 def test_float32_against_float64_on_300_000_samples(kernels64: Kernels, kernels32: Kernels) -> None:
     rng = np.random.default_rng(8)
     n_rays, n_steps = 1500, 200
