@@ -16,6 +16,8 @@ import tyro
 
 from warpnerf import __version__
 from warpnerf.checks import InputError
+from warpnerf.commands.progress import ProgressBar
+from warpnerf.commands.render import render_command
 from warpnerf.config import PRESETS, Scaling, TrainConfig
 from warpnerf.stop import Stopped, StopRequest, raise_when_asked
 
@@ -215,11 +217,11 @@ def _train(run: Run, scene: Scene, trainer: Trainer) -> int:
         print("compiling kernels (once; later runs start at once)", flush=True)
     with StopRequest() as stop:
         try:
-            with _reporter(trainer.config) as report:
+            with ProgressBar("first step") as bar:
 
                 def on_progress(progress: Progress) -> None:
                     run.log(progress)
-                    report(progress)
+                    bar.report(progress.fraction, _text(progress))
 
                 trainer.run(on_progress, run.save_checkpoint, lambda: stop.asked)
         except FloatingPointError as error:
@@ -246,7 +248,7 @@ def _train(run: Run, scene: Scene, trainer: Trainer) -> int:
         return stopped.exit_code
     print(
         f"wrote {run.folder}: field.safetensors, metrics.json, log.jsonl, config.json, and "
-        f"test/*.png (truth, rendering, depth from 0 red to {far:.3g} violet)"
+        f"test/*.png (truth, rendering, depth from 0 yellow to {far:.3g} blue)"
     )
     return 0
 
@@ -272,48 +274,6 @@ def _describe(scene: Scene, content_distance: float, config: TrainConfig) -> Non
 
 def _absolute(source: str) -> str:
     return source if source.startswith("builtin:") else str(Path(source).resolve())
-
-
-class _reporter:
-    """Progress as a bar on a terminal, as plain lines elsewhere."""
-
-    def __init__(self, config: TrainConfig) -> None:
-        self._config = config
-        self._lines_at = 0.0
-
-    def __enter__(self) -> Callable[[Progress], None]:
-        from rich.console import Console
-
-        console = Console()
-        self._bar = None
-        if not console.is_terminal:
-            return self._line
-        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-        self._bar = Progress(
-            TextColumn("{task.percentage:3.0f}%"),
-            BarColumn(),
-            TextColumn("{task.description}"),
-            TimeRemainingColumn(),
-            console=console,
-        )
-        self._bar.start()
-        self._task = self._bar.add_task("first step", total=1.0)
-        return self._draw
-
-    def __exit__(self, *error: object) -> None:
-        if self._bar is not None:
-            self._bar.stop()
-
-    def _draw(self, progress: Progress) -> None:
-        assert self._bar is not None
-        self._bar.update(self._task, completed=progress.fraction, description=_text(progress))
-
-    def _line(self, progress: Progress) -> None:
-        if progress.seconds >= self._lines_at or progress.fraction >= 1.0:
-            left = progress.seconds * (1.0 / max(progress.fraction, 1e-6) - 1.0)
-            print(f"{progress.fraction:4.0%}  {_text(progress)}  {left:.0f} s left", flush=True)
-            self._lines_at = progress.seconds + 5.0
 
 
 def _text(progress: Progress) -> str:
@@ -343,7 +303,7 @@ def main(arguments: list[str] | None = None) -> int:
         sys.stdout.reconfigure(errors="backslashreplace")  # file names may hold anything
     try:
         return tyro.extras.subcommand_cli_from_dict(
-            {"train": train_command, "eval": eval_command},
+            {"train": train_command, "eval": eval_command, "render": render_command},
             prog="warpnerf",
             description="Voxel-grid radiance fields from posed photographs, without floaters.",
             args=arguments,
