@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from warpnerf.camera import Camera
-from warpnerf.data import room
+from warpnerf.data import room, room_textures
 from warpnerf.data.raytrace import Ball, Box, Cylinder, Room
 from warpnerf.scene import Scene, View
 
@@ -99,7 +99,7 @@ def test_images_show_something(scene: Scene) -> None:
 def test_building_twice_gives_the_same() -> None:
     first = room.room_scene(downscale=5)
     room._tracer.cache_clear()
-    room._noise_table.cache_clear()
+    room_textures._noise_table.cache_clear()
     second = room.room_scene(downscale=5)
     assert first.content_distance == second.content_distance
     for a, b in zip(first.views, second.views, strict=True):

@@ -16,6 +16,7 @@ import tyro
 
 from warpnerf import __version__
 from warpnerf.checks import InputError
+from warpnerf.commands.demo import demo_command
 from warpnerf.commands.progress import ProgressBar
 from warpnerf.commands.render import render_command
 from warpnerf.config import PRESETS, Scaling, TrainConfig
@@ -303,7 +304,12 @@ def main(arguments: list[str] | None = None) -> int:
         sys.stdout.reconfigure(errors="backslashreplace")  # file names may hold anything
     try:
         return tyro.extras.subcommand_cli_from_dict(
-            {"train": train_command, "eval": eval_command, "render": render_command},
+            {
+                "demo": demo_command,
+                "train": train_command,
+                "eval": eval_command,
+                "render": render_command,
+            },
             prog="warpnerf",
             description="Voxel-grid radiance fields from posed photographs, without floaters.",
             args=arguments,
