@@ -17,6 +17,7 @@ import tyro
 from warpnerf import __version__
 from warpnerf.checks import InputError
 from warpnerf.commands.demo import demo_command
+from warpnerf.commands.inspect import inspect_command
 from warpnerf.commands.progress import ProgressBar
 from warpnerf.commands.render import render_command
 from warpnerf.config import PRESETS, Scaling, TrainConfig
@@ -306,6 +307,7 @@ def main(arguments: list[str] | None = None) -> int:
         return tyro.extras.subcommand_cli_from_dict(
             {
                 "demo": demo_command,
+                "inspect": inspect_command,
                 "train": train_command,
                 "eval": eval_command,
                 "render": render_command,

@@ -130,6 +130,8 @@ class Focus:
     """The content distance, scene units."""
     how: str
     """How they were found: the second half of a sentence."""
+    guessed: bool = False
+    """Whether the cameras look at no common point, and the distance is a guess."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -200,6 +202,7 @@ def find_focus(cameras: Sequence[Camera]) -> Focus:
         distance=spread,
         how=f"mean distance of the training cameras from their centre, because {reason}; "
         "set the content distance if you know it",
+        guessed=True,
     )
 
 

@@ -27,10 +27,10 @@ def demo_command(
     from warpnerf.video import video_file
 
     print(
-        "Space near a camera is crossed by many rays of that one camera. It gets more gradient than\n"
-        "it should, and fills with floaters. Two fields are trained on the same photographs, from\n"
-        f"the same seed, for {seconds:g} s each and with the near plane at 0: without and with each\n"
-        "sample's gradient scaled by its distance from the camera.",
+        "Space near a camera is crossed by many rays of that one camera. It gets more gradient\n"
+        "than it should, and fills with floaters. Two fields are trained on the same photographs,\n"
+        f"from the same seed, for {seconds:g} s each, with the near plane at 0: without and with\n"
+        "each sample's gradient scaled by its distance from the camera.",
         flush=True,
     )
     with _Stages() as stages:
