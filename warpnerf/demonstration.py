@@ -11,7 +11,6 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from warpnerf.camera import Camera
-from warpnerf.camera_path import backing_away
 from warpnerf.checkpoint import write_atomically
 from warpnerf.checks import InputError, require_positive
 from warpnerf.config import Scaling, TrainConfig
@@ -19,6 +18,7 @@ from warpnerf.data import load_scene
 from warpnerf.data.room import first_hit, photograph
 from warpnerf.evaluation import evaluate
 from warpnerf.field import Field, Rendering
+from warpnerf.flight import backing_away
 from warpnerf.floaters import near_density
 from warpnerf.pictures import FAINT, INK, depth_legend, depth_picture, font, write_png
 from warpnerf.scene import Scene

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from warpnerf.camera import Camera
-from warpnerf.camera_path import path_lens
 from warpnerf.checks import InputError
 from warpnerf.field import Field
+from warpnerf.flight import path_lens
 from warpnerf.pictures import colour_and_depth, write_png
 from warpnerf.video import write_video
 

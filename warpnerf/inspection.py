@@ -194,8 +194,9 @@ def _oddities(scene: Scene, found: Survey, content_distance: float, near: float)
     if nearest >= content_distance:
         why = "the near plane" if nearest == near else "the box"
         odd.append(
-            f"the scaling has nothing to do: {why} begins {nearest:.4g} from the cameras, but "
-            f"gradients are only scaled nearer than the content distance {content_distance:.4g}"
+            f"the scaling has nothing to do: {why} begins {nearest:.4g} scene units "
+            "from the cameras, but gradients are only scaled nearer than the content distance "
+            f"{content_distance:.4g}"
         )
     return odd
 
@@ -209,7 +210,7 @@ def _focus(cameras: Sequence[Camera]) -> np.ndarray | None:
 
 
 def _odd_directions(cameras: Sequence[Camera]) -> list[str]:
-    """Cameras that have nothing in common to look at, or stand on their heads."""
+    """Cameras that have nothing in common to look at."""
     odd = []
     aimed = share_aimed_at(cameras, find_focus(cameras).point)
     turned = [_turned(camera) for camera in cameras]
@@ -223,10 +224,6 @@ def _odd_directions(cameras: Sequence[Camera]) -> list[str]:
             f"no common focus: {aimed:.0%} of the training cameras have one point in the middle of "
             "their image, so content distance and box are guesses; give --content-distance"
         )
-    up = up_direction(cameras)
-    rolled = sum(float(camera.c2w[:, 1] @ up) < -0.3 for camera in cameras)
-    if rolled:
-        odd.append(f"upside down against the others: {rolled} of {len(cameras)} training cameras")
     return odd
 
 
@@ -236,16 +233,25 @@ def _turned(camera: Camera) -> Camera:
 
 
 def _odd_places(scene: Scene) -> list[str]:
+    """Cameras that stand on their heads, or far away from all others."""
+    odd = []
+    up = up_direction(scene.cameras)
+    rolled = [view.name for view in scene.views if view.camera.c2w[:, 1] @ up < -0.3]
+    if rolled:
+        odd.append(
+            f"upside down against the others: {len(rolled)} of {len(scene.views)} cameras (first: "
+            f"{rolled[0]})"
+        )
     places = np.array([camera.position for camera in scene.cameras])
     away = np.linalg.norm(places - np.median(places, axis=0), axis=1)
     limit = FAR_OFF * float(np.median(away))
     lost = [view.name for view, far in zip(scene.views, away, strict=True) if far > limit]
-    if not lost:
-        return []
-    return [
-        f"far away from all others: {len(lost)} of {len(places)} cameras (first: {lost[0]}), "
-        "which may be wrongly posed"
-    ]
+    if lost:
+        odd.append(
+            f"far away from all others: {len(lost)} of {len(places)} cameras (first: {lost[0]}), "
+            "which may be wrongly posed"
+        )
+    return odd
 
 
 def _distance_to_box(scene: Scene) -> float:

@@ -77,7 +77,7 @@ def render_command(
 
     cameras: list[Camera]
     if stills is None:
-        from warpnerf.camera_path import camera_path, natural_path
+        from warpnerf.flight import camera_path, natural_path
 
         kind = natural_path(views) if path == "auto" else path
         n_frames = _n_frames(fps, seconds)
@@ -126,7 +126,7 @@ def _n_frames(fps: float, seconds: float) -> int:
 
 def _still_cameras(scene: Scene, split: str, size: tuple[int, int] | None) -> dict[str, Camera]:
     """The cameras of a split's views by the file names of their pictures."""
-    from warpnerf.camera_path import path_lens
+    from warpnerf.flight import path_lens
     from warpnerf.pictures import picture_files
     from warpnerf.scene import require_split
 
