@@ -59,7 +59,10 @@ def test_depths_span_what_is_seen() -> None:
     field, cameras = tiny_field(), path(20)
     near, far = depth_range(field, cameras)
     looks = [field.render(camera) for camera in cameras]
-    depths = np.concatenate([(r.depth / r.opacity)[r.opacity > 0.5] for r in looks])
+    solid = [r.opacity > 0.5 for r in looks]
+    depths = np.concatenate(
+        [r.depth[at] / r.opacity[at] for r, at in zip(looks, solid, strict=True)]
+    )
     assert depths.size
     assert np.mean((depths > near) & (depths < far)) > 0.9
     assert near < np.percentile(depths, 5.0) and near > 0.5 * depths.min()
