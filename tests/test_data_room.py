@@ -256,3 +256,11 @@ def test_downscale_crops_what_fills_no_pixel() -> None:
 def test_impossible_downscale_is_refused(downscale: int) -> None:
     with pytest.raises(ValueError, match="downscale"):
         room.room_scene(downscale=downscale)
+
+
+def test_a_photograph_is_what_the_scene_is_made_of() -> None:
+    scene = room.room_scene(downscale=8)
+    view = scene.views[4]
+    rgb, depth = room.photograph(view.camera, 4)
+    np.testing.assert_array_equal(rgb, view.image)
+    np.testing.assert_array_equal(depth, view.depth)
