@@ -21,8 +21,7 @@ def test_the_command_says_what_goes_on_and_why(
     said = capsys.readouterr().out
     for words in (
         "crossed by many rays of that one camera",
-        "training without scaling",
-        "training with scaling",
+        "training both fields in turns",
         "filming a camera that backs away",
         "density near cameras",
         "floaters.png",

@@ -54,11 +54,12 @@ def test_it_trains_both_and_shows_them(tiny: None, tmp_path: Path) -> None:
         assert f"{row['psnr']:.2f}" in str(result)
     none, clamped = (result.fields[s].grid.values.numpy() for s in ("none", "clamped"))
     assert (none != clamped).any()
-    stages = list(dict.fromkeys(stage for stage, _, _ in reports))
-    assert [stage for stage in stages if stage.startswith("training")] == [
-        "training without scaling",
-        "training with scaling",
-    ]
+    training = [report for report in reports if report[0].startswith("training both")]
+    fractions = [fraction for _, fraction, _ in training]
+    assert fractions == sorted(fractions)
+    assert fractions[-1] == 1.0
+    turns = [text.split(":")[0] for _, _, text in training[1:]]
+    assert turns[:4] == 2 * ["without scaling", "with scaling"]
     with Image.open(result.picture) as picture:
         assert picture.width > 2 * 64 and picture.height > 3 * 48
     import av

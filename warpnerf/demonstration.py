@@ -22,6 +22,7 @@ from warpnerf.flight import backing_away
 from warpnerf.floaters import near_density
 from warpnerf.pictures import FAINT, INK, depth_legend, depth_picture, font, write_png
 from warpnerf.scene import Scene
+from warpnerf.state import Progress
 from warpnerf.training import Trainer
 from warpnerf.video import video_file, write_video
 
@@ -30,6 +31,9 @@ SCALINGS: dict[Scaling, str] = {"none": "without scaling", "clamped": "with scal
 
 STEPS = 100_000
 """More than there is time for: the time ends the training."""
+
+TURNS = 5
+"""The trainings take turns, so that what else the machine does slows down both."""
 
 CAMERAS = ("train_41.png", "train_49.png", "train_34.png")
 """Training views that the film backs away from, chosen because there is room behind them and the
@@ -111,18 +115,15 @@ def demo(
     video, _ = video_file(folder / "floaters.mp4", FPS)
     report("tracing the photographs of the built-in room", 0.0, "")
     scene = load_scene("builtin:room", downscale=downscale)
-    fields: dict[Scaling, Field] = {}
+    config = TrainConfig(steps=STEPS, time_limit=seconds, device=device, threads=threads)
+    trainers = _trained_in_turns(scene, config, report)
+    fields = {scaling: trainer.field() for scaling, trainer in trainers.items()}
     figures: dict[Scaling, dict[str, float]] = {}
-    for scaling in SCALINGS:
-        config = TrainConfig(
-            steps=STEPS, time_limit=seconds, scaling=scaling, device=device, threads=threads
-        )
-        trainer = _trained(scene, config, report)
-        fields[scaling] = trainer.field()
+    for scaling, field in fields.items():
         report(f"measuring the field {SCALINGS[scaling]}", 0.0, "")
-        figures[scaling] = evaluate(trainer.field(), scene, "test").mean | {
-            "near_density": near_density(trainer.field(), scene.training_cameras, first_hit),
-            "steps": trainer.steps_done,
+        figures[scaling] = evaluate(field, scene, "test").mean | {
+            "near_density": near_density(field, scene.training_cameras, first_hit),
+            "steps": trainers[scaling].steps_done,
         }
     far = 2.0 * scene.content_distance
     picture = folder / "floaters.png"
@@ -191,18 +192,31 @@ def comparison_picture(
     return np.asarray(sheet)
 
 
-def _trained(scene: Scene, config: TrainConfig, report: Report) -> Trainer:
-    stage = f"training {SCALINGS[config.scaling]}"
+def _trained_in_turns(scene: Scene, config: TrainConfig, report: Report) -> dict[Scaling, Trainer]:
+    """Both trainings, each for the same time, as they are at the end of it."""
+    stage = "training both fields in turns"
     report(stage, 0.0, "compiling kernels (once)")
-    trainer = Trainer(scene, config)
-    trainer.run(
-        lambda progress: report(
-            stage,
-            progress.fraction,
-            f"step {progress.step}  PSNR of the batch {progress.psnr:.2f} dB",
-        )
-    )
-    return trainer
+    trainers: dict[Scaling, Trainer] = {}
+    done = dict.fromkeys(SCALINGS, 0.0)
+
+    def take_turn(scaling: Scaling, end: float) -> None:
+        state = trainers[scaling].state() if scaling in trainers else None
+        trainer = trainers[scaling] = Trainer(scene, replace(config, scaling=scaling), state)
+
+        def on_progress(progress: Progress) -> None:
+            done[scaling] = progress.fraction
+            report(
+                stage,
+                sum(done.values()) / len(done),
+                f"{SCALINGS[scaling]}: step {progress.step}  loss {progress.loss:.5f}",
+            )
+
+        trainer.run(on_progress, stop=lambda: trainer.fraction >= end)
+
+    for turn in range(TURNS):
+        for scaling in SCALINGS:
+            take_turn(scaling, (turn + 1) / TURNS)
+    return trainers
 
 
 def _film(
