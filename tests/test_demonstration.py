@@ -24,7 +24,7 @@ from warpnerf.pictures import depth_colours
 
 @pytest.fixture
 def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(demonstration, "STEPS", 30)
+    monkeypatch.setattr(demonstration, "STEPS", 125)
     monkeypatch.setattr(demonstration, "FRAMES_PER_CAMERA", 2)
     monkeypatch.setattr(demonstration, "FRAME_SIZE", (32, 24))
     monkeypatch.setattr(demonstration, "PICTURE_SIZE", (64, 48))
@@ -49,7 +49,7 @@ def test_it_trains_both_and_shows_them(tiny: None, tmp_path: Path) -> None:
     for scaling in SCALINGS:
         row = figures[scaling]
         assert set(row) == {"psnr", "ssim", "depth_error", "near_density", "steps"}
-        assert row["steps"] == 30
+        assert row["steps"] == 125
         assert row["near_density"] > 0.0
         assert f"{row['psnr']:.2f}" in str(result)
     none, clamped = (result.fields[s].grid.values.numpy() for s in ("none", "clamped"))

@@ -25,17 +25,18 @@ def path(n: int = 4) -> list[Any]:
 
 
 class Wall:
-    """Stands for a field: one depth, or nothing."""
+    """Stands for a field: depths that rise from top to bottom."""
 
-    def __init__(self, depth: float, opacity: float) -> None:
-        self._seen = depth, opacity
+    def __init__(self, near: float, far: float, opacity: float) -> None:
+        self._seen = near, far, opacity
 
     def render(self, camera: Any) -> Rendering:
         shape = (camera.height, camera.width)
-        depth, opacity = self._seen
+        near, far, opacity = self._seen
+        depth = np.repeat(np.linspace(near, far, shape[0])[:, None], shape[1], axis=1)
         return Rendering(
             rgb=np.ones((*shape, 3), np.float32),
-            depth=np.full(shape, depth * opacity, np.float32),
+            depth=(depth * opacity).astype(np.float32),
             opacity=np.full(shape, opacity, np.float32),
         )
 
@@ -70,16 +71,23 @@ def test_depths_span_what_is_seen() -> None:
 
 
 @pytest.mark.parametrize(
-    ("depth", "opacity", "expected"),
-    [(123.4, 1.0, (120.0, 130.0)), (0.0321, 0.6, (0.032, 0.033)), (2.0, 1.0, (2.0, 2.1))],
+    ("near", "far", "opacity", "expected"),
+    [
+        (100.0, 254.0, 1.0, (100.0, 260.0)),
+        (0.0321, 0.0321, 0.6, (0.032, 0.033)),
+        (2.0, 2.0, 1.0, (2.0, 2.1)),
+        (0.31, 7.25, 1.0, (0.3, 7.3)),
+    ],
 )
-def test_depths_are_rounded_outward(depth: float, opacity: float, expected: Any) -> None:
-    wall: Any = Wall(depth, opacity)
-    assert depth_range(wall, path()) == pytest.approx(expected, rel=1e-6)
+def test_depths_are_rounded_outward(
+    near: float, far: float, opacity: float, expected: tuple[float, float]
+) -> None:
+    wall: Any = Wall(near, far, opacity)
+    assert depth_range(wall, path()) == expected
 
 
 def test_where_nothing_is_seen_depths_are_made_up() -> None:
-    wall: Any = Wall(3.0, 0.2)
+    wall: Any = Wall(3.0, 4.0, 0.2)
     assert depth_range(wall, path()) == (0.0, 1.0)
 
 

@@ -51,6 +51,17 @@ def test_from_above_x_is_right_and_y_is_up() -> None:
     assert abs(test[1] - train[1]) < 10
 
 
+def test_from_above_nothing_is_mirrored_where_up_is_down() -> None:
+    """With up along -z, y is to the right of x: seen from there, x is up on paper."""
+    poses = [np.eye(4) for _ in range(4)]
+    for pose, place in zip(poses, ((0, 3, 0), (0, -3, 0), (0, 2, 0), (3, 0, 0)), strict=True):
+        pose[:3, 3] = place
+    picture = plan_picture(inspection(poses, (0.0, 0.0, -1.0)))
+    test, train = (places(picture, c, 0).mean(axis=0) for c in (_TEST, _TRAIN))
+    assert test[0] < train[0] - 50
+    assert train[1] > test[1] + 50
+
+
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_from_the_side_up_is_up(axis: int, sign: float) -> None:
