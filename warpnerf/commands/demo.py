@@ -9,7 +9,7 @@ from warpnerf.commands.progress import ProgressBar
 
 def demo_command(
     output: Path,
-    seconds: float = 50.0,
+    steps: int = 2500,
     downscale: int = 1,
     device: str = "cpu",
     threads: int | None = None,
@@ -18,7 +18,7 @@ def demo_command(
 
     Args:
         output: Folder for a picture, a video and the figures.
-        seconds: Of training, each.
+        steps: Of each training.
         downscale: Of the room's photographs.
         device: cpu, cuda, cuda:1, ...
         threads: CPU threads; by default one per core.
@@ -29,14 +29,14 @@ def demo_command(
     print(
         "Space near a camera is crossed by many rays of that one camera. It gets more gradient\n"
         "than it should, and fills with floaters. Two fields are trained on the same photographs,\n"
-        f"from the same seed, for {seconds:g} s each, with the near plane at 0: without and with\n"
+        f"from the same seed, for {steps} steps each, with the near plane at 0: without and with\n"
         "each sample's gradient scaled by its distance from the camera.",
         flush=True,
     )
     with _Stages() as stages:
         result = demo(
             output,
-            seconds=seconds,
+            steps=steps,
             downscale=downscale,
             device=device,
             threads=threads,
