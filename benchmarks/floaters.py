@@ -12,39 +12,14 @@ Prints a table and writes benchmarks/results/floaters_<device>.json and a pictur
 from __future__ import annotations
 
 import argparse
-import dataclasses
 from pathlib import Path
 
-import numpy as np
 from measuring import RESULTS, machine, write_record
 
 import warpnerf as wn
 from warpnerf.data.room import first_hit
+from warpnerf.floaters import near_density
 from warpnerf.pictures import comparison, write_png
-
-N_DIRECTIONS = 2000
-
-
-def sphere(n: int) -> np.ndarray:
-    """Evenly spread unit vectors, [n, 3]: Fibonacci's spiral."""
-    k = np.arange(n) + 0.5
-    z = 1.0 - 2.0 * k / n
-    angle = np.pi * (1.0 + 5.0**0.5) * k
-    radius = np.sqrt(1.0 - z * z)
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
-
-
-def near_density(field: wn.Field, scene: wn.Scene) -> float:
-    """Mean optical depth from a training camera to its clearance; the truth is 0."""
-    directions = sphere(N_DIRECTIONS)
-    depths = []
-    for camera in scene.training_cameras:
-        origins = np.broadcast_to(camera.position, directions.shape)
-        clearance = float(first_hit(origins, directions).min())
-        steps = dataclasses.replace(field.steps, far=clearance, transmittance_min=0.0)
-        seen = dataclasses.replace(field, steps=steps).render_rays(origins, directions)
-        depths.append(float(-np.log(np.maximum(1.0 - seen.opacity, 1e-6)).mean()))
-    return float(np.mean(depths))
 
 
 def main() -> None:
@@ -68,7 +43,7 @@ def main() -> None:
         )
         result = wn.train(scene, config)
         row = wn.evaluate(result.field, scene).mean
-        row["near_density"] = near_density(result.field, scene)
+        row["near_density"] = near_density(result.field, scene.training_cameras, first_hit)
         row["steps"] = result.progress.step
         rows[scaling] = row
         print(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from warpnerf.camera import Camera
-from warpnerf.data import room, textures
+from warpnerf.data import room, room_textures
 from warpnerf.data.raytrace import Ball, Box, Cylinder, Room
 from warpnerf.scene import Scene, View
 
@@ -100,7 +100,7 @@ def test_images_show_something(scene: Scene) -> None:
 def test_building_twice_gives_the_same() -> None:
     first = room.room_scene(downscale=5)
     room._tracer.cache_clear()
-    textures._noise_table.cache_clear()
+    room_textures._noise_table.cache_clear()
     second = room.room_scene(downscale=5)
     assert first.content_distance == second.content_distance
     for a, b in zip(first.views, second.views, strict=True):
@@ -269,3 +269,11 @@ def test_photographed_anew_it_looks_the_same() -> None:
         c2w = camera.c2w.copy()
         c2w[:, 3] = place
         assert scene.photograph(replace(camera, c2w=c2w)) is None
+
+
+def test_a_photograph_is_what_the_scene_is_made_of() -> None:
+    scene = room.room_scene(downscale=8)
+    view = scene.views[4]
+    rgb, depth = room.photograph(view.camera, 4)
+    np.testing.assert_array_equal(rgb, view.image)
+    np.testing.assert_array_equal(depth, view.depth)

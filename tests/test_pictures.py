@@ -8,7 +8,14 @@ import imageio.v3 as iio
 import numpy as np
 
 from warpnerf.field import Rendering
-from warpnerf.pictures import comparison, depth_colours, picture_files, write_png
+from warpnerf.pictures import (
+    colour_and_depth,
+    comparison,
+    depth_colours,
+    depth_legend,
+    picture_files,
+    write_png,
+)
 
 
 def test_png_keeps_pixels_and_clips(tmp_path: Path) -> None:
@@ -20,7 +27,33 @@ def test_png_keeps_pixels_and_clips(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
 
 
-def test_depth_goes_from_red_to_blue_and_stays_there() -> None:
+def oklab(rgb: np.ndarray) -> np.ndarray:
+    """Lightness, and two axes of colour, of sRGB [..., 3]; Ottosson 2020."""
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    lms = linear @ np.array(
+        [
+            [0.4122214708, 0.2119034982, 0.0883024619],
+            [0.5363325363, 0.6806995451, 0.2817188376],
+            [0.0514459929, 0.1073969566, 0.6299787005],
+        ]
+    )
+    return np.cbrt(lms) @ np.array(
+        [
+            [0.2104542553, 1.9779984951, 0.0259040371],
+            [0.7936177850, -2.4285922050, 0.7827717662],
+            [-0.0040720468, 0.4505937099, -0.8086757660],
+        ]
+    )
+
+
+def test_equal_steps_of_depth_look_equal() -> None:
+    lab = oklab(depth_colours(np.linspace(0.0, 1.0, 17)[None], 0.0, 1.0)[0])
+    steps = np.linalg.norm(np.diff(lab, axis=0), axis=1)
+    assert steps.min() > 0.85 * steps.mean() and steps.max() < 1.15 * steps.mean()
+    assert (np.diff(lab[:, 0]) < -0.02).all()  # darker all along: readable without colours
+
+
+def test_depth_goes_from_yellow_to_blue_and_stays_there() -> None:
     rgb = depth_colours(np.array([[0.0, 1.0, 3.0, 5.0, 9.0]]), 1.0, 5.0)
     assert rgb.shape == (1, 5, 3)
     near, far = rgb[0, 1], rgb[0, 3]
@@ -50,6 +83,28 @@ def test_comparison_shows_three_panels() -> None:
     last = image[:, -width:]
     np.testing.assert_array_equal(last[0], 1.0)
     np.testing.assert_allclose(last[1:], depth_colours(depth, 0.0, 4.0)[1:])
+
+
+def test_colour_stands_left_of_depth_above_the_legend() -> None:
+    rng = np.random.default_rng(0)
+    rgb, depth = rng.random((6, 40, 3)), rng.uniform(1.0, 3.0, (6, 40))
+    seen = Rendering(rgb=rgb, depth=depth, opacity=np.ones((6, 40)))
+    image = colour_and_depth(seen, 1.0, 3.0)
+    assert image.dtype == np.uint8
+    np.testing.assert_array_equal(image[:6, :40], np.round(255 * rgb))
+    np.testing.assert_array_equal(image[:6, -40:], np.round(255 * depth_colours(depth, 1.0, 3.0)))
+    np.testing.assert_array_equal(image[6:], depth_legend(84, 1.0, 3.0))
+
+
+def test_the_legend_holds_all_colours_and_says_the_range() -> None:
+    legend = depth_legend(600, 1.0, 3.0).astype(int)
+    middle = legend[legend.shape[0] // 2]
+    for colour in np.round(255 * depth_colours(np.linspace(1.0, 3.0, 9)[None], 1.0, 3.0)[0]):
+        assert np.abs(middle - colour).sum(axis=1).min() < 12
+    assert (legend != depth_legend(600, 1.0, 4.0)).any()
+    assert (legend != depth_legend(600, 2.0, 3.0)).any()
+    for width in (1, 8, 30, 3000):
+        assert depth_legend(width, 0.0, 1.0).shape[1] == width
 
 
 def test_every_view_gets_a_picture_of_its_own() -> None:

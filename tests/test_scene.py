@@ -19,6 +19,8 @@ from warpnerf.scene import (
     estimate_extent,
     find_focus,
     focus_point,
+    share_aimed_at,
+    up_direction,
 )
 
 
@@ -194,3 +196,38 @@ def test_a_scene_that_nothing_can_be_trained_on_is_refused(
     scene_of()
     with pytest.raises(InputError, match=rf"by hand: {message}"):
         scene_of(**changes)
+
+
+def test_up_is_found_in_upright_photographs_that_all_look_down() -> None:
+    """From one side only, the mean of the cameras' own up axes is tilted."""
+    poses = [look_at((3.0 * np.cos(a), 3.0 * np.sin(a), 3.0), (0.0, 0.0, 0.0)) for a in (0, 0.5, 1)]
+    cameras = cameras_at(poses)
+    mean = np.mean([camera.c2w[:, 1] for camera in cameras], axis=0)
+    assert mean[2] / np.linalg.norm(mean) < 0.9
+    np.testing.assert_allclose(up_direction(cameras), [0.0, 0.0, 1.0], atol=1e-9)
+
+
+def test_up_turns_with_the_scene() -> None:
+    turn, _ = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))
+    turn *= np.linalg.det(turn)
+    poses = [np.concatenate([turn @ pose[:3], [[0.0, 0.0, 0.0, 1.0]]]) for pose in ring(9)]
+    np.testing.assert_allclose(up_direction(cameras_at(poses)), turn[:, 2], atol=1e-9)
+
+
+def test_up_is_the_cameras_own_where_nothing_else_tells() -> None:
+    poses = [look_at((3.0, 0.0, 1.0), (0.0, 0.0, 0.0)), look_at((4.0, 0.0, 2.0), (1.0, 0.0, 1.0))]
+    camera, other = cameras_at(poses)
+    np.testing.assert_allclose(up_direction([camera, other]), camera.c2w[:, 1], atol=1e-9)
+    rolled = cameras_at([pose @ np.diag([-1.0, -1.0, 1.0, 1.0]) for pose in poses])
+    np.testing.assert_array_equal(up_direction([camera, rolled[0]]), [0.0, 0.0, 1.0])
+
+
+def test_share_of_cameras_aimed_at_a_point() -> None:
+    cameras = cameras_at(ring(4))
+    assert share_aimed_at(cameras, np.zeros(3)) == 1.0
+    away = cameras_at(outward(ring(4)))
+    assert share_aimed_at([*cameras, *away], np.zeros(3)) == 0.5
+    edge = cameras[0].position + cameras[0].forward + 0.3 * cameras[0].c2w[:, 0]  # of 0.4 seen
+    assert share_aimed_at(cameras[:1], edge) == 0.0
+    inner = cameras[0].position + cameras[0].forward + 0.15 * cameras[0].c2w[:, 0]
+    assert share_aimed_at(cameras[:1], inner) == 1.0

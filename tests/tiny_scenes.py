@@ -14,6 +14,7 @@ import pytest
 from PIL import Image
 
 from warpnerf.camera import Camera
+from warpnerf.scene import Scene, View
 
 DATA = Path(os.environ.get("WARPNERF_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
@@ -118,3 +119,21 @@ def hand_made_png(
         + chunk(b"IEND", b"")
     )
     return path
+
+
+def tiny_scene(poses: list[np.ndarray], **lens: Any) -> Scene:
+    """A scene made by hand: noise seen from these poses, the last one for testing."""
+    views = []
+    for i, pose in enumerate(poses):
+        camera = camera_at(pose, **lens)
+        pixels = picture(i, width=camera.width, height=camera.height)
+        views.append(View(name=f"{i:03}.png", camera=camera, image=pixels))
+    return Scene(
+        name="tiny",
+        views=views,
+        splits={"train": tuple(range(len(poses) - 1)), "test": (len(poses) - 1,)},
+        box_min=np.full(3, -1.0),
+        box_max=np.full(3, 1.0),
+        unbounded=False,
+        content_distance=3.0,
+    )

@@ -18,8 +18,13 @@ if TYPE_CHECKING:
     from warpnerf.checks import InputError
     from warpnerf.config import PRESETS, GridConfig, MarchConfig, OptimConfig, TrainConfig
     from warpnerf.data import load_scene
+    from warpnerf.demonstration import Demo, demo
     from warpnerf.evaluation import Evaluation, evaluate
     from warpnerf.field import Field, Rendering
+    from warpnerf.filming import render_stills, render_video
+    from warpnerf.flight import camera_path
+    from warpnerf.inspection import Inspection, inspect
+    from warpnerf.plan import plan_picture
     from warpnerf.scene import Scene, View
     from warpnerf.state import Progress, TrainingState
     from warpnerf.training import TrainResult, train
@@ -28,6 +33,7 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "Camera": "camera",
+    "camera_path": "flight",
     "load_checkpoint": "checkpoint",
     "load_field": "checkpoint",
     "save_checkpoint": "checkpoint",
@@ -39,10 +45,17 @@ _HOMES = {
     "OptimConfig": "config",
     "TrainConfig": "config",
     "load_scene": "data",
+    "Demo": "demonstration",
+    "demo": "demonstration",
     "Evaluation": "evaluation",
     "evaluate": "evaluation",
     "Field": "field",
     "Rendering": "field",
+    "render_stills": "filming",
+    "render_video": "filming",
+    "Inspection": "inspection",
+    "inspect": "inspection",
+    "plan_picture": "plan",
     "Scene": "scene",
     "View": "scene",
     "Progress": "state",
@@ -53,6 +66,7 @@ _HOMES = {
 
 __all__ = [  # noqa: RUF022 (grouped by home, as above)
     "Camera",
+    "camera_path",
     "load_checkpoint",
     "load_field",
     "save_checkpoint",
@@ -64,10 +78,17 @@ __all__ = [  # noqa: RUF022 (grouped by home, as above)
     "OptimConfig",
     "TrainConfig",
     "load_scene",
+    "Demo",
+    "demo",
     "Evaluation",
     "evaluate",
     "Field",
     "Rendering",
+    "render_stills",
+    "render_video",
+    "Inspection",
+    "inspect",
+    "plan_picture",
     "Scene",
     "View",
     "Progress",

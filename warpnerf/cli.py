@@ -16,7 +16,16 @@ import tyro
 
 from warpnerf import __version__
 from warpnerf.checks import InputError
-from warpnerf.cli_machine import check_command, require_writable, warmup_command, write_json
+from warpnerf.commands.demo import demo_command
+from warpnerf.commands.inspect import inspect_command
+from warpnerf.commands.machine import (
+    check_command,
+    require_writable,
+    warmup_command,
+    write_json,
+)
+from warpnerf.commands.progress import ProgressBar
+from warpnerf.commands.render import render_command
 from warpnerf.config import PRESETS, Scaling, TrainConfig
 from warpnerf.stop import Stopped, StopRequest, raise_when_asked
 
@@ -216,11 +225,11 @@ def _train(run: Run, scene: Scene, trainer: Trainer) -> int:
     """Train to the end, or until asked to stop; look at the test views."""
     with StopRequest() as stop:
         try:
-            with _reporter(trainer.config) as report:
+            with ProgressBar("first step") as bar:
 
                 def on_progress(progress: Progress) -> None:
                     run.log(progress)
-                    report(progress)
+                    bar.report(progress.fraction, _text(progress))
 
                 trainer.run(on_progress, run.save_checkpoint, lambda: stop.asked)
         except FloatingPointError as error:
@@ -247,7 +256,7 @@ def _train(run: Run, scene: Scene, trainer: Trainer) -> int:
         return stopped.exit_code
     print(
         f"wrote {run.folder}: field.safetensors, metrics.json, log.jsonl, config.json, and "
-        f"test/*.png (truth, rendering, depth from 0 red to {far:.3g} violet)"
+        f"test/*.png (truth, rendering, depth from 0 yellow to {far:.3g} blue)"
     )
     return 0
 
@@ -282,48 +291,6 @@ class _Printer(logging.Handler):
         print(record.getMessage(), flush=True)
 
 
-class _reporter:
-    """Progress as a bar on a terminal, as plain lines elsewhere."""
-
-    def __init__(self, config: TrainConfig) -> None:
-        self._config = config
-        self._lines_at = 0.0
-
-    def __enter__(self) -> Callable[[Progress], None]:
-        from rich.console import Console
-
-        console = Console()
-        self._bar = None
-        if not console.is_terminal:
-            return self._line
-        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-        self._bar = Progress(
-            TextColumn("{task.percentage:3.0f}%"),
-            BarColumn(),
-            TextColumn("{task.description}"),
-            TimeRemainingColumn(),
-            console=console,
-        )
-        self._bar.start()
-        self._task = self._bar.add_task("first step", total=1.0)
-        return self._draw
-
-    def __exit__(self, *error: object) -> None:
-        if self._bar is not None:
-            self._bar.stop()
-
-    def _draw(self, progress: Progress) -> None:
-        assert self._bar is not None
-        self._bar.update(self._task, completed=progress.fraction, description=_text(progress))
-
-    def _line(self, progress: Progress) -> None:
-        if progress.seconds >= self._lines_at or progress.fraction >= 1.0:
-            left = progress.seconds * (1.0 / max(progress.fraction, 1e-6) - 1.0)
-            print(f"{progress.fraction:4.0%}  {_text(progress)}  {left:.0f} s left", flush=True)
-            self._lines_at = progress.seconds + 5.0
-
-
 def _text(progress: Progress) -> str:
     speed = progress.step / max(progress.seconds, 1e-6)
     size = " x ".join(str(n) for n in progress.size)
@@ -355,8 +322,11 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         return tyro.extras.subcommand_cli_from_dict(
             {
+                "demo": demo_command,
+                "inspect": inspect_command,
                 "train": train_command,
                 "eval": eval_command,
+                "render": render_command,
                 "check": check_command,
                 "warmup": warmup_command,
             },

@@ -8,29 +8,28 @@ from io import BytesIO
 from pathlib import Path
 
 import numpy as np
+from PIL import Image, ImageDraw, ImageFont
 
 from warpnerf.checkpoint import write_atomically
 from warpnerf.field import Rendering
 
-# Near to far: dark red, orange, yellow, green, blue, dark violet; brightness peaks in the middle.
-_STOPS = np.array([0.0, 0.15, 0.32, 0.5, 0.68, 0.85, 1.0])
-_COLOURS = np.array(
-    [
-        [0.45, 0.02, 0.05],
-        [0.86, 0.24, 0.10],
-        [0.98, 0.66, 0.20],
-        [0.86, 0.95, 0.45],
-        [0.20, 0.75, 0.70],
-        [0.20, 0.40, 0.80],
-        [0.18, 0.10, 0.40],
-    ]
+_COLOURS = (
+    "ffef6d fdd654 febe3e fea430 fc8b2e f67337 ec5b47 de4656 cd3365"
+    " b92372 a2167c 8a0d84 700888 560585 3d047a 260667 14094e"
 )
+"""Near to far, sRGB: yellow, orange, red, purple, dark blue. Our own: points of a curve that gets
+darker all along, at equal distances in OKLab, where equal distances look equal (Ottosson 2020,
+https://bottosson.github.io/posts/oklab)."""
+
 _GAP = 4
 _LONGEST_STEM = 200
 
+INK, FAINT = (30, 30, 34), (120, 120, 128)
+"""Of text, and of what is less important; sRGB of 8 bits."""
+
 
 def depth_colours(depth: np.ndarray, near: float, far: float) -> np.ndarray:
-    """Depth as colour: red is near, violet is far.
+    """Depth as colour: bright yellow is near, dark blue is far; equal steps look equal.
 
     Args:
         depth: [H, W], scene units.
@@ -40,8 +39,26 @@ def depth_colours(depth: np.ndarray, near: float, far: float) -> np.ndarray:
     Returns:
         [H, W, 3] in [0, 1].
     """
+    table = np.array([list(bytes.fromhex(colour)) for colour in _COLOURS.split()]) / 255.0
     x = np.clip((depth - near) / max(far - near, 1e-12), 0.0, 1.0)
-    return np.stack([np.interp(x, _STOPS, _COLOURS[:, c]) for c in range(3)], axis=-1)
+    stops = np.linspace(0.0, 1.0, len(table))
+    return np.stack([np.interp(x, stops, table[:, c]) for c in range(3)], axis=-1)
+
+
+def depth_picture(rendering: Rendering, near: float, far: float) -> np.ndarray:
+    """Depth of what is seen, in colour; it fades to white where nothing is.
+
+    Args:
+        rendering: [H, W].
+        near: Depth of the first colour, scene units.
+        far: Depth of the last.
+
+    Returns:
+        [H, W, 3] in [0, 1].
+    """
+    opacity = rendering.opacity[..., None]
+    surface = rendering.depth / np.maximum(rendering.opacity, 1e-6)
+    return opacity * depth_colours(surface, near, far) + (1.0 - opacity)
 
 
 def comparison(target: np.ndarray, rendering: Rendering, near: float, far: float) -> np.ndarray:
@@ -56,11 +73,60 @@ def comparison(target: np.ndarray, rendering: Rendering, near: float, far: float
     Returns:
         [H, 3 W + 8, 3] in [0, 1].
     """
-    opacity = rendering.opacity[..., None]
-    surface = rendering.depth / np.maximum(rendering.opacity, 1e-6)
-    depth = opacity * depth_colours(surface, near, far) + (1.0 - opacity)
+    depth = depth_picture(rendering, near, far)
     gap = np.ones((target.shape[0], _GAP, 3))
     return np.concatenate([target, gap, np.clip(rendering.rgb, 0, 1), gap, depth], axis=1)
+
+
+def colour_and_depth(rendering: Rendering, near: float, far: float) -> np.ndarray:
+    """Colour and depth side by side, above a legend of the depths' colours.
+
+    Args:
+        rendering: [H, W].
+        near: Depth of the first colour, scene units.
+        far: Depth of the last.
+
+    Returns:
+        [H + legend, 2 W + 4, 3] uint8.
+    """
+    gap = np.ones((rendering.depth.shape[0], _GAP, 3))
+    depth = depth_picture(rendering, near, far)
+    panels = np.concatenate([np.clip(rendering.rgb, 0.0, 1.0), gap, depth], axis=1)
+    pixels = np.round(255.0 * panels).astype(np.uint8)
+    return np.concatenate([pixels, depth_legend(pixels.shape[1], near, far)])
+
+
+def depth_legend(width: int, near: float, far: float) -> np.ndarray:
+    """A strip that says which colour is which depth.
+
+    Args:
+        width: Of the strip, pixels.
+        near: Depth of the first colour, scene units.
+        far: Depth of the last.
+
+    Returns:
+        [height, width, 3] uint8; the height follows from the width.
+    """
+    size = int(np.clip(width / 36, 8, 20))
+    height = 2 * size
+    strip = Image.new("RGB", (width, height), "white")
+    draw = ImageDraw.Draw(strip)
+    type_face = font(size)
+    words = [f"{near:.3g}", f"{far:.3g} scene units"]
+    if width >= 16 * size:
+        words[0] = f"depth {words[0]}"
+    left, right = (draw.textlength(word, type_face) + size for word in words)
+    bar = np.linspace(near, far, max(1, int(width - left - right)))[None]
+    colours = np.round(255.0 * depth_colours(bar, near, far)).astype(np.uint8)
+    strip.paste(Image.fromarray(np.repeat(colours, size, axis=0)), (int(left), size // 2))
+    draw.text((left - size / 2, size), words[0], INK, type_face, anchor="rm")
+    draw.text((width - right + size / 2, size), words[1], INK, type_face, anchor="lm")
+    return np.asarray(strip)
+
+
+def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    """The typeface of our pictures, that Pillow brings along, in a size in pixels."""
+    return ImageFont.load_default(size)
 
 
 def picture_files(names: Sequence[str]) -> dict[str, str]:
@@ -88,14 +154,22 @@ def picture_files(names: Sequence[str]) -> dict[str, str]:
 
 
 def write_png(path: str | Path, rgb: np.ndarray) -> None:
-    """Write an image [H, W, 3] in [0, 1] as an 8-bit PNG.
+    """Write an image as an 8-bit PNG, whole or not at all.
+
+    Args:
+        path: Of the file; its folder exists.
+        rgb: [H, W, 3] uint8, or in [0, 1].
 
     Raises:
         OSError: It cannot be written.
     """
-    import imageio.v3 as imageio
+    write_atomically(path, png(rgb))
 
+
+def png(rgb: np.ndarray) -> bytes:
+    """The PNG file of an image [H, W, 3] uint8, or in [0, 1]."""
+    if rgb.dtype != np.uint8:
+        rgb = np.round(255.0 * np.clip(rgb, 0.0, 1.0)).astype(np.uint8)
     buffer = BytesIO()
-    pixels = np.round(255.0 * np.clip(rgb, 0.0, 1.0)).astype(np.uint8)
-    imageio.imwrite(buffer, pixels, extension=".png")
-    write_atomically(path, buffer.getvalue())
+    Image.fromarray(rgb).save(buffer, "PNG")
+    return buffer.getvalue()

@@ -16,6 +16,9 @@ UNBOUNDED_BOX_SHARE = 0.75
 MIN_AXIS_SPREAD = 1e-4
 """Mean squared sine of the axes to their mean, below which they count as parallel: 0.6 degrees."""
 
+MIN_LEVEL_SPREAD = 0.02
+"""Mean squared sine of the horizontal axes to their main direction, for their plane to be known."""
+
 MIN_SHARE_IN_FRONT = 0.75
 """Share of cameras that must have the focus in front of them for it to be what they look at."""
 
@@ -130,6 +133,8 @@ class Focus:
     """The content distance, scene units."""
     how: str
     """How they were found: the second half of a sentence."""
+    guessed: bool = False
+    """Whether the cameras look at no common point, and the distance is a guess."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -200,6 +205,7 @@ def find_focus(cameras: Sequence[Camera]) -> Focus:
         distance=spread,
         how=f"mean distance of the training cameras from their centre, because {reason}; "
         "set the content distance if you know it",
+        guessed=True,
     )
 
 
@@ -214,6 +220,46 @@ def _check_spread(spread: float, farthest: float) -> None:
             f"the training cameras lie {farthest:.4g} from the origin but only {spread:.4g} apart, "
             "which single precision cannot resolve; subtract their mean from the translations."
         )
+
+
+def share_aimed_at(cameras: Sequence[Camera], point: np.ndarray) -> float:
+    """The share of cameras that have a point in the middle of what they see, [0, 1].
+
+    The middle is half of the image's width and height; distortion is left out of account.
+
+    Args:
+        cameras: At least one.
+        point: [3] scene units.
+    """
+    return float(np.mean([_is_aimed_at(camera, point) for camera in cameras]))
+
+
+def _is_aimed_at(camera: Camera, point: np.ndarray) -> bool:
+    x, y, z = camera.c2w[:, :3].T @ (point - camera.position)
+    u, v = abs(x) * camera.fx, abs(y) * camera.fy
+    return bool(z < 0.0 and u < -0.25 * camera.width * z and v < -0.25 * camera.height * z)
+
+
+def up_direction(cameras: Sequence[Camera]) -> np.ndarray:
+    """Estimate which way is up, a unit vector [3].
+
+    Most photographs are taken upright, and their horizontal axes x_i lie in one plane, the level
+    one: up = argmin_u sum_i (u . x_i)^2 over unit u. Where that is not clear, or far from the
+    cameras' own up axes, it is the mean of those.
+
+    Args:
+        cameras: At least one.
+    """
+    poses = np.stack([camera.c2w for camera in cameras])
+    across, mean = poses[:, :, 0], poses[:, :, 1].mean(axis=0)
+    length = float(np.linalg.norm(mean))
+    if length < 1e-6:  # looking straight down, from all sides
+        return np.array([0.0, 0.0, 1.0])
+    mean /= length
+    spread, directions = np.linalg.eigh(across.T @ across / len(cameras))
+    normal = directions[:, 0] * np.sign(directions[:, 0] @ mean)
+    level = spread[1] > MIN_LEVEL_SPREAD and spread[0] < 0.1 * spread[1]
+    return normal if level and normal @ mean > 0.5 else mean
 
 
 def estimate_box(cameras: Sequence[Camera], unbounded: bool) -> tuple[np.ndarray, np.ndarray]:

@@ -402,7 +402,7 @@ def adj_integrate(
     step = int(ray.begin)
     n = int(0)
     n_samples = int(0)
-    while n_samples < total.n_samples:
+    while n_samples < total.n_samples and step < ray.end:
         slot = row + wp.min(n, capacity - 1)
         if n >= capacity - 1:
             step = next_pack(grid, free, march, ray, step, transmittance, contraction, packs, slot)

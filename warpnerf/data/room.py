@@ -15,7 +15,7 @@ import numpy as np
 from warpnerf.camera import Camera
 from warpnerf.checks import InputError, require_rays
 from warpnerf.data.raytrace import Ball, Box, Cylinder, Light, Room, Texture, Tracer, Vec3
-from warpnerf.data.textures import (
+from warpnerf.data.room_textures import (
     checks,
     globe,
     leaves,
@@ -210,6 +210,19 @@ def first_hit(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
     return _tracer().first_hit(origins, directions)
 
 
+def photograph(camera: Camera, samples: int = 2) -> tuple[np.ndarray, np.ndarray]:
+    """What a camera in the room sees.
+
+    Args:
+        camera: Anywhere inside; its distortion is not simulated.
+        samples: Squared, the rays of each pixel.
+
+    Returns:
+        rgb [H, W, 3] uint8, and the true depth [H, W] float32 in scene units.
+    """
+    return _tracer().image(camera, samples), _tracer().depth(camera)
+
+
 # --- Cameras -----------------------------------------------------------------------------------
 
 
@@ -307,19 +320,18 @@ def room_scene(downscale: int = 1) -> Scene:
     """
     if not isinstance(downscale, int) or not 1 <= downscale <= HEIGHT:
         raise InputError(f"downscale must be a whole number from 1 to {HEIGHT}, not {downscale}.")
-    tracer = _tracer()
     samples = min(downscale + 1, 4)  # small images hold more detail in each pixel
 
-    def photograph(camera: Camera) -> np.ndarray | None:
+    def once_more(camera: Camera) -> np.ndarray | None:
         inside = first_hit(camera.position[None], camera.forward[None])[0] > 0.0
-        return tracer.image(camera, samples) if inside else None
+        return photograph(camera, samples)[0] if inside else None
 
     views = []
     for kind, poses in (("test", _TEST), ("train", tuple(_train_poses()))):
         for k, (eye, target) in enumerate(poses):
             c2w = _look(eye, target, roll=0.03 * np.sin(2.4 * k))
             camera = _camera(c2w).downscaled(downscale)
-            image, depth = tracer.image(camera, samples), tracer.depth(camera)
+            image, depth = photograph(camera, samples)
             views.append(View(name=f"{kind}_{k:02d}.png", camera=camera, image=image, depth=depth))
     train = range(len(_TEST), len(views))
     seen = [view.depth for view in views[train.start :] if view.depth is not None]
@@ -336,5 +348,5 @@ def room_scene(downscale: int = 1) -> Scene:
             f"content distance {content_distance:.3g}: median of the true depth over the training "
             "views, which look in, out and close, at no common point",
         ),
-        photograph=photograph,
+        photograph=once_more,
     )

@@ -1,4 +1,4 @@
-"""Paint for the built-in room: albedo as a function of the surface point."""
+"""What the built-in room is covered with: albedo as a function of the surface point."""
 
 from __future__ import annotations
 

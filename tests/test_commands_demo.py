@@ -1,0 +1,30 @@
+"""`warpnerf demo`: what it says on the way."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from warpnerf import demonstration
+from warpnerf.commands.demo import demo_command
+
+
+def test_the_command_says_what_goes_on_and_why(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(demonstration, "FRAMES_PER_CAMERA", 1)
+    monkeypatch.setattr(demonstration, "FRAME_SIZE", (32, 24))
+    monkeypatch.setattr(demonstration, "PICTURE_SIZE", (64, 48))
+    assert demo_command(tmp_path, steps=3, downscale=8, threads=1) == 0
+    said = capsys.readouterr().out
+    for words in (
+        "crossed by many rays of that one camera",
+        "for 3 steps each",
+        "training without scaling",
+        "training with scaling",
+        "filming a camera that backs away",
+        "density near cameras",
+        "floaters.png",
+    ):
+        assert words in said

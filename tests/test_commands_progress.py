@@ -1,0 +1,26 @@
+"""Progress where there is no terminal: plain lines, not one for each report."""
+
+from __future__ import annotations
+
+import pytest
+
+from warpnerf.commands import progress
+from warpnerf.commands.progress import ProgressBar
+
+
+def test_plain_lines_are_few_and_end_with_the_last(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = 100.0
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now)
+    with ProgressBar("first") as bar:
+        for step in range(1, 101):
+            now += 0.125
+            bar.report(step / 100, f"step {step}")
+    lines = capsys.readouterr().out.splitlines()
+    assert lines == [
+        "  1%  step 1  12 s left",
+        " 41%  step 41  7 s left",
+        " 81%  step 81  2 s left",
+        "100%  step 100  0 s left",
+    ]

@@ -1,0 +1,133 @@
+"""What inspection says of scenes with one thing odd about each."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tiny_scenes import look_at, ring, save, write_blender, write_transforms
+
+from warpnerf.checks import InputError
+from warpnerf.inspection import Inspection, inspect
+
+
+def scene_with(folder: Path, poses: list[np.ndarray]) -> Path:
+    content = write_transforms(folder, len(poses))
+    for frame, pose in zip(content["frames"], poses, strict=True):
+        frame["transform_matrix"] = pose.tolist()
+    save(folder / "transforms.json", content)
+    return folder
+
+
+def odd(found: Inspection) -> str:
+    return "\n".join(found.oddities)
+
+
+def test_an_ordinary_scene(tmp_path: Path) -> None:
+    found = inspect(scene_with(tmp_path / "ring", ring(9)))
+    facts = json.loads(found.to_json())
+    assert found.oddities == ()
+    assert facts["name"] == "ring"
+    assert facts["splits"] == {"test": 2, "train": 7}
+    assert facts["sizes"] == [[8, 6, 9]]
+    assert facts["focal_length"] == [10.0, 11.0]
+    assert facts["field_of_view"][0] == pytest.approx(2 * [2 * np.degrees(np.arctan(0.4))])
+    assert facts["distortion"] == {}
+    np.testing.assert_allclose(facts["focus"], 0.0, atol=1e-9)
+    np.testing.assert_allclose(facts["up"], [0.0, 0.0, 1.0], atol=1e-9)
+    assert facts["content_distance"] == pytest.approx(np.sqrt(10.0))
+    assert any("median depth" in line for line in facts["how"])
+    text = str(found)
+    for words in ("instant-ngp", "9: 2 test, 7 train", "8 x 6", "3.162 scene units", "nothing"):
+        assert words in text
+
+
+def test_what_loading_warns_of_is_odd(tmp_path: Path) -> None:
+    folder = scene_with(tmp_path, ring(9))
+    content = json.loads((folder / "transforms.json").read_text())
+    content["frames"].append(content["frames"][0] | {"file_path": "images/gone.png"})
+    content["frames"].append(content["frames"][0])
+    content["exposure"] = 3
+    save(folder / "transforms.json", content)
+    found = odd(inspect(folder))
+    for words in ("gone.png", "naming an image again", "not read: exposure"):
+        assert words in found
+
+
+def test_poses_in_opencv_axes_are_recognised(tmp_path: Path) -> None:
+    poses = [pose @ np.diag([1.0, -1.0, -1.0, 1.0]) for pose in ring(9)]
+    found = inspect(scene_with(tmp_path, poses))
+    assert "poses are in OpenCV axes" in odd(found)
+    assert found.focus is None
+
+
+def test_no_common_focus_is_said(tmp_path: Path) -> None:
+    along = [look_at((float(i), 0.0, 0.0), (i + 0.5 * (-1) ** i, 5.0, 0.0)) for i in range(12)]
+    found = inspect(scene_with(tmp_path, along))
+    assert "no common focus" in odd(found)
+    assert "guess" in odd(found)
+    assert "OpenCV" not in odd(found)
+
+
+def test_a_camera_far_away_and_one_upside_down(tmp_path: Path) -> None:
+    poses = ring(9)
+    poses[3] = look_at((300.0, 1.0, 1.0), (0.0, 0.0, 0.0))
+    poses[5] = poses[5] @ np.diag([-1.0, -1.0, 1.0, 1.0])
+    found = odd(inspect(scene_with(tmp_path, poses)))
+    assert "far away from all others: 1 of 9 cameras (first: images/003.png)" in found
+    assert "upside down against the others: 1 of 9 cameras (first: images/005.png)" in found
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({}, None),
+        ({"near": 2.0}, None),
+        ({"near": 3.2}, "the near plane begins 3.2"),
+        ({"content_distance": 1.0}, "the box begins"),
+        ({"content_distance": 2.9}, None),
+    ],
+)
+def test_a_scaling_that_does_nothing_is_said(
+    tmp_path: Path, options: dict[str, Any], says: str | None
+) -> None:
+    write_blender(tmp_path, "train", ring(8))
+    found = odd(inspect(tmp_path, **options))
+    assert ("the scaling has nothing to do" in found) == (says is not None)
+    assert (says or "") in found
+
+
+def test_the_built_in_room_is_in_order() -> None:
+    found = inspect("builtin:room", downscale=8)
+    assert found.oddities == ()
+    assert found.focus is None  # its cameras look everywhere, and it knows its distances
+
+
+def test_costs_grow_with_what_is_asked(tmp_path: Path) -> None:
+    folder = scene_with(tmp_path, ring(9))
+    one, four = (inspect(folder, threads=n).costs for n in (1, 4))
+    assert one["quality"].seconds > 2.0 * one["fast"].seconds > 0.0
+    assert one["quality"].memory > 2.0 * one["fast"].memory
+    assert one["fast"].memory >= 64 * 160**3
+    assert four["fast"].memory > one["fast"].memory
+    assert four["fast"].seconds == pytest.approx(one["fast"].seconds / 4)
+
+
+def test_a_scene_that_is_refused_says_how_many_poses_are(tmp_path: Path) -> None:
+    folder = scene_with(tmp_path, ring(9))
+    content = json.loads((folder / "transforms.json").read_text())
+    for index in (2, 6, 7):
+        content["frames"][index]["transform_matrix"][0][0] += 0.2
+    save(folder / "transforms.json", content)
+    says = r"\$\.frames\[2\].*likewise: 2 more \(\$\.frames\[6\], \$\.frames\[7\]\)"
+    with pytest.raises(InputError, match=says):
+        inspect(folder)
+
+
+@pytest.mark.parametrize("options", [{"near": -1.0}, {"content_distance": 0.0}])
+def test_values_out_of_range_are_refused(options: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match=next(iter(options))):
+        inspect("builtin:room", downscale=8, **options)

@@ -1,0 +1,59 @@
+"""`warpnerf inspect`: what was understood of a scene."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import tyro
+
+from warpnerf.checks import InputError
+
+
+def inspect_command(
+    scene: tyro.conf.Positional[str],
+    /,
+    output: Path | None = None,
+    json: bool = False,
+    downscale: int = 1,
+    content_distance: float | None = None,
+    near: float = 0.0,
+    threads: int | None = None,
+) -> int:
+    """Say what was understood of a scene, what training will take, and what is odd.
+
+    Args:
+        scene: Folder with transforms.json or transforms_train.json, or builtin:room.
+        output: FILE.png for a plan: cameras, box and content distance from above and the side.
+        json: Print JSON instead of a table.
+        downscale: As training will be given.
+        content_distance: As training will be given; by default the estimate.
+        near: As training will be given.
+        threads: CPU threads that training would have; by default one per core.
+    """
+    from warpnerf.inspection import inspect
+
+    if output is not None:
+        if output.suffix != ".png":
+            raise InputError(f"--output {output}: the plan is a PNG; let its name end in .png.")
+        if not output.parent.is_dir():
+            raise InputError(f"--output {output}: its folder does not exist; make it first.")
+    found = inspect(
+        scene,
+        downscale=downscale,
+        content_distance=content_distance,
+        near=near,
+        threads=threads or os.cpu_count() or 1,
+    )
+    print(found.to_json() if json else found, end="" if json else "\n")
+    if output is not None:
+        from warpnerf.pictures import write_png
+        from warpnerf.plan import plan_picture
+
+        try:
+            write_png(output, plan_picture(found))
+        except OSError as error:
+            raise InputError(f"--output {output} cannot be written: {error.strerror}.") from error
+        if not json:
+            print(f"wrote {output}")
+    return 0

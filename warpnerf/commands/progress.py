@@ -1,0 +1,58 @@
+"""Progress in a terminal: a bar there, plain lines in a file or a pipe."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.progress import Progress as Bar
+
+LINE_EVERY = 5.0
+"""Seconds from one plain line to the next."""
+
+
+class ProgressBar:
+    """How far something is, within a `with` statement."""
+
+    def __init__(self, waiting: str = "") -> None:
+        """Set up; ``waiting`` is shown until the first report."""
+        self._waiting = waiting
+        self._bar: Bar | None = None
+        self._began = time.monotonic()
+        self._line_at = 0.0
+
+    def __enter__(self) -> ProgressBar:
+        """Show the bar, where there is a terminal."""
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+        console = Console()
+        self._began = time.monotonic()
+        if console.is_terminal:
+            self._bar = Progress(
+                TextColumn("{task.percentage:3.0f}%"),
+                BarColumn(),
+                TextColumn("{task.description}"),
+                TimeRemainingColumn(),
+                console=console,
+            )
+            self._bar.start()
+            self._task = self._bar.add_task(self._waiting, total=1.0)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Leave the bar as it stands."""
+        if self._bar is not None:
+            self._bar.stop()
+
+    def report(self, fraction: float, text: str) -> None:
+        """Show that a fraction, [0, 1], is done, and a few words."""
+        if self._bar is not None:
+            self._bar.update(self._task, completed=fraction, description=text)
+            return
+        seconds = time.monotonic() - self._began
+        if seconds >= self._line_at or fraction >= 1.0:
+            left = seconds * (1.0 / max(fraction, 1e-6) - 1.0)
+            print(f"{fraction:4.0%}  {text}  {left:.0f} s left", flush=True)
+            self._line_at = seconds + LINE_EVERY
