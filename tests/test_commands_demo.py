@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from pathlib import Path
 
 import pytest
@@ -28,3 +29,7 @@ def test_the_command_says_what_goes_on_and_why(
         "floaters.png",
     ):
         assert words in said
+
+
+def test_the_default_is_that_of_the_function() -> None:
+    assert inspect.signature(demo_command).parameters["steps"].default == demonstration.STEPS
