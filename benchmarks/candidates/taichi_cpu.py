@@ -1,7 +1,7 @@
 """Taichi: a loop over threads with gradients of their own, adjoint by hand, samples kept.
 
-Tried and slower: a parallel loop over rays with atomic addition (1.2 times on one thread, 2 to 3
-times on two), and reading samples again instead of keeping them (2 times).
+Tried and slower: a parallel loop over rays with atomic addition (up to 1.2 times as long on one
+thread, 2 to 3 times on two), and reading samples again instead of keeping them (1.4 to 2 times).
 """
 # Taichi reads annotations as they are: none may be put off.
 
