@@ -14,6 +14,25 @@ from warpnerf.parallel import Workers
 from warpnerf.render import TrainingPass, render_rays
 
 
+@wp.func_native("""
+auto* sum = &rows.data[node].c[0];
+auto* row = &rows.data[(size_t)worker * rows.shape[1] + node].c[0];
+for (int n = 0; n < 4 * count; ++n) {
+    sum[n] += row[n];
+    row[n] = 0;
+}
+""")
+def add_row(rows: wp.array2d(dtype=vec4), worker: int, node: int, count: int):
+    """Add some nodes of a worker's row to the first row, and zero them."""
+    ...
+
+
+@wp.func_native("memset(&rows.data[node], 0, sizeof(rows.data[node]) * count);")
+def clear_row(rows: wp.array2d(dtype=vec4), node: int, count: int):
+    """Zero some nodes of the first row."""
+    ...
+
+
 @wp.kernel(enable_backward=False)
 def fold(
     first: int,
@@ -34,12 +53,11 @@ def fold(
         tile = next_tile(touched, tile + 1, last)
     tile = next_tile(touched, tile_of(start), last)
     while tile < last:
+        node = wp.max(start, tile * wp.static(TILE))
+        count = wp.min(end, (tile + 1) * wp.static(TILE)) - node
         for worker in range(1, gradients.shape[0]):
             if flagged(touched, worker, tile):
-                node = tile * wp.static(TILE)
-                for i in range(wp.max(start, node), wp.min(end, node + wp.static(TILE))):
-                    gradients[0, i] = gradients[0, i] + gradients[worker, i]
-                    gradients[worker, i] = vec4()
+                add_row(gradients, worker, node, count)
         tile = next_tile(touched, tile + 1, last)
 
 
@@ -56,9 +74,8 @@ def clear(
     last = tile_of(end - 1) + 1
     tile = next_tile(touched, tile_of(start), last)
     while tile < last:
-        node = tile * wp.static(TILE)
-        for i in range(wp.max(start, node), wp.min(end, node + wp.static(TILE))):
-            gradients[0, i] = vec4()
+        node = wp.max(start, tile * wp.static(TILE))
+        clear_row(gradients, node, wp.min(end, (tile + 1) * wp.static(TILE)) - node)
         tile = next_tile(touched, tile + 1, last)
 
 
