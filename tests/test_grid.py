@@ -88,12 +88,12 @@ def test_grid_size_makes_cubes() -> None:
     assert grid_size(np.array([1.0, 1.0, 1e-9]), 8)[2] == 2
 
 
-def test_a_grid_larger_than_memory() -> None:
-    require_memory((10, 10, 10), 4)
-    with pytest.raises(InputError, match=r"grid\.voxels: a grid of .* use fewer voxels"):
-        require_memory((1200, 1200, 1200), 400)
-    with pytest.raises(InputError, match=r"grid\.voxels must give fewer than 2\^31 nodes"):
-        require_memory((20000, 20000, 20000), 4)
+def test_a_grid_larger_than_memory(workers: Workers) -> None:
+    require_memory((10, 10, 10), workers)
+    with pytest.raises(InputError, match=r"grid\.voxels: a grid of .* or fewer threads"):
+        require_memory((500, 500, 500), Workers("cpu", 400))
+    with pytest.raises(InputError, match=r"grid\.voxels must give fewer than \d+ nodes"):
+        require_memory((20000, 20000, 20000), workers)
 
 
 def test_free_cells_of_a_grid(workers: Workers) -> None:

@@ -160,3 +160,17 @@ def test_thin_media_keep_their_digits(packed: Kernels) -> None:
     thicker = replace(p, density_scale=1e-6)
     ratio = packed.forward(thicker).depth / packed.forward(p).depth
     np.testing.assert_allclose(ratio, 1e6, rtol=1e-4)
+
+
+@pytest.mark.parametrize("channel", range(4))
+def test_what_is_not_a_number_shows(channel: int, packed: Kernels) -> None:
+    """Else a broken training would look like empty space."""
+    p = make_problem(2)
+    raw = p.raw.copy()
+    raw[..., channel] = np.nan
+    out = packed.forward(replace(p, raw=raw))
+    seen = out.n_samples > 0
+    assert seen.any()
+    colour = out.rgb if channel == 0 else out.rgb[:, [channel - 1]]
+    assert np.isnan(colour[seen]).all()
+    assert np.isnan(packed.train(replace(p, raw=raw))[0][seen]).all()

@@ -198,6 +198,7 @@ def _field(header: _Header, tensors: dict[str, np.ndarray], path: Path, workers:
         and steps.step > 0.0
         and steps.n_linear >= 0
         and steps.growth >= 0.0
+        and 0.0 <= steps.transmittance_min < 1.0
         and np.isfinite(values).all()
     )
     if not fits:

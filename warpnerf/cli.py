@@ -245,7 +245,8 @@ def _train(run: Run, scene: Scene, trainer: Trainer) -> int:
             run.save_field(trainer.field())
     if stop.exit_code is not None:
         step = trainer.steps_done
-        print(f"stopped and saved after step {step}; go on with: {run.resume_command}", flush=True)
+        saved = f"stopped and saved after step {step}; go on with: {run.resume_command}"
+        print(saved if run.last_step == step else f"stopped; {run.way_on()}", flush=True)
         return stop.exit_code
     print("rendering the test views", flush=True)
     far = 2.0 * trainer.content_distance

@@ -151,7 +151,7 @@ class TrainConfig:
     occupancy_every: int = 100
     """Steps between two looks for free space."""
     alpha_min: float = 1e-2
-    """A cell is free where a step of ``march.step_voxels`` would be less opaque than this."""
+    """A cell is free where the longest step that there can be would be less opaque than this."""
     seed: int = 0
     """Same seed, same number of threads: same bits on the CPU."""
     threads: int | None = None

@@ -149,17 +149,29 @@ def grid_size(extent: np.ndarray, voxels: int) -> tuple[int, int, int]:
     return int(size[0]), int(size[1]), int(size[2])
 
 
-def require_memory(size: tuple[int, int, int], arrays: int) -> None:
-    """Raise InputError if that many arrays of 16 bytes a node do not fit this machine's memory."""
-    if math.prod(size) >= 2**31:
-        raise InputError(f"grid.voxels must give fewer than 2^31 nodes, not {math.prod(size)}.")
-    needed = math.prod(size) * 16 * arrays
+def most_nodes(workers: Workers, itemsize: int) -> int:
+    """Nodes that kernels can count: 2^31, and 2^31 bytes between the rows of several workers."""
+    return 2**31 if workers.count == 1 else 2**31 // itemsize
+
+
+def require_memory(size: tuple[int, int, int], workers: Workers) -> None:
+    """Raise InputError if training a grid of this size does not fit this machine's memory.
+
+    It takes values, two moments and a gradient for each worker, of 16 bytes a node.
+    """
+    most = most_nodes(workers, 16)
+    if math.prod(size) >= most:
+        raise InputError(
+            f"grid.voxels must give fewer than {most} nodes on {workers.count} threads, not "
+            f"{math.prod(size)}; use fewer voxels."
+        )
+    needed = math.prod(size) * 16 * (3 + workers.count)
     total = usable_memory()
     if total is not None and needed > total:
         raise InputError(
             f"grid.voxels: a grid of {size[0]} x {size[1]} x {size[2]} nodes needs "
-            f"{needed / 2**30:.1f} GiB to train, but this machine has {total / 2**30:.1f} GiB; "
-            "use fewer voxels."
+            f"{needed / 2**30:.1f} GiB to train on {workers.count} threads, but this machine has "
+            f"{total / 2**30:.1f} GiB; use fewer voxels, or fewer threads."
         )
 
 

@@ -9,6 +9,7 @@ written, made, or believed is left for a temporary one, once in a process and wi
 from __future__ import annotations
 
 import atexit
+import contextlib
 import hashlib
 import logging
 import os
@@ -140,7 +141,8 @@ def _seal(folder: Path) -> None:
             new.write_text(text)
             new.replace(folder / SUMS)
     except OSError:
-        new.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # a read-only file system refuses even that
+            new.unlink(missing_ok=True)
 
 
 def _sums(folder: Path) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""How much memory there is to use, and giving it back."""
+"""What there is of the machine to use: memory, cores."""
 
 from __future__ import annotations
 
@@ -44,6 +44,13 @@ def _own() -> int | None:
         return None
     soft, _ = resource.getrlimit(resource.RLIMIT_AS)
     return None if soft == resource.RLIM_INFINITY else soft
+
+
+def usable_cores() -> int:
+    """Cores that this process may run on."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def give_back() -> None:

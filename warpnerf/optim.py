@@ -11,7 +11,7 @@ from warpnerf_kernels.types import vec4
 
 from warpnerf.config import OptimConfig
 from warpnerf.grid import VoxelGrid
-from warpnerf.parallel import Workers
+from warpnerf.parallel import NODES, Workers
 from warpnerf.render import Gradients
 
 
@@ -69,6 +69,7 @@ def adam_step(
         grid.values,
         moments.mean,
         moments.square,
+        chunk=NODES // tiles.STRETCH,
     )
     gradients.touched.zero_()
 
@@ -95,6 +96,7 @@ def add_total_variation(
         vec4(config.tv_every * config.tv_density, rgb, rgb, rgb),
         gradients.touched,
         gradients.rows,
+        chunk=NODES // tiles.STRETCH,
     )
 
 

@@ -7,7 +7,6 @@ whatever else the machine is doing.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -16,6 +15,7 @@ import warp as wp
 
 from warpnerf import kernel_cache
 from warpnerf.checks import InputError, require_at_least
+from warpnerf.memory import usable_cores
 
 NODES = 1 << 20
 RAYS = 1 << 13
@@ -49,8 +49,7 @@ class Workers:
                 f"device {device!r} is not available on this machine (found: {found}); "
                 "use --device cpu."
             ) from error
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        self.count = 1 if self.device.is_cuda else (threads or cores or 1)
+        self.count = 1 if self.device.is_cuda else (threads or usable_cores())
         self._pool = ThreadPoolExecutor(self.count - 1) if self.count > 1 else None
         self._loaded: set[Any] = set()
 

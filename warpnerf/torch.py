@@ -15,7 +15,7 @@ from warpnerf_kernels import contraction, gradscale, precision, tiles
 
 from warpnerf.checks import InputError, require_at_least, require_one_of, require_positive
 from warpnerf.config import Scaling
-from warpnerf.grid import free_struct, grid_struct
+from warpnerf.grid import free_struct, grid_struct, most_nodes
 from warpnerf.parallel import Workers
 from warpnerf.render import SCALINGS, Steps, scratch
 
@@ -370,8 +370,9 @@ def _require_grid(raw: torch.Tensor) -> None:
             f"raw must be [X, Y, Z, 4] with at least two nodes along each axis, "
             f"not {list(raw.shape)}."
         )
-    if raw.shape[:3].numel() >= 2**31:
-        raise InputError(f"raw must have fewer than 2^31 nodes, not {raw.shape[:3].numel()}.")
+    most = most_nodes(_workers(str(raw.device)), 4 * raw.element_size())
+    if raw.shape[:3].numel() >= most:
+        raise InputError(f"raw must have fewer than {most} nodes, not {raw.shape[:3].numel()}.")
 
 
 def _require_tensor(field: str, value: Any, like: torch.Tensor | None = None) -> None:

@@ -23,6 +23,9 @@ from warpnerf.pictures import png
 QUALITY = "18"
 """Constant rate factor of H.264: hardly to be told from the original."""
 
+MIN_FPS = 0.02
+"""A frame in fifty seconds; slower pauses have no place in the formats."""
+
 MAX_FPS = 1000.0
 MAX_GIF_FPS = 50.0
 """Pauses in a GIF are hundredths of a second, and viewers slow down a pause of one."""
@@ -48,6 +51,8 @@ def video_file(path: str | Path, fps: float) -> tuple[Path, str | None]:
     if path.suffix == ".mp4" and importlib.util.find_spec("av") is None:
         path = path.with_suffix(".gif")
         note = f'PyAV is not installed (pip install "warpnerf[video]"): writing {path} instead'
+    if fps < MIN_FPS:
+        raise InputError(f"{path}: at least {MIN_FPS:g} frames per second, not {fps:g}.")
     limit = MAX_GIF_FPS if path.suffix == ".gif" else MAX_FPS
     if fps > limit:
         raise InputError(

@@ -46,7 +46,8 @@ auto fma = [&](auto a, auto b, auto c) {
 // exp(x) = 2^n exp(r), r = x - n log 2 in two parts, |r| <= log(2) / 2.
 // The polynomial is (exp(r) - 1 - r) / r^2 at five Chebyshev points; relative error 7e-8.
 auto exponential = [&](vec x) -> vec {
-    x = least(most(x, all(-87.0f)), all(88.0f));
+    x = x < -87.0f ? all(-87.0f) : x;  // not by least and most, which would hide a NaN
+    x = x > 88.0f ? all(88.0f) : x;
     vec n = __builtin_elementwise_rint(x * 1.44269504f);
     vec r = fma(n, all(2.12194440e-4f), fma(n, all(-0.693359375f), x));
     vec p = fma(all(1.39261840e-3f), r, all(8.36317893e-3f));

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import tyro
 
-from warpnerf.checks import InputError
+from warpnerf.checks import InputError, require_at_least
+from warpnerf.memory import usable_cores
 
 
 def inspect_command(
@@ -38,12 +38,14 @@ def inspect_command(
             raise InputError(f"--output {output}: the plan is a PNG; let its name end in .png.")
         if not output.parent.is_dir():
             raise InputError(f"--output {output}: its folder does not exist; make it first.")
+    if threads is not None:
+        require_at_least("--threads", threads, 1)
     found = inspect(
         scene,
         downscale=downscale,
         content_distance=content_distance,
         near=near,
-        threads=threads or os.cpu_count() or 1,
+        threads=threads or usable_cores(),
     )
     print(found.to_json() if json else found, end="" if json else "\n")
     if output is not None:

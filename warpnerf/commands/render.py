@@ -43,7 +43,7 @@ def render_command(
             cameras look at one thing, else through.
         stills: Render the views of this split as PNG pictures instead of a video.
         output: FILE.mp4, FILE.gif, or a new folder for PNG frames; for stills a folder. By default
-            PATH.mp4 or stills/ in the run's folder.
+            PATH.mp4 (video.mp4 for auto) or stills/ in the run's folder.
         size: Of the colour picture, pixels; by default as the photographs.
         fps: Frames per second.
         seconds: Length of the video.
@@ -60,6 +60,10 @@ def render_command(
 
     if depths is not None:
         checked_depths(depths)
+    if distance is not None and (stills is not None or path != "back"):
+        raise InputError("--distance is how far --path back backs away; give both or neither.")
+    if stills is not None and path != "auto":
+        raise InputError("--stills renders the views of a split, along no path; give one of them.")
     run = Run(folder)
     config = run.read_config()
     if stills is None:

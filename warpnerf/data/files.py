@@ -148,7 +148,7 @@ def resolve_inside(folder: Path, relative: str, *, field: str) -> Path:
     """
     text = relative.replace("\\", "/")
     # Control characters in a name are no file's of ours, and would steer a terminal.
-    if not text or any(ord(character) < 32 for character in text):
+    if not text.isprintable() or not text:
         raise InputError(
             f"{field}: {_quoted(relative)} is not a path; name a file in the scene's folder."
         )
@@ -197,6 +197,11 @@ def find_image(folder: Path, file_path: str, *, field: str) -> Path | None:
             "can be read."
         ) from None
     return path
+
+
+def printable(text: str) -> str:
+    """Text out of a file for a terminal: what would steer it is spelled out."""
+    return text if text.isprintable() else _quoted(text)
 
 
 def _quoted(text: str) -> str:

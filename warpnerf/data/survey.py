@@ -10,7 +10,7 @@ import numpy as np
 
 from warpnerf.checks import InputError
 from warpnerf.data.blender import SPLITS, split_file
-from warpnerf.data.files import exists, read_json
+from warpnerf.data.files import exists, printable, read_json
 from warpnerf.data.poses import check_pose
 from warpnerf.data.transforms import FrameEntry, TransformsFile
 
@@ -91,4 +91,4 @@ def _unread_keys(raw: dict[str, Any]) -> list[str]:
     """Keys of a file and of its frames that nobody reads, and that nobody knows to be harmless."""
     known = {*WITHOUT_EFFECT, *TransformsFile.__struct_fields__, *FrameEntry.__struct_fields__}
     given = {*raw, *(key for frame in raw["frames"] for key in frame)}
-    return sorted(key[:40] for key in given - known)
+    return sorted(printable(key[:40]) for key in given - known)
