@@ -13,7 +13,7 @@ def test_the_python_of_the_readme_runs(
 ) -> None:
     pytest.importorskip("av")
     monkeypatch.chdir(tmp_path)
-    blocks = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    blocks = re.findall(r"```python\n(.*?)```", README, re.DOTALL)[:2]  # torch comes later
     assert len(blocks) == 2 and all(block.count("\n") <= 12 for block in blocks)
     code = "".join(blocks)
     for given, smaller in {
