@@ -148,7 +148,7 @@ def resolve_inside(folder: Path, relative: str, *, field: str) -> Path:
     """
     text = relative.replace("\\", "/")
     # Control characters in a name are no file's of ours, and would steer a terminal.
-    if not text.isprintable() or not text:
+    if not text or any(ord(c) < 0x20 or 0x7F <= ord(c) < 0xA0 for c in text):
         raise InputError(
             f"{field}: {_quoted(relative)} is not a path; name a file in the scene's folder."
         )
