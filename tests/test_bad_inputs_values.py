@@ -57,7 +57,7 @@ NAN = math.nan
         ),
         pytest.param(
             ["--voxels", str(12 * 10**7), "--threads", "1000"],  # 2 TB
-            "GiB to train, but this machine has",
+            "GiB to train on 1000 threads, but this machine has",
             id="61-more-than-the-memory",
         ),
         pytest.param(["--near", "-1"], "march.near", id="near-negative"),
