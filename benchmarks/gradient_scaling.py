@@ -37,10 +37,11 @@ from warpnerf_kernels import render as kernels
 from warpnerf_kernels.types import real, vec3
 from workload import Workload, make_workload
 
+from warpnerf.adjoint import AdjointLaunch, Gradients
 from warpnerf.config import Scaling
 from warpnerf.grid import FreeCells
 from warpnerf.parallel import Workers
-from warpnerf.render import JACOBIANS, SCALINGS, Gradients, TrainingPass, render_rays, scratch
+from warpnerf.render import JACOBIANS, SCALINGS, TrainingPass, render_rays, scratch
 
 N_RAYS = 1500
 N_STEPS = 200
@@ -78,17 +79,12 @@ class WarpAdjoint:
         )
         self._nothing = wp.zeros(len(rgb), dtype=real, device=workers.device)
         self._passes = {scaling: self._training_pass(scaling) for scaling in ("none", "clamped")}
-        vars(self._passes["clamped"]).update(
-            {
-                name: value
-                for name, value in vars(self._passes["none"]).items()
-                if isinstance(value, wp.array | Gradients)
-            }
-        )
+        share_memory(self._passes["none"], self._passes["clamped"])
 
     def _training_pass(self, scaling: Scaling) -> TrainingPass:
-        nodes = self._grid.values.shape[0]
-        return TrainingPass(self._batch.count, nodes, scaling, "none", "none", self._workers)
+        return TrainingPass(
+            self._batch.count, self._grid, self._steps, scaling, "none", self._workers
+        )
 
     @property
     def gradients(self) -> Gradients:
@@ -127,16 +123,32 @@ class WarpAdjoint:
             self._nothing,
             self._nothing,
             *scratch(kernels, variant, 1, self._workers),
-            self.gradients.rows,
-            self.gradients.touched,
         )
-        return lambda: self._workers.launch_owned(kernel, batch.count, *arguments)
+        launch = AdjointLaunch(
+            kernel,
+            variant,
+            self._grid.size,
+            self._steps.most(self._grid.diagonal),
+            batch.count,
+            self._workers,
+        )
+        gradient = self.gradients.struct()
+        return lambda: launch.run(batch.count, gradient, *arguments)
 
     def gradient_of(self, launch: Call) -> np.ndarray:
         """What a launch adds, [X, Y, Z, 4]."""
-        self.gradients.rows.zero_()
+        self.gradients.values.zero_()
         launch()
-        return self.gradients.rows.numpy().sum(axis=0).reshape(*self._grid.size, 4)
+        return self.gradients.values.numpy().reshape(*self._grid.size, 4)
+
+
+def share_memory(of: TrainingPass, to: TrainingPass) -> None:
+    """Give one pass the other's arrays, so that the two differ in what they do and not where."""
+    for name, value in vars(of).items():
+        if isinstance(value, wp.array | Gradients):
+            vars(to)[name] = value
+    if of.launch.scratch():
+        vars(to.launch)["_parcels"] = vars(of.launch)["_parcels"]
 
 
 def check(ours: WarpAdjoint, theirs: dict[Scaling, TorchPipeline]) -> None:

@@ -5,8 +5,8 @@
 Measured, on a number of threads at once:
 
     stream    an array much larger than the caches, read and written: bytes a second, both counted
-    line      a random 64-byte line read from a grid of some size, and the same line of a gradient
-              of the thread's own added to: what a sample's nodes cost if they are in no cache
+    line      a random 64-byte line read from a grid of some size, and added to a line of a gradient
+              of that size, in the thread's own part: what nodes cost if they are in no cache
     peak      fused multiply-adds on vectors in registers: operations a second, two for each
     cached    a sample of warpnerf's step on a grid that lies in a core's own caches
 
@@ -74,19 +74,23 @@ def update_stream(data: wp.array(dtype=wp.float32), worker: int, n_workers: int)
     + """
 const size_t n_lines = grid.shape[0] / 16;
 const wide* from = (const wide*)grid.data;
-wide* to = (wide*)(rows.data + (size_t)worker * rows.shape[1]);
+wide* to = (wide*)gradient.data + worker * (n_lines / n_workers);
 for (unsigned i = 0; i < (unsigned)count; ++i) {
     unsigned long long x = (i + 1ull + ((unsigned long long)worker << 32)) * 0x9E3779B97F4A7C15ull;
     x = (x ^ (x >> 32)) * 0xD6E8FEB86659FD93ull;
     const size_t line = ((x >> 32) * n_lines) >> 32;
-    to[line] = to[line] + from[line];
+    to[line / n_workers] += from[line];
 }
 """
 )
 def visit_lines(
-    grid: wp.array(dtype=wp.float32), rows: wp.array2d(dtype=wp.float32), worker: int, count: int
+    grid: wp.array(dtype=wp.float32),
+    gradient: wp.array(dtype=wp.float32),
+    worker: int,
+    n_workers: int,
+    count: int,
 ):
-    """Read random lines of the grid, and add them to the same lines of the worker's row."""
+    """Read random lines of the grid, and add them to lines of the worker's part of the gradient."""
     ...
 
 
@@ -127,9 +131,10 @@ def lines(
     worker: int,
     count: int,
     grid: wp.array(dtype=wp.float32),
-    rows: wp.array2d(dtype=wp.float32),
+    gradient: wp.array(dtype=wp.float32),
+    n_workers: int,
 ):
-    visit_lines(grid, rows, worker, count)
+    visit_lines(grid, gradient, worker, n_workers, count)
 
 
 @wp.kernel(enable_backward=False)
@@ -173,8 +178,9 @@ def measure(threads: int, grids: list[int], repeats: int = 5) -> Machine:
     for grid in grids:
         numbers = 4 * grid**3
         values = wp.full(numbers, 1.0, dtype=wp.float32, device="cpu")
-        rows = wp.full((threads, numbers), 1.0, dtype=wp.float32, device="cpu")
-        per_line[grid] = seconds(lines, n_lines, values, rows) / (n_lines * threads)
+        gradient = wp.full(numbers, 1.0, dtype=wp.float32, device="cpu")
+        cost = seconds(lines, n_lines, values, gradient, threads)
+        per_line[grid] = cost / (n_lines * threads)
     out = wp.zeros(threads, dtype=wp.float32, device="cpu")
     operations = 2 * 16 * 10 * n_chains * threads
     small = make_workload("random", 16, 4096, 256)

@@ -1,5 +1,6 @@
 """One rendering problem in plain numbers, driven through the kernels and through the oracle."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -11,6 +12,7 @@ import warp as wp
 from numpy.typing import NDArray
 from warpnerf_kernels import precision, tiles
 
+from warpnerf.adjoint import AdjointLaunch, gradient_struct
 from warpnerf.grid import CONTRACTIONS, free_struct, grid_struct
 from warpnerf.parallel import Workers
 from warpnerf.render import JACOBIANS, SCALINGS, Steps
@@ -105,6 +107,7 @@ class Kernels:
     def __init__(self, name: str, device: str, threads: int = 1, packed: bool = False) -> None:
         self.workers = Workers(device, threads)
         self.device = self.workers.device
+        self.alone = self.workers if self.device.is_cuda else Workers(device, 1)
         self.packed = packed
         self.precision = name
         self.render = precision.load(name, "render")
@@ -197,18 +200,11 @@ class Kernels:
 
     def backward(self, p: Problem, scaling: str = "none", jacobian: str = "none") -> Float64:
         """The gradient [X, Y, Z, 4] of the outputs' product with the problem's adjoints."""
-        return total_gradient(*self.backward_rows(p, scaling, jacobian)).reshape(p.raw.shape)
-
-    def backward_rows(
-        self, p: Problem, scaling: str = "none", jacobian: str = "none"
-    ) -> tuple[wp.array, wp.array]:
-        """The same in a row for each worker [n_workers, n_nodes], and the tiles' flags."""
-        gradients = self.zeros((self.workers.count, p.raw[..., 0].size), self.types.vec4)
-        touched = self.touched(*gradients.shape)
+        gradient = self.no_gradient(p.raw.shape)
         variant = self.variant(p, scaling, jacobian)
-        self.workers.launch_owned(
-            self.render.render_backward_kernel(variant),
+        self.adjoint(p, self.render.render_backward_kernel(variant), variant).run(
             p.n_rays,
+            gradient,
             *self._scene(p),
             *self._rays(p),
             self.array(p.content_distance),
@@ -217,28 +213,34 @@ class Kernels:
             self.array(p.adj_opacity),
             self.array(p.adj_depth),
             *self.scratch(variant, 0),
-            gradients,
-            touched,
         )
-        return gradients, touched
+        return found_gradient(gradient).reshape(p.raw.shape)
 
-    def touched(self, n_workers: int, n_nodes: int, value: int = 0) -> wp.array:
-        """Flags of the tiles of nodes that have a gradient."""
-        shape = (n_workers, -(-n_nodes // tiles.TILE))
-        return wp.full(shape, value, dtype=wp.uint8, device=self.device)
+    def adjoint(self, p: Problem, kernel: wp.Kernel, variant: Any) -> AdjointLaunch:
+        """How to launch a kernel that ends in a gradient."""
+        length = float(np.linalg.norm(p.box_max - p.box_min))
+        most = p.steps.most(math.inf if p.contraction != "none" else length)
+        size = (p.raw.shape[0], p.raw.shape[1], p.raw.shape[2])
+        return AdjointLaunch(kernel, variant, size, most, p.n_rays, self.workers)
+
+    def no_gradient(self, size: tuple[int, ...], flag: int = 0) -> Any:
+        """A kernel's Gradient of a grid [X, Y, Z, ...], zero, all tiles flagged alike."""
+        n_nodes = math.prod(size[:3])
+        values = self.zeros(n_nodes, self.types.vec4)
+        n_tiles = -(-n_nodes // tiles.TILE)
+        touched = wp.full(n_tiles, flag, dtype=wp.uint8, device=self.device)
+        return gradient_struct(self.types, values, touched)
 
     def train(
         self, p: Problem, scaling: str = "none", jacobian: str = "none", capacity: int = 64
     ) -> tuple[Float64, Float64]:
         """Squared errors [n_rays], and the gradient [X, Y, Z, 4] of their mean."""
-        workers = self.workers
         error, n_samples = self.zeros(p.n_rays), self.zeros(p.n_rays, wp.int32)
-        gradients = self.zeros((workers.count, p.raw[..., 0].size), self.types.vec4)
-        touched = self.touched(*gradients.shape)
+        gradient = self.no_gradient(p.raw.shape)
         variant = self.variant(p, scaling, jacobian)
-        workers.launch_owned(
-            self.render.render_train_kernel(variant),
+        self.adjoint(p, self.render.render_train_kernel(variant), variant).run(
             p.n_rays,
+            gradient,
             *self._scene(p),
             *self._rays(p),
             self.array(p.content_distance),
@@ -247,19 +249,17 @@ class Kernels:
             *self.scratch(variant, capacity),
             error,
             n_samples,
-            gradients,
-            touched,
         )
-        return error.numpy(), total_gradient(gradients, touched).reshape(p.raw.shape)
+        return error.numpy(), found_gradient(gradient).reshape(p.raw.shape)
 
 
-def total_gradient(gradients: wp.array, touched: wp.array) -> Float64:
-    """The sum over workers [n_nodes, 4]; every tile that holds some of it must be flagged."""
-    rows = gradients.numpy()
-    for row, flags in zip(rows, np.pad(touched.numpy(), ((0, 0), (0, 1))), strict=True):
-        tile = np.flatnonzero(row.any(axis=1)) // tiles.TILE
-        assert (flags[tile] | flags[tile - 1]).all()
-    return np.asarray(rows.sum(axis=0))
+def found_gradient(gradient: Any) -> Float64:
+    """What a kernel has added [n_nodes, 4]; every tile that holds some must be flagged."""
+    values = gradient.values.numpy()
+    flags = np.pad(gradient.touched.numpy(), (0, 1))
+    tile = np.flatnonzero(values.any(axis=1)) // tiles.TILE
+    assert (flags[tile] | flags[tile - 1]).all()
+    return np.asarray(values)
 
 
 def oracle(

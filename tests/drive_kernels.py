@@ -20,7 +20,7 @@ def _of(name: str) -> SimpleNamespace:
     activation = precision.load(name, "activation")
     contraction = precision.load(name, "contraction")
     gradscale = precision.load(name, "gradscale")
-    real, vec3, vec4 = types.real, types.vec3, types.vec4
+    real, vec3, vec4, Gradient = types.real, types.vec3, types.vec4, types.Gradient
 
     @wp.kernel(module="unique", enable_backward=False)
     def gather_points(
@@ -40,19 +40,17 @@ def _of(name: str) -> SimpleNamespace:
     @wp.kernel(module="unique", enable_backward=False)
     def scatter_points(
         first: int,
-        worker: int,
         size: wp.vec3i,
         points: wp.array(dtype=vec3),
         adj: wp.array(dtype=vec4),
-        out: wp.array2d(dtype=vec4),
-        touched: wp.array2d(dtype=wp.uint8),
+        gradient: Gradient,
     ):
         n = first + wp.tid()
         u = points[n]
         node = interp.lowest_node(u, size)
         base = interp.flat_index(node[0], node[1], node[2], size)
         fraction = u - vec3(real(node[0]), real(node[1]), real(node[2]))
-        interp.adj_gather(size, base, fraction, adj[n], worker, out, touched)
+        interp.adj_gather(size, base, fraction, adj[n], gradient)
 
     @wp.kernel(module="unique", enable_backward=False)
     def activate(

@@ -125,6 +125,8 @@ FLOORS = [
     {"interp", "activation", "contraction", "march", "gradscale", "loss"},
     {"integral", "vectors"},
     {"packs"},
+    {"parcels"},
+    {"integral_packed"},
     {"render", "regularize", "adam", "occupancy", "camera", "precision", "probe"},
 ]
 

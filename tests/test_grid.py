@@ -88,12 +88,13 @@ def test_grid_size_makes_cubes() -> None:
     assert grid_size(np.array([1.0, 1.0, 1e-9]), 8)[2] == 2
 
 
-def test_a_grid_larger_than_memory(workers: Workers) -> None:
-    require_memory((10, 10, 10), workers)
-    with pytest.raises(InputError, match=r"grid\.voxels: a grid of .* or fewer threads"):
-        require_memory((500, 500, 500), Workers("cpu", 400))
+def test_a_grid_larger_than_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("warpnerf.grid.usable_memory", lambda: 64 * 10**3)
+    require_memory((10, 10, 10))
+    with pytest.raises(InputError, match=r"grid\.voxels: a grid of .* use fewer voxels"):
+        require_memory((10, 10, 11))
     with pytest.raises(InputError, match=r"grid\.voxels must give fewer than \d+ nodes"):
-        require_memory((20000, 20000, 20000), workers)
+        require_memory((20000, 20000, 20000))
 
 
 def test_free_cells_of_a_grid(workers: Workers) -> None:

@@ -15,7 +15,7 @@ BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-4
 def step(
     kernels: Kernels,
     number: int,
-    gradients: Any,
+    adj: Any,
     values: Any,
     mean: Any,
     square: Any,
@@ -23,10 +23,11 @@ def step(
     flags: Any = None,
 ) -> tuple[Any, Any, Any, Any]:
     vec4 = kernels.types.vec4
-    touched = kernels.touched(*gradients.shape[:2], 1)
+    gradient = kernels.no_gradient((1, 1, len(adj)), flag=1)
+    gradient.values.assign(adj)
     if flags is not None:
-        touched.assign(np.asarray(flags, np.uint8))
-    arrays = [kernels.array(a, vec4) for a in (gradients, values, mean, square)]
+        gradient.touched.assign(np.asarray(flags, np.uint8))
+    arrays = [kernels.array(a, vec4) for a in (values, mean, square)]
     kernels.workers.launch(
         kernels.module("adam").adam_step,
         -(-len(values) // span),
@@ -37,11 +38,11 @@ def step(
         EPSILON,
         1.0 / (1.0 - BETA1**number),
         1.0 / (1.0 - BETA2**number),
-        touched,
+        gradient,
         *arrays,
     )
-    gradients, values, mean, square = (a.numpy() for a in arrays)
-    return gradients, values, mean, square
+    values, mean, square = (a.numpy() for a in arrays)
+    return gradient.values.numpy(), values, mean, square
 
 
 def test_against_the_oracle_skipping_exact_zeros(kernels64: Kernels) -> None:
@@ -50,12 +51,12 @@ def test_against_the_oracle_skipping_exact_zeros(kernels64: Kernels) -> None:
         state = [rng.normal(size=(30, 4)), np.zeros((30, 4)), np.zeros((30, 4))]
         expected = [torch.tensor(s) for s in state]
         for number in range(1, 6):
-            gradients = rng.normal(size=(3, 30, 4)) * 10.0 ** rng.uniform(-7, 0, size=(1, 30, 4))
-            gradients[:, rng.uniform(size=(30, 4)) < 0.3] = 0.0
-            gradients[:, :3] = 0.0  # whole nodes as well
-            total = torch.tensor(gradients[0] + gradients[1] + gradients[2])
+            adj = rng.normal(size=(30, 4)) * 10.0 ** rng.uniform(-7, 0, size=(30, 4))
+            adj[rng.uniform(size=(30, 4)) < 0.3] = 0.0
+            adj[:3] = 0.0  # whole nodes as well
+            total = torch.tensor(adj)
             before = state
-            after, *state = step(kernels64, number, gradients, *state)
+            after, *state = step(kernels64, number, adj, *state)
             assert not after.any()
             expected = list(
                 reference.adam(*expected, total, number, torch.tensor(RATE), BETA1, BETA2, EPSILON)
@@ -68,28 +69,17 @@ def test_against_the_oracle_skipping_exact_zeros(kernels64: Kernels) -> None:
                 assert (new[~still] != old[~still]).all()
 
 
-def test_gradients_that_cancel_between_workers_are_zeroed_too(kernels64: Kernels) -> None:
-    gradients = np.zeros((2, 5, 4))
-    gradients[0, 1, 2], gradients[1, 1, 2] = 0.7, -0.7
-    values = np.ones((5, 4))
-    after, new, mean, square = step(kernels64, 1, gradients, values, 0 * values, 0 * values)
-    assert np.array_equal(new, values) and not mean.any() and not square.any()
-    assert not after.any()
-
-
 def test_tiles_that_are_not_flagged_are_passed_over(kernels64: Kernels) -> None:
-    """Each worker's flags are of its own row."""
     rng = np.random.default_rng(4)
-    gradients, values = rng.normal(size=(2, 100, 4)), rng.normal(size=(100, 4))
-    flags = np.arange(100 // TILE) % 5 == np.array([[0], [2]])
+    adj, values = rng.normal(size=(100, 4)), rng.normal(size=(100, 4))
+    flags = np.arange(100 // TILE) % 5 == 2
     # The first node of the next tile may have been added to as well.
-    flagged = np.repeat(flags | np.roll(flags, 1, axis=1), TILE, axis=1)
-    assert not flagged.any(axis=0).all()
-    counted = np.where(flagged[..., None], gradients, 0.0)
+    flagged = np.repeat(flags | np.roll(flags, 1), TILE)
+    counted = np.where(flagged[:, None], adj, 0.0)
     expected = step(kernels64, 1, counted, values, 0 * values, 0 * values)
     for span in (1, TILE, 48):
-        found = step(kernels64, 1, gradients, values, 0 * values, 0 * values, span, flags)
+        found = step(kernels64, 1, adj, values, 0 * values, 0 * values, span, flags)
         for new, exact in zip(found[1:], expected[1:], strict=True):
             assert np.array_equal(new, exact)
         assert not found[0][flagged].any()
-        assert np.array_equal(found[0][~flagged], gradients[~flagged])
+        assert np.array_equal(found[0][~flagged], adj[~flagged])

@@ -37,20 +37,16 @@ def gather(kernels: Kernels, values: Any, u: Any) -> Any:
 
 def adj_gather(kernels: Kernels, shape: Any, u: Any, adj: Any) -> Any:
     types, n = kernels.types, len(u)
-    out = kernels.zeros((2, int(np.prod(shape[:3]))), types.vec4)
-    kernels.workers.launch(
+    gradient = kernels.no_gradient(shape)
+    kernels.alone.launch(
         drive_kernels.of(kernels).scatter_points,
         n,
-        1,
         wp.vec3i(*shape[:3]),
         kernels.array(u, types.vec3),
         kernels.array(adj, types.vec4),
-        out,
-        kernels.touched(*out.shape),
+        gradient,
     )
-    both = out.numpy()
-    assert not both[0].any()  # another worker's
-    return both[1].reshape(shape)
+    return gradient.values.numpy().reshape(shape)
 
 
 def test_gather_and_its_adjoint_against_the_oracle(kernels64: Kernels) -> None:
@@ -104,21 +100,21 @@ def test_only_tiles_around_the_point_are_flagged(kernels64: Kernels) -> None:
     types, size = kernels64.types, (6, 5, 40)
     for seed in range(N_SEEDS):
         u = np.random.default_rng(seed).uniform(size=(1, 3)) * (np.array(size) - 1)
-        out, touched = kernels64.zeros((1, 1200), types.vec4), kernels64.touched(1, 1200)
-        kernels64.workers.launch(
+        gradient = kernels64.no_gradient(size)
+        kernels64.alone.launch(
             drive_kernels.of(kernels64).scatter_points,
             1,
-            0,
             wp.vec3i(*size),
             kernels64.array(u, types.vec3),
             kernels64.array(np.ones((1, 4)), types.vec4),
-            out,
-            touched,
+            gradient,
         )
-        nodes = np.flatnonzero(out.numpy()[0].any(axis=-1))
+        nodes = np.flatnonzero(gradient.values.numpy().any(axis=-1))
         assert len(nodes) == 8
         # A pair of nodes along z flags the tile that it begins in.
-        assert np.array_equal(np.flatnonzero(touched.numpy()[0]), np.unique(nodes[::2] // TILE))
+        assert np.array_equal(
+            np.flatnonzero(gradient.touched.numpy()), np.unique(nodes[::2] // TILE)
+        )
 
 
 def test_activations_against_the_oracle(kernels64: Kernels) -> None:

@@ -102,21 +102,6 @@ def test_capacity_changes_nothing(packed: Kernels) -> None:
                 assert np.array_equal(gradient, in_one_slot[1])
 
 
-def test_workers_add_to_rows_of_their_own(packed: Kernels, on_cpu: None) -> None:
-    """The first row holds the gradient of the first half of the rays, and so on."""
-    p = make_problem(6, n_rays=20)
-    rows = Kernels("float32", "cpu", threads=2, packed=True).backward_rows(p)[0].numpy()
-    for row, mine in zip(rows, (np.arange(20) < 10, np.arange(20) >= 10), strict=True):
-        adjoints = {
-            "adj_rgb": p.adj_rgb * mine[:, None],
-            "adj_opacity": p.adj_opacity * mine,
-            "adj_depth": p.adj_depth * mine,
-        }
-        assert row.any()
-        expected = packed.backward(replace(p, **adjoints))
-        assert np.array_equal(row.reshape(p.raw.shape), expected)
-
-
 def test_limits_of_the_scaling(packed: Kernels) -> None:
     for seed in range(N_SEEDS):
         p = make_problem(seed)

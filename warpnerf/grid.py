@@ -13,7 +13,7 @@ from warpnerf_kernels import contraction, interp, occupancy, types
 from warpnerf_kernels.types import FreeSpace, Grid, March, vec3, vec4
 
 from warpnerf.checks import InputError
-from warpnerf.config import Contraction
+from warpnerf.config import MAX_VOXELS, Contraction
 from warpnerf.memory import usable_memory
 from warpnerf.parallel import Workers
 
@@ -46,6 +46,11 @@ class VoxelGrid:
         """Distance between nodes inside the box, [3] scene units."""
         extent = (self.box_max - self.box_min) * (1.0 + self.border)
         return extent / (np.array(self.size) - 1)
+
+    @property
+    def diagonal(self) -> float:
+        """Of the box, scene units."""
+        return float(np.linalg.norm(self.box_max - self.box_min))
 
     def struct(self) -> Grid:
         """The grid as kernels take it."""
@@ -149,29 +154,23 @@ def grid_size(extent: np.ndarray, voxels: int) -> tuple[int, int, int]:
     return int(size[0]), int(size[1]), int(size[2])
 
 
-def most_nodes(workers: Workers, itemsize: int) -> int:
-    """Nodes that kernels can count: 2^31, and 2^31 bytes between the rows of several workers."""
-    return 2**31 if workers.count == 1 else 2**31 // itemsize
-
-
-def require_memory(size: tuple[int, int, int], workers: Workers) -> None:
+def require_memory(size: tuple[int, int, int]) -> None:
     """Raise InputError if training a grid of this size does not fit this machine's memory.
 
-    It takes values, two moments and a gradient for each worker, of 16 bytes a node.
+    It takes values, two moments and a gradient, of 16 bytes a node.
     """
-    most = most_nodes(workers, 16)
-    if math.prod(size) >= most:
+    if math.prod(size) >= MAX_VOXELS:
         raise InputError(
-            f"grid.voxels must give fewer than {most} nodes on {workers.count} threads, not "
-            f"{math.prod(size)}; use fewer voxels."
+            f"grid.voxels must give fewer than {MAX_VOXELS} nodes, not {math.prod(size)}; use "
+            "fewer voxels."
         )
-    needed = math.prod(size) * 16 * (3 + workers.count)
+    needed = math.prod(size) * 16 * 4
     total = usable_memory()
     if total is not None and needed > total:
         raise InputError(
             f"grid.voxels: a grid of {size[0]} x {size[1]} x {size[2]} nodes needs "
-            f"{needed / 2**30:.1f} GiB to train on {workers.count} threads, but this machine has "
-            f"{total / 2**30:.1f} GiB; use fewer voxels, or fewer threads."
+            f"{needed / 2**30:.1f} GiB to train, but this machine has {total / 2**30:.1f} GiB; use "
+            "fewer voxels."
         )
 
 

@@ -267,7 +267,7 @@ def _cost(scene: Scene, config: TrainConfig, threads: int) -> Cost:
     voxels = config.grid.voxels
     images = sum(view.image.nbytes for view in scene.views)
     pixels = sum(camera.width * camera.height for camera in scene.training_cameras)
-    memory = 16 * (3 + threads) * voxels + images + 4 * pixels
+    memory = 16 * 4 * voxels + images + 4 * pixels
 
     with_alpha = any(view.image.shape[2] == 4 for view in scene.views)
     kind = "unbounded" if scene.unbounded else "object" if with_alpha else "room"

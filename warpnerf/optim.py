@@ -9,10 +9,10 @@ import warp as wp
 from warpnerf_kernels import adam, regularize, tiles
 from warpnerf_kernels.types import vec4
 
+from warpnerf.adjoint import Gradients
 from warpnerf.config import OptimConfig
 from warpnerf.grid import VoxelGrid
 from warpnerf.parallel import NODES, Workers
-from warpnerf.render import Gradients
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -48,7 +48,7 @@ def adam_step(
     Args:
         grid: Its values are updated; an entry whose gradient is exactly zero is left alone.
         moments: Updated likewise.
-        gradients: Summed in the order of workers.
+        gradients: Of a batch.
         step: Counts from 1.
         decay: Factor on the learning rates.
         config: The rest.
@@ -64,8 +64,7 @@ def adam_step(
         config.epsilon,
         1.0 / (1.0 - config.beta1**step),
         1.0 / (1.0 - config.beta2**step),
-        gradients.touched,
-        gradients.rows,
+        gradients.struct(),
         grid.values,
         moments.mean,
         moments.square,
@@ -81,7 +80,7 @@ def add_total_variation(
 
     Args:
         grid: The grid.
-        gradients: Added to, in a row that has some at the node.
+        gradients: Added to.
         config: Holds the weights, and how many steps this one gradient stands for.
         workers: Where to work.
     """
@@ -94,8 +93,7 @@ def add_total_variation(
         grid.values,
         wp.vec3i(*grid.size),
         vec4(config.tv_every * config.tv_density, rgb, rgb, rgb),
-        gradients.touched,
-        gradients.rows,
+        gradients.struct(),
         chunk=NODES // tiles.STRETCH,
     )
 

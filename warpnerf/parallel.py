@@ -62,11 +62,14 @@ class Workers:
             arguments: The rest of the kernel's arguments.
             chunk: Items per launch, NODES or RAYS.
         """
-        self._launch(kernel, n, lambda worker: arguments, chunk)
+        self._launch(kernel, n, lambda worker: arguments, chunk, 0)
 
-    def launch_owned(self, kernel: wp.Kernel, n: int, *arguments: Any, chunk: int = RAYS) -> None:
-        """Run kernel(first, worker, *arguments) likewise: it writes to rows that a worker owns."""
-        self._launch(kernel, n, lambda worker: (worker, *arguments), chunk)
+    def launch_owned(self, kernel: wp.Kernel, n: int, *arguments: Any, begin: int = 0) -> None:
+        """Run kernel(first, worker, *arguments) over items begin..n-1, of much work each.
+
+        It writes to rows that a worker owns; a worker's items all come before the next one's.
+        """
+        self._launch(kernel, n, lambda worker: (worker, *arguments), RAYS, begin)
 
     def load(self, kernel: wp.Kernel) -> None:
         """Compile a kernel, or fetch it from the cache, once: else every thread would."""
@@ -75,20 +78,26 @@ class Workers:
             self._loaded.add(kernel)
 
     def _launch(
-        self, kernel: wp.Kernel, n: int, arguments: Callable[[int], tuple[Any, ...]], chunk: int
+        self,
+        kernel: wp.Kernel,
+        end: int,
+        arguments: Callable[[int], tuple[Any, ...]],
+        chunk: int,
+        begin: int,
     ) -> None:
+        n = end - begin
         if n == 0:
             return
         self.load(kernel)
         if self.device.is_cuda:
-            wp.launch(kernel, n, inputs=[0, *arguments(0)], device=self.device)
+            wp.launch(kernel, n, inputs=[begin, *arguments(0)], device=self.device)
             return
 
         def share(worker: int) -> None:
-            end = n * (worker + 1) // self.count
-            for first in range(n * worker // self.count, end, chunk):
+            until = begin + n * (worker + 1) // self.count
+            for first in range(begin + n * worker // self.count, until, chunk):
                 inputs = [first, *arguments(worker)]
-                wp.launch(kernel, min(chunk, end - first), inputs=inputs, device=self.device)
+                wp.launch(kernel, min(chunk, until - first), inputs=inputs, device=self.device)
 
         others = [self._pool.submit(share, w) for w in range(1, self.count)] if self._pool else []
         try:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
-import numpy as np
 import warp as wp
-from warpnerf_kernels import gradscale, tiles, types
+from warpnerf_kernels import gradscale, types
 from warpnerf_kernels import render as kernels
-from warpnerf_kernels.types import real, vec3, vec4
+from warpnerf_kernels.types import real, vec3
 
+from warpnerf.adjoint import AdjointLaunch, Gradients
 from warpnerf.config import Jacobian, Scaling
 from warpnerf.grid import CONTRACTIONS, FreeCells, VoxelGrid
 from warpnerf.parallel import Workers
@@ -49,6 +50,16 @@ class Steps:
     """Each later step is (1 + growth) times the one before; 0: all are equal."""
     transmittance_min: float = 0.0
     """A ray ends where less light than this would pass."""
+
+    def most(self, length: float) -> int:
+        """How many steps a ray can take within `length` scene units, at most."""
+        linear = self.near + self.n_linear * self.step  # where growing steps begin
+        if self.growth == 0.0 or self.far <= linear:
+            shortest, in_all = self.step, (self.far - self.near) / self.step
+        else:
+            shortest = min(self.step, self.growth * linear)
+            in_all = self.n_linear + math.log(self.far / linear) / math.log1p(self.growth)
+        return min(int(min(in_all, length / shortest, 1e9)) + 4, 10**9)  # as prepare_ray counts
 
     def struct(self, types: ModuleType = types) -> Any:
         """The steps as kernels take them, in the precision of the given types."""
@@ -157,30 +168,6 @@ def scratch(
     return capacity, kept
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Gradients:
-    """The gradient of a loss with respect to a grid's values, in one row for each worker."""
-
-    rows: wp.array
-    """[n_workers, n_nodes] vec4; their sum over the workers is the gradient."""
-    touched: wp.array
-    """[n_workers, n_tiles] uint8, 0 where neither a tile nor the first node behind it has any."""
-
-    @staticmethod
-    def zeros(n_nodes: int, workers: Workers) -> Gradients:
-        """No gradient yet."""
-        n_tiles = -(-n_nodes // tiles.TILE)
-        if workers.device.is_cuda:
-            rows = wp.zeros((1, n_nodes), dtype=vec4, device=workers.device)
-        else:  # pages of zeros that take no memory until a gradient is added to them
-            zeros = np.zeros((workers.count, n_nodes, 4), np.float32)
-            rows = wp.array(zeros, dtype=vec4, device=workers.device, copy=False)
-        return Gradients(
-            rows=rows,
-            touched=wp.zeros((workers.count, n_tiles), dtype=wp.uint8, device=workers.device),
-        )
-
-
 class TrainingPass:
     """Forward, loss and scaled adjoint of ray batches in one launch, into gradients of its own.
 
@@ -190,35 +177,42 @@ class TrainingPass:
     def __init__(
         self,
         n_rays: int,
-        n_nodes: int,
+        grid: VoxelGrid,
+        steps: Steps,
         scaling: Scaling,
         jacobian: Jacobian,
-        contraction: str,
         workers: Workers,
     ) -> None:
-        """Allocate what a batch of n_rays into a grid of n_nodes needs, whatever its samples."""
+        """Allocate what batches of n_rays through such a grid need, by such steps."""
         device = workers.device
-        self._workers = workers
         variant = kernels.Variant(
-            CONTRACTIONS[contraction],
+            CONTRACTIONS[grid.contraction],
             SCALINGS[scaling],
             JACOBIANS[jacobian],
             packed=not device.is_cuda,
         )
-        self._kernel = kernels.render_train_kernel(variant)
+        self.launch = AdjointLaunch(
+            kernels.render_train_kernel(variant),
+            variant,
+            grid.size,
+            steps.most(math.inf if grid.contraction != "none" else grid.diagonal),
+            n_rays,
+            workers,
+        )
+        """How batches are put through."""
         self._capacity, self._kept = scratch(kernels, variant, KEPT_PACKS, workers)
         self.error = wp.zeros(n_rays, dtype=real, device=device)
         """[n_rays] squared error of the last batch."""
         self.n_samples = wp.zeros(n_rays, dtype=wp.int32, device=device)
         """[n_rays] visited steps of the last batch."""
-        self.gradients = Gradients.zeros(n_nodes, workers)
+        self.gradients = Gradients.zeros(grid.size, workers)
         """What batches have added up to since the last optimiser step."""
 
     def run(self, grid: VoxelGrid, free: FreeCells, steps: Steps, batch: RayBatch) -> None:
         """Add a batch's gradient to ``gradients``."""
-        self._workers.launch_owned(
-            self._kernel,
+        self.launch.run(
             batch.count,
+            self.gradients.struct(),
             grid.struct(),
             free.struct(grid.border),
             steps.struct(),
@@ -233,6 +227,4 @@ class TrainingPass:
             self._kept,
             self.error,
             self.n_samples,
-            self.gradients.rows,
-            self.gradients.touched,
         )

@@ -11,11 +11,12 @@ from typing import Any, NamedTuple, get_args
 import numpy as np
 import torch
 import warp as wp
-from warpnerf_kernels import contraction, gradscale, precision, tiles
+from warpnerf_kernels import contraction, gradscale, precision
 
+from warpnerf.adjoint import AdjointLaunch, gradient_struct, n_tiles
 from warpnerf.checks import InputError, require_at_least, require_one_of, require_positive
-from warpnerf.config import Scaling
-from warpnerf.grid import free_struct, grid_struct, most_nodes
+from warpnerf.config import MAX_VOXELS, Scaling
+from warpnerf.grid import free_struct, grid_struct
 from warpnerf.parallel import Workers
 from warpnerf.render import SCALINGS, Steps, scratch
 
@@ -270,16 +271,26 @@ class _Render(torch.autograd.Function):
         kernels, types = _device_code(raw)
         workers = _workers(str(raw.device))
         adj_rgb, adj_opacity, adj_depth = (grad.contiguous() for grad in grads)
-        n_nodes = raw.shape[:3].numel()
-        adj_raw = raw.new_zeros(workers.count, n_nodes, 4)
-        touched = torch.zeros(
-            workers.count, -(-n_nodes // tiles.TILE), dtype=torch.uint8, device=raw.device
+        size = (raw.shape[0], raw.shape[1], raw.shape[2])
+        adj_raw = raw.new_zeros(*size, 4)
+        touched = torch.zeros(n_tiles(size), dtype=torch.uint8, device=raw.device)
+        gradient = gradient_struct(
+            types, _array(adj_raw.reshape(-1, 4), types.vec4), _array(touched)
         )
         variant = _variant(raw, kernels, call.scaling)
+        diagonal = float(np.linalg.norm(call.corners[1] - call.corners[0]))
+        launch = AdjointLaunch(
+            kernels.render_backward_kernel(variant),
+            variant,
+            size,
+            call.steps.most(diagonal),
+            len(origins),
+            workers,
+        )
         with _stream(raw):
-            workers.launch_owned(
-                kernels.render_backward_kernel(variant),
+            launch.run(
                 len(origins),
+                gradient,
                 *_scene(raw, call, types),
                 *_ray_arrays(raw, origins, directions, call, types),
                 _array(call.content_distance),
@@ -291,10 +302,8 @@ class _Render(torch.autograd.Function):
                 _array(adj_opacity),
                 _array(adj_depth),
                 *scratch(kernels, variant, 1, workers),
-                _array(adj_raw, types.vec4),
-                _array(touched),
             )
-        return adj_raw.sum(0).reshape(raw.shape), None, None, None
+        return adj_raw, None, None, None
 
 
 @cache
@@ -370,9 +379,10 @@ def _require_grid(raw: torch.Tensor) -> None:
             f"raw must be [X, Y, Z, 4] with at least two nodes along each axis, "
             f"not {list(raw.shape)}."
         )
-    most = most_nodes(_workers(str(raw.device)), 4 * raw.element_size())
-    if raw.shape[:3].numel() >= most:
-        raise InputError(f"raw must have fewer than {most} nodes, not {raw.shape[:3].numel()}.")
+    if raw.shape[:3].numel() >= MAX_VOXELS:
+        raise InputError(
+            f"raw must have fewer than {MAX_VOXELS} nodes, not {raw.shape[:3].numel()}."
+        )
 
 
 def _require_tensor(field: str, value: Any, like: torch.Tensor | None = None) -> None:

@@ -310,7 +310,7 @@ class Trainer:
         border = 0.0 if contraction == "none" else config.border
         extent = (scene.box_max - scene.box_min) * (1.0 + border)
         final = grid_size(extent, config.voxels)
-        require_memory(final, self.workers)
+        require_memory(final)
         size = grid_size(extent, self._voxels(0))
         voxel = float((extent / (np.array(final) - 1)).min())
         n = math.prod(size)
@@ -334,10 +334,10 @@ class Trainer:
     def _training_pass(self) -> TrainingPass:
         return TrainingPass(
             self.config.rays_per_step,
-            math.prod(self.grid.size),
+            self.grid,
+            self.march_steps(),
             self.config.scaling,
             self.config.jacobian,
-            self.grid.contraction,
             self.workers,
         )
 

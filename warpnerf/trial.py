@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 import warp as wp
 from warpnerf_kernels import precision, tiles
 
+from warpnerf.adjoint import AdjointLaunch, gradient_struct, n_tiles
 from warpnerf.config import Contraction, Scaling
 from warpnerf.grid import CONTRACTIONS, free_struct, grid_struct
 from warpnerf.parallel import Workers
@@ -160,11 +162,11 @@ class TrialKernels:
 
     def gradient(self, trial: Trial, scaling: Scaling = "none") -> np.ndarray:
         """The backward launch: the gradient [X, Y, Z, 4] of the trial's loss."""
-        rows, touched = self._gradients(trial)
+        gradient = self._no_gradient(trial.raw.shape)
         variant = self._variant(trial, scaling)
-        self._workers.launch_owned(
-            self._render.render_backward_kernel(variant),
+        self._adjoint(trial, self._render.render_backward_kernel(variant), variant).run(
             trial.n_rays,
+            gradient,
             *self._scene(trial),
             *self._rays(trial),
             self._array(trial.content_distance),
@@ -172,22 +174,18 @@ class TrialKernels:
             self._array(trial.rgb_slope, self._types.vec3),
             self._array(trial.opacity_slope),
             self._array(trial.depth_slope),
-            *scratch(
-                self._render, variant, 1, self._workers
-            ),  # which keeps nothing between launches
-            rows,
-            touched,
+            *scratch(self._render, variant, 1, self._workers),  # nothing is kept between launches
         )
-        return _total(rows, touched).reshape(trial.raw.shape)
+        return _total(gradient).reshape(trial.raw.shape)
 
     def train(self, trial: Trial, scaling: Scaling = "none") -> tuple[np.ndarray, np.ndarray]:
         """The training launch: squared errors [n_rays], the gradient [X, Y, Z, 4] of their mean."""
         error, n_samples = self._zeros(trial.n_rays), self._zeros(trial.n_rays, wp.int32)
-        rows, touched = self._gradients(trial)
+        gradient = self._no_gradient(trial.raw.shape)
         variant = self._variant(trial, scaling)
-        self._workers.launch_owned(
-            self._render.render_train_kernel(variant),
+        self._adjoint(trial, self._render.render_train_kernel(variant), variant).run(
             trial.n_rays,
+            gradient,
             *self._scene(trial),
             *self._rays(trial),
             self._array(trial.content_distance),
@@ -196,10 +194,8 @@ class TrialKernels:
             *scratch(self._render, variant, KEPT_PACKS, self._workers),
             error,
             n_samples,
-            rows,
-            touched,
         )
-        return error.numpy(), _total(rows, touched).reshape(trial.raw.shape)
+        return error.numpy(), _total(gradient).reshape(trial.raw.shape)
 
     def gather(self, values: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Values [X, Y, Z, 4] at points [n, 3] in grid coordinates: [n, 4]."""
@@ -216,17 +212,17 @@ class TrialKernels:
 
     def scatter(self, size: tuple[int, ...], points: np.ndarray, out: np.ndarray) -> np.ndarray:
         """The transpose of ``gather``, which hands [n, 4] to the nodes: [X, Y, Z, 4]."""
-        rows, touched = self._rows(int(np.prod(size)))
-        self._workers.launch_owned(
+        gradient = self._no_gradient(size)
+        workers = self._workers if self._workers.device.is_cuda else Workers("cpu", 1)
+        workers.launch(
             self._probe.gather_backward,
             len(points),
             wp.vec3i(*size),
             self._array(points, self._types.vec3),
             self._array(out, self._types.vec4),
-            rows,
-            touched,
+            gradient,
         )
-        return _total(rows, touched).reshape(*size, 4)
+        return _total(gradient).reshape(*size, 4)
 
     def _forward(self, trial: Trial) -> tuple[wp.array, ...]:
         out = (
@@ -279,14 +275,23 @@ class TrialKernels:
             self._array(trial.background, self._types.vec3),
         )
 
-    def _gradients(self, trial: Trial) -> tuple[wp.array, wp.array]:
-        return self._rows(trial.raw[..., 0].size)
+    def _no_gradient(self, size: tuple[int, ...]) -> Any:
+        """A kernel's Gradient of a grid [X, Y, Z, ...], zero."""
+        x, y, z = size[:3]
+        values = self._zeros(x * y * z, self._types.vec4)
+        return gradient_struct(self._types, values, self._zeros(n_tiles((x, y, z)), wp.uint8))
 
-    def _rows(self, n_nodes: int) -> tuple[wp.array, wp.array]:
-        """A row of gradients for each worker, and flags of the tiles that have one."""
-        n_workers, n_tiles = self._workers.count, -(-n_nodes // tiles.TILE)
-        rows = self._zeros((n_workers, n_nodes), self._types.vec4)
-        return rows, self._zeros((n_workers, n_tiles), wp.uint8)
+    def _adjoint(self, trial: Trial, kernel: wp.Kernel, variant: Any) -> AdjointLaunch:
+        x, y, z = trial.raw.shape[:3]
+        length = float(np.linalg.norm(BOX_MAX - BOX_MIN))
+        return AdjointLaunch(
+            kernel,
+            variant,
+            (x, y, z),
+            trial.steps.most(math.inf if trial.contraction != "none" else length),
+            trial.n_rays,
+            self._workers,
+        )
 
     def _array(self, values: np.ndarray, dtype: Any = None) -> wp.array:
         dtype = dtype or self._types.real
@@ -297,14 +302,14 @@ class TrialKernels:
         return wp.zeros(shape, dtype=dtype or self._types.real, device=self._workers.device)
 
 
-def _total(rows: wp.array, touched: wp.array) -> np.ndarray:
-    """The sum over workers, [n_nodes, 4] float64.
+def _total(gradient: Any) -> np.ndarray:
+    """[n_nodes, 4] float64.
 
     NaN in tiles that hold gradient and are not flagged: the optimiser would not see them.
     """
-    found = rows.numpy().astype(np.float64)
-    flags = np.pad(touched.numpy(), ((0, 0), (0, 1))) != 0
-    tile = np.arange(found.shape[1]) // tiles.TILE
-    seen = flags[:, tile] | flags[:, tile - 1]  # the column added stands before the first tile
-    found[found.any(axis=2) & ~seen] = np.nan
-    return np.asarray(found.sum(axis=0))
+    found = gradient.values.numpy().astype(np.float64)
+    flags = np.pad(gradient.touched.numpy(), (1, 0)) != 0
+    tile = 1 + np.arange(len(found)) // tiles.TILE
+    seen = flags[tile] | flags[tile - 1]
+    found[found.any(axis=1) & ~seen] = np.nan
+    return np.asarray(found)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import get_args
 
 import warp as wp
-from warpnerf_kernels import adam, camera, interp, occupancy, regularize, render
+from warpnerf_kernels import adam, camera, interp, occupancy, parcels, regularize, render
 
 from warpnerf import kernel_cache
 from warpnerf.config import PRESETS, Contraction, Jacobian, Scaling
@@ -40,6 +40,7 @@ def training_kernels(
     return [
         camera.sample_pixels,
         render.render_train_kernel(variant),
+        *([parcels.deliver] if variant.packed else []),
         regularize.total_variation_backward,
         adam.adam_step,
         occupancy.mark_occupied,

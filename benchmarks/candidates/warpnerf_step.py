@@ -1,82 +1,38 @@
-"""warpnerf: its training launch, and the workers' rows folded into one as the optimiser does it."""
+"""warpnerf: its training pass, and the zeroing that the optimiser does for it in training."""
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import warp as wp
-from warpnerf_kernels.tiles import STRETCH, TILE, flagged, next_tile, prefetch_row, tile_of
-from warpnerf_kernels.types import vec4
+from warpnerf_kernels.tiles import STRETCH, TILE, next_tile, tile_of
+from warpnerf_kernels.types import Gradient, vec4
 from workload import Workload
 
 from warpnerf.parallel import Workers
 from warpnerf.render import TrainingPass, render_rays
 
 
-@wp.func_native("""
-auto* sum = &rows.data[node].c[0];
-auto* row = &rows.data[(size_t)worker * rows.shape[1] + node].c[0];
-for (int n = 0; n < 4 * count; ++n) {
-    sum[n] += row[n];
-    row[n] = 0;
-}
-""")
-def add_row(rows: wp.array2d(dtype=vec4), worker: int, node: int, count: int):
-    """Add some nodes of a worker's row to the first row, and zero them."""
+@wp.func_native("memset(values.data + node, 0, sizeof(*values.data) * count);")
+def clear_nodes(values: wp.array(dtype=vec4), node: int, count: int):
+    """Zero some nodes."""
     ...
-
-
-@wp.func_native("memset(&rows.data[node], 0, sizeof(rows.data[node]) * count);")
-def clear_row(rows: wp.array2d(dtype=vec4), node: int, count: int):
-    """Zero some nodes of the first row."""
-    ...
-
-
-@wp.kernel(enable_backward=False)
-def fold(
-    first: int,
-    span: int,  # nodes per thread
-    touched: wp.array2d(dtype=wp.uint8),  # [n_workers, n_tiles] as adj_gather left it
-    gradients: wp.array2d(dtype=vec4),  # [n_workers, n_nodes] row 0 becomes the sum, the rest zero
-):
-    """Like adam_step, of which this is the part that has to do with gradients: tile by tile."""
-    start = (first + wp.tid()) * span
-    end = wp.min(start + span, gradients.shape[1])
-    last = tile_of(end - 1) + 1
-    tile = next_tile(touched, tile_of(start), last)
-    while tile < last:
-        prefetch_row(gradients, 0, tile * wp.static(TILE))
-        for worker in range(1, gradients.shape[0]):
-            if flagged(touched, worker, tile):
-                prefetch_row(gradients, worker, tile * wp.static(TILE))
-        tile = next_tile(touched, tile + 1, last)
-    tile = next_tile(touched, tile_of(start), last)
-    while tile < last:
-        node = wp.max(start, tile * wp.static(TILE))
-        count = wp.min(end, (tile + 1) * wp.static(TILE)) - node
-        for worker in range(1, gradients.shape[0]):
-            if flagged(touched, worker, tile):
-                add_row(gradients, worker, node, count)
-        tile = next_tile(touched, tile + 1, last)
 
 
 @wp.kernel(enable_backward=False)
 def clear(
     first: int,
-    span: int,
-    touched: wp.array2d(dtype=wp.uint8),  # [n_workers, n_tiles]
-    gradients: wp.array2d(dtype=vec4),  # [n_workers, n_nodes] row 0 is zeroed
+    span: int,  # nodes per thread
+    gradient: Gradient,  # zeroed
 ):
-    """Make way for the next step; what was not touched is zero."""
+    """What adam_step has to do with gradients: zero what was touched."""
     start = (first + wp.tid()) * span
-    end = wp.min(start + span, gradients.shape[1])
+    end = wp.min(start + span, gradient.values.shape[0])
     last = tile_of(end - 1) + 1
-    tile = next_tile(touched, tile_of(start), last)
+    tile = next_tile(gradient.touched, tile_of(start), last)
     while tile < last:
         node = wp.max(start, tile * wp.static(TILE))
-        clear_row(gradients, node, wp.min(end, (tile + 1) * wp.static(TILE)) - node)
-        tile = next_tile(touched, tile + 1, last)
+        clear_nodes(gradient.values, node, wp.min(end, (tile + 1) * wp.static(TILE)) - node)
+        tile = next_tile(gradient.touched, tile + 1, last)
 
 
 class WarpStep:
@@ -90,26 +46,23 @@ class WarpStep:
         self._free = work.free_cells(workers)
         self._steps = work.steps()
         self._batch = work.batch(workers)
-        self._span = 1 if workers.device.is_cuda else STRETCH
         scaling = "clamped" if work.scaled else "none"
-        n_nodes = math.prod(self._size[:3])
-        self._pass = TrainingPass(self._batch.count, n_nodes, scaling, "none", "none", workers)
+        self._pass = TrainingPass(
+            self._batch.count, self._grid, self._steps, scaling, "none", workers
+        )
 
     def step(self) -> None:
-        """One launch between the zeroing and the adding up of what was touched."""
-        self._for_touched(clear)
-        self._pass.gradients.touched.zero_()
-        self._pass.run(self._grid, self._free, self._steps, self._batch)
-        self._for_touched(fold)
-
-    def _for_touched(self, kernel: wp.Kernel) -> None:
+        """Zero what the last step touched, then the training pass."""
         gradients = self._pass.gradients
-        n = -(-gradients.rows.shape[1] // self._span)
-        self._workers.launch(kernel, n, self._span, gradients.touched, gradients.rows)
+        span = 1 if self._workers.device.is_cuda else STRETCH
+        n = -(-gradients.values.shape[0] // span)
+        self._workers.launch(clear, n, span, gradients.struct())
+        gradients.touched.zero_()
+        self._pass.run(self._grid, self._free, self._steps, self._batch)
 
     def gradient(self) -> np.ndarray:
         """[X, Y, Z, 4]"""
-        return self._pass.gradients.rows.numpy()[0].reshape(self._size)
+        return self._pass.gradients.values.numpy().reshape(self._size)
 
     def rgb(self) -> np.ndarray:
         """[n_rays, 3]"""
@@ -131,7 +84,8 @@ class WarpStep:
 
     def scratch_bytes(self) -> int:
         """All arrays of the training pass but the gradient."""
-        arrays = [*vars(self._pass).values(), self._pass.gradients.touched]
+        launch = self._pass.launch
+        arrays = [*vars(self._pass).values(), self._pass.gradients.touched, *launch.scratch()]
         return sum(array.capacity for array in arrays if isinstance(array, wp.array))
 
 

@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from .tiles import TILE, flagged, next_tile, prefetch, prefetch_row, tile_of
-from .types import real, vec4
+from .tiles import TILE, next_tile, prefetch, tile_of
+from .types import Gradient, real, vec4
 
 wp.set_module_options({"enable_backward": False})
 
@@ -18,8 +18,7 @@ def adam_step(
     epsilon: real,
     correction1: real,  # 1 / (1 - beta1^step)
     correction2: real,  # 1 / (1 - beta2^step)
-    touched: wp.array2d(dtype=wp.uint8),  # [n_workers, n_tiles] as adj_gather left it
-    gradients: wp.array2d(dtype=vec4),  # [n_workers, n_nodes] summed in order, then zeroed
+    gradient: Gradient,  # zeroed
     values: wp.array(dtype=vec4),  # [n_nodes] updated
     mean: wp.array(dtype=vec4),  # [n_nodes] first moment, updated
     square: wp.array(dtype=vec4),  # [n_nodes] second moment, updated
@@ -28,32 +27,27 @@ def adam_step(
     start = (first + wp.tid()) * span
     end = wp.min(start + span, values.shape[0])
     last = tile_of(end - 1) + 1
-    tile = next_tile(touched, tile_of(start), last)
+    tile = next_tile(gradient.touched, tile_of(start), last)
     while tile < last:
         node = tile * wp.static(TILE)
-        for worker in range(gradients.shape[0]):
-            if flagged(touched, worker, tile):
-                prefetch_row(gradients, worker, node)
+        prefetch(gradient.values, node)
         prefetch(values, node)
         prefetch(mean, node)
         prefetch(square, node)
-        tile = next_tile(touched, tile + 1, last)
+        tile = next_tile(gradient.touched, tile + 1, last)
     zero = vec4()
-    tile = next_tile(touched, tile_of(start), last)
+    tile = next_tile(gradient.touched, tile_of(start), last)
     while tile < last:
         node = tile * wp.static(TILE)
         for i in range(wp.max(start, node), wp.min(end, node + wp.static(TILE))):
-            gradient = vec4()
-            for worker in range(gradients.shape[0]):
-                if flagged(touched, worker, tile):
-                    gradient += gradients[worker, i]
-                    gradients[worker, i] = zero
-            if not (gradient == zero):
+            adj = gradient.values[i]
+            if not (adj == zero):
+                gradient.values[i] = zero
                 value = values[i]
                 m = mean[i]
                 v = square[i]
                 for channel in range(4):
-                    g = gradient[channel]
+                    g = adj[channel]
                     m_new = beta1 * m[channel] + (real(1.0) - beta1) * g
                     v_new = beta2 * v[channel] + (real(1.0) - beta2) * g * g
                     x_new = value[channel] - learning_rate[channel] * (correction1 * m_new) / (
@@ -65,4 +59,4 @@ def adam_step(
                 values[i] = value
                 mean[i] = m
                 square[i] = v
-        tile = next_tile(touched, tile + 1, last)
+        tile = next_tile(gradient.touched, tile + 1, last)

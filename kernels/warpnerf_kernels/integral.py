@@ -27,7 +27,7 @@ from .march import (
     step_edge,
     step_length,
 )
-from .types import FreeSpace, Grid, Integral, March, Ray, Sample, real, vec3, vec4
+from .types import FreeSpace, Gradient, Grid, Integral, March, Ray, Sample, real, vec3, vec4
 
 wp.set_module_options({"enable_backward": False})
 
@@ -50,9 +50,7 @@ def adj_shade(
     sample: Sample,
     adj_sigma: real,
     adj_rgb: vec3,
-    worker: int,
-    adj_values: wp.array2d(dtype=vec4),  # [n_workers, X * Y * Z], added to
-    touched: wp.array2d(dtype=wp.uint8),  # [n_workers, n_tiles] as in interp.adj_gather
+    gradient: Gradient,  # added to
 ):
     """Hand the gradients of a sample's density and colour to the nodes around it."""
     adj_density = adj_softplus(sample.sigma_slope, adj_sigma)
@@ -62,9 +60,7 @@ def adj_shade(
         sample.base,
         sample.fraction,
         vec4(adj_density, adj_raw[0], adj_raw[1], adj_raw[2]),
-        worker,
-        adj_values,
-        touched,
+        gradient,
     )
 
 
@@ -182,9 +178,8 @@ def adj_integrate(
     scaling: int,
     jacobian: int,
     kept: wp.array(dtype=Sample),  # read, as integrate left it
-    worker: int,
-    adj_values: wp.array2d(dtype=vec4),  # [n_workers, X * Y * Z], added to
-    touched: wp.array2d(dtype=wp.uint8),  # [n_workers, n_tiles] as in interp.adj_gather
+    worker: int,  # of which there must be one on the CPU
+    gradient: Gradient,  # added to
 ):
     """Adjoint of integrate. With G_i = dL/dw_i = <adj_rgb, c_i> + adj_depth t_i,
 
@@ -217,4 +212,4 @@ def adj_integrate(
         scale = distance_scale(sample.t, content_distance, sample.det_jacobian, scaling, jacobian)
         adj_sigma = scale * (sample.dt * (transmittance * adj_weight - behind))
         adj_sample_rgb = scale * (weight * adj_rgb)
-        adj_shade(grid, sample, adj_sigma, adj_sample_rgb, worker, adj_values, touched)
+        adj_shade(grid, sample, adj_sigma, adj_sample_rgb, gradient)

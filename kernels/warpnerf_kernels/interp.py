@@ -3,7 +3,7 @@
 import warp as wp
 
 from .tiles import tile_of
-from .types import real, vec3, vec4
+from .types import Gradient, real, vec3, vec4
 
 wp.set_module_options({"enable_backward": False})
 
@@ -59,11 +59,12 @@ def adj_gather(
     base: int,
     fraction: vec3,
     adj_value: vec4,
-    worker: int,
-    adj_values: wp.array2d(dtype=vec4),  # [n_workers, X * Y * Z], added to
-    touched: wp.array2d(dtype=wp.uint8),  # [n_workers, n_tiles] set to 1 where a pair begins
+    gradient: Gradient,  # added to
 ):
-    """Transpose of gather: hands adj_value to the eight nodes with the weights it was made with."""
+    """Transpose of gather: hands adj_value to the eight nodes with the weights it was made with.
+
+    Additions are atomic on CUDA; on the CPU only one thread may call this at a time.
+    """
     stride_y = size[2]
     stride_x = size[1] * size[2]
     fx = fraction[0]
@@ -77,22 +78,22 @@ def adj_gather(
     n10 = base + stride_x
     n11 = base + stride_x + stride_y
     yes = wp.uint8(1)
-    touched[worker, tile_of(n00)] = yes
-    touched[worker, tile_of(n01)] = yes
-    touched[worker, tile_of(n10)] = yes
-    touched[worker, tile_of(n11)] = yes
+    gradient.touched[tile_of(n00)] = yes
+    gradient.touched[tile_of(n01)] = yes
+    gradient.touched[tile_of(n10)] = yes
+    gradient.touched[tile_of(n11)] = yes
     low = gx * gy * adj_value
-    wp.atomic_add(adj_values, worker, n00, gz * low)
-    wp.atomic_add(adj_values, worker, n00 + 1, fz * low)
+    wp.atomic_add(gradient.values, n00, gz * low)
+    wp.atomic_add(gradient.values, n00 + 1, fz * low)
     low = gx * fy * adj_value
-    wp.atomic_add(adj_values, worker, n01, gz * low)
-    wp.atomic_add(adj_values, worker, n01 + 1, fz * low)
+    wp.atomic_add(gradient.values, n01, gz * low)
+    wp.atomic_add(gradient.values, n01 + 1, fz * low)
     low = fx * gy * adj_value
-    wp.atomic_add(adj_values, worker, n10, gz * low)
-    wp.atomic_add(adj_values, worker, n10 + 1, fz * low)
+    wp.atomic_add(gradient.values, n10, gz * low)
+    wp.atomic_add(gradient.values, n10 + 1, fz * low)
     low = fx * fy * adj_value
-    wp.atomic_add(adj_values, worker, n11, gz * low)
-    wp.atomic_add(adj_values, worker, n11 + 1, fz * low)
+    wp.atomic_add(gradient.values, n11, gz * low)
+    wp.atomic_add(gradient.values, n11 + 1, fz * low)
 
 
 @wp.kernel

@@ -11,11 +11,8 @@ cannot return a vector: they hand on what they compute in a ``Pack``, scratch me
 import warp as wp
 
 from .contraction import L2, NONE
-from .gradscale import distance_scale
-from .integral import behind_limit, next_sample
-from .march import step_edge
-from .types import FreeSpace, Grid, Integral, March, Ray, real, vec3, vec4
-from .vectors import LANES, VECTORS, float3, float4, lanes, lanes_int
+from .types import FreeSpace, Grid, March, Ray
+from .vectors import VECTORS, float3, float4, lanes, lanes_int
 
 wp.set_module_options({"enable_backward": False})
 
@@ -33,12 +30,15 @@ class Pack:
     t: lanes  # distance from the ray's origin
     dt: lanes  # step length
     det_jacobian: lanes  # |det J| of the contraction, 1 without
-    base: lanes_int  # flat index of the lowest of the eight nodes around
+    i: lanes_int  # index along x of the lowest of the eight nodes around
+    base: lanes_int  # its flat index
     share_00: lanes  # of the four columns of nodes around, by x and y; together 1
     share_01: lanes
     share_10: lanes
     share_11: lanes
-    fraction_z: lanes  # position between a column's two nodes, [0, 1]
+    fraction_x: lanes  # position between the nodes, [0, 1]
+    fraction_y: lanes
+    fraction_z: lanes
     sigma_slope: lanes  # d sigma / d raw density
     attenuation: lanes  # exp(-sigma dt)
     alpha: lanes  # 1 - attenuation
@@ -114,11 +114,14 @@ store_int(pack.visited, visited);
 store(pack.t, visited ? t : all(0.0f));
 store(pack.dt, dt);
 store(pack.det_jacobian, det_jacobian);
+store_int(pack.i, i);
 store_int(pack.base, index(i, j, l));
 store(pack.share_00, gx * gy);
 store(pack.share_01, gx * fy);
 store(pack.share_10, fx * gy);
 store(pack.share_11, fx * fy);
+store(pack.fraction_x, fx);
+store(pack.fraction_y, fy);
 store(pack.fraction_z, visited ? uz - to_float(l) : all(0.0f));
 pack.step = step;
 // Memory is slower than all of this: fetch what the next eight steps will read, going straight on.
@@ -196,53 +199,6 @@ def shade(grid: Grid, packs: wp.array(dtype=Pack), slot: int):
     VECTORS
     + r"""
 auto& pack = packs.data[slot];
-auto* values = adj_values.data + (size_t)worker * adj_values.shape[1];
-auto* flags = touched.data + (size_t)worker * touched.shape[1];
-for (int n = 0; n < 8; ++n) fetch(values + packs.data[later].base.c[n], size);
-const int stride_y = size.c[2], stride_x = stride_y * size.c[1];
-vec red = load(pack.red), green = load(pack.green), blue = load(pack.blue);
-quad adj[8];
-to_quads(
-    load(pack.sigma_slope) * load(pack.adj_sigma),
-    red * (1.0f - red) * load(pack.adj_red),
-    green * (1.0f - green) * load(pack.adj_green),
-    blue * (1.0f - blue) * load(pack.adj_blue),
-    adj);
-#pragma clang loop unroll(full)
-for (int n = 0; n < 8; ++n) {
-    if (!pack.visited.c[n]) continue;
-    quad high = pack.fraction_z.c[n] * adj[n], low = adj[n] - high;
-    auto add = [&](int node, float share) {
-        quad_at* column = (quad_at*)(values + node);
-        column[0] = fma(quad(share), low, quad(column[0]));
-        column[1] = fma(quad(share), high, quad(column[1]));
-        flags[(unsigned)node / TILE] = 1;
-    };
-    const int base = pack.base.c[n];
-    add(base, pack.share_00.c[n]);
-    add(base + stride_y, pack.share_01.c[n]);
-    add(base + stride_x, pack.share_10.c[n]);
-    add(base + stride_x + stride_y, pack.share_11.c[n]);
-}
-"""
-)
-def adj_shade(
-    size: wp.vec3i,
-    packs: wp.array(dtype=Pack),
-    slot: int,
-    later: int,  # slot of a pack whose turn comes soon
-    worker: int,
-    adj_values: wp.array2d(dtype=float4),  # [n_workers, X * Y * Z], added to
-    touched: wp.array2d(dtype=wp.uint8),  # [n_workers, n_tiles] as in interp.adj_gather
-):
-    """integral.adj_shade, down to interp.adj_gather; one by one, as samples may share nodes."""
-    ...
-
-
-@wp.func_native(
-    VECTORS
-    + r"""
-auto& pack = packs.data[slot];
 ivec visited = load_int(pack.visited);
 vec light = transmittance * running_product(visited ? load(pack.attenuation) : all(1.0f));
 vec before = __builtin_shufflevector(light, all(transmittance), 8, 0, 1, 2, 3, 4, 5, 6);
@@ -301,125 +257,3 @@ def adj_composite(
 ):
     """What integral.adj_integrate does with a sample, for those of a pack."""
     ...
-
-
-@wp.func
-def next_pack(
-    grid: Grid,
-    free: FreeSpace,
-    march: March,
-    ray: Ray,
-    first: int,  # step to begin looking at
-    transmittance: float,  # of what lies before
-    contraction: int,
-    packs: wp.array(dtype=Pack),  # written
-    slot: int,
-) -> int:
-    """Fill a pack with the next sample and the seven steps behind it; returns the step after them.
-
-    That is ray.end where nothing is left, or not enough light. The walk is the plain one.
-    """
-    sample = next_sample(grid, free, march, ray, first, contraction)
-    place(
-        grid,
-        free,
-        march,
-        ray,
-        sample.step,
-        step_edge(march, wp.max(sample.step, march.n_linear)),
-        contraction,
-        packs,
-        slot,
-    )
-    shade(grid, packs, slot)
-    composite(transmittance, march.transmittance_min, packs, slot)
-    if packs[slot].passed < march.transmittance_min:
-        return ray.end
-    return wp.min(sample.step + LANES, ray.end)
-
-
-@wp.func
-def integrate(
-    grid: Grid,
-    free: FreeSpace,
-    march: March,
-    ray: Ray,
-    row: int,  # first slot of this worker
-    capacity: int,  # its slots; all packs that do not fit share the last one
-    contraction: int,
-    packs: wp.array(dtype=Pack),  # [n_workers * capacity] written
-) -> Integral:
-    """integral.integrate, a pack at a time."""
-    total = Integral()
-    total.transmittance = real(1.0)
-    step = int(ray.begin)
-    n = int(0)
-    while step < ray.end:
-        slot = row + wp.min(n, capacity - 1)
-        step = next_pack(
-            grid, free, march, ray, step, total.transmittance, contraction, packs, slot
-        )
-        n += 1
-        integral = packs[slot].integral
-        total.rgb += vec3(integral[0], integral[1], integral[2])
-        total.depth += integral[3]
-        total.transmittance = packs[slot].passed
-        total.n_samples += packs[slot].n_samples
-    return total
-
-
-@wp.func
-def adj_integrate(
-    grid: Grid,
-    free: FreeSpace,
-    march: March,
-    ray: Ray,
-    total: Integral,
-    background: vec3,
-    adj_rgb: vec3,  # of the colour, background included
-    adj_opacity: real,
-    adj_depth: real,
-    content_distance: real,
-    row: int,
-    capacity: int,
-    contraction: int,
-    scaling: int,
-    jacobian: int,
-    packs: wp.array(dtype=Pack),  # as integrate left it
-    worker: int,
-    adj_values: wp.array2d(dtype=vec4),  # [n_workers, X * Y * Z], added to
-    touched: wp.array2d(dtype=wp.uint8),  # [n_workers, n_tiles] as in interp.adj_gather
-):
-    """integral.adj_integrate, a pack at a time; those that shared the last slot are made again."""
-    adj_transmittance = wp.dot(adj_rgb, background) - adj_opacity
-    behind = (
-        wp.dot(adj_rgb, total.rgb)
-        + adj_depth * total.depth
-        + adj_transmittance * total.transmittance
-    )
-    limit = behind_limit(march, ray, adj_transmittance, adj_rgb, adj_depth)
-    transmittance = real(1.0)
-    step = int(ray.begin)
-    n = int(0)
-    n_samples = int(0)
-    while n_samples < total.n_samples and step < ray.end:
-        slot = row + wp.min(n, capacity - 1)
-        if n >= capacity - 1:
-            step = next_pack(grid, free, march, ray, step, transmittance, contraction, packs, slot)
-        else:
-            step = packs[slot].step + LANES
-        n += 1
-        n_samples += packs[slot].n_samples
-        transmittance = packs[slot].passed
-        t = packs[slot].t
-        det_jacobian = packs[slot].det_jacobian
-        scale = lanes()
-        for lane in range(LANES):
-            scale[lane] = distance_scale(
-                t[lane], content_distance, det_jacobian[lane], scaling, jacobian
-            )
-        packs[slot].scale = scale
-        adj_composite(adj_rgb, adj_depth, behind, limit, packs, slot)
-        behind = packs[slot].behind
-        later = row + wp.min(n + 1, capacity - 1)
-        adj_shade(grid.size, packs, slot, later, worker, adj_values, touched)

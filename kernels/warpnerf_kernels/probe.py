@@ -3,7 +3,7 @@
 import warp as wp
 
 from .interp import adj_gather, flat_index, gather, lowest_node
-from .types import real, vec3, vec4
+from .types import Gradient, real, vec3, vec4
 
 
 @wp.func
@@ -30,15 +30,13 @@ def gather_forward(
 @wp.kernel(enable_backward=False)
 def gather_backward(
     first: int,
-    worker: int,  # row of adj_values
     size: wp.vec3i,
     points: wp.array(dtype=vec3),  # [n] grid coordinates
     adj_out: wp.array(dtype=vec4),  # [n]
-    adj_values: wp.array2d(dtype=vec4),  # [n_workers, X * Y * Z], added to
-    touched: wp.array2d(dtype=wp.uint8),  # [n_workers, n_tiles] as in interp.adj_gather
+    gradient: Gradient,  # added to
 ):
     """Transpose of gather_forward."""
     i = first + wp.tid()
     node = lowest_node(points[i], size)
     base = flat_index(node[0], node[1], node[2], size)
-    adj_gather(size, base, fraction_of(points[i], node), adj_out[i], worker, adj_values, touched)
+    adj_gather(size, base, fraction_of(points[i], node), adj_out[i], gradient)

@@ -7,8 +7,8 @@ huber(d) = d^2 / 2 for |d| <= 1, |d| - 1/2 beyond: an edge costs its height, not
 import warp as wp
 
 from .interp import flat_index
-from .tiles import TILE, flagged, next_tile, prefetch, prefetch_row, tile_of
-from .types import real, vec4
+from .tiles import TILE, next_tile, prefetch, tile_of
+from .types import Gradient, real, vec4
 
 wp.set_module_options({"enable_backward": False})
 
@@ -111,8 +111,7 @@ def total_variation_backward(
     values: wp.array(dtype=vec4),  # [X * Y * Z]
     size: wp.vec3i,
     weight: vec4,  # per channel
-    touched: wp.array2d(dtype=wp.uint8),  # [n_workers, n_tiles] as adj_gather left it
-    adj_values: wp.array2d(dtype=vec4),  # [n_workers, X * Y * Z], added to where not 0
+    gradient: Gradient,  # added to where not 0
 ):
     """d TV / d x at the nodes that already have a gradient; unseen ones stay as they are."""
     start = (first + wp.tid()) * span
@@ -120,27 +119,20 @@ def total_variation_backward(
     last = tile_of(end - 1) + 1
     stride_y = size[2]
     stride_x = size[1] * size[2]
-    tile = next_tile(touched, tile_of(start), last)
+    tile = next_tile(gradient.touched, tile_of(start), last)
     while tile < last:
         node = tile * wp.static(TILE)
-        for worker in range(adj_values.shape[0]):
-            if flagged(touched, worker, tile):
-                prefetch_row(adj_values, worker, node)
+        prefetch(gradient.values, node)
         prefetch(values, node)
         prefetch(values, node - stride_y)
         prefetch(values, node + stride_y)
         prefetch(values, node - stride_x)
         prefetch(values, node + stride_x)
-        tile = next_tile(touched, tile + 1, last)
-    tile = next_tile(touched, tile_of(start), last)
+        tile = next_tile(gradient.touched, tile + 1, last)
+    tile = next_tile(gradient.touched, tile_of(start), last)
     while tile < last:
         node = tile * wp.static(TILE)
         for n in range(wp.max(start, node), wp.min(end, node + wp.static(TILE))):
-            seen = int(-1)
-            for worker in range(adj_values.shape[0]):
-                if flagged(touched, worker, tile):
-                    if not (adj_values[worker, n] == vec4()):
-                        seen = worker
-            if seen >= 0:
-                adj_values[seen, n] += adj_node_variation(values, size, weight, n)
-        tile = next_tile(touched, tile + 1, last)
+            if not (gradient.values[n] == vec4()):
+                gradient.values[n] += adj_node_variation(values, size, weight, n)
+        tile = next_tile(gradient.touched, tile + 1, last)

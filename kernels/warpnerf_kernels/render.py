@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import warp as wp
 
-from . import integral, packs
+from . import integral, integral_packed, packs, parcels
 from .loss import adj_squared_error, squared_error
 from .march import prepare_ray
-from .types import FreeSpace, Grid, Integral, March, Sample, real, vec3, vec4
+from .types import FreeSpace, Gradient, Grid, Integral, March, Sample, real, vec3
 
 
 class Variant(NamedTuple):
@@ -28,6 +28,11 @@ class Variant(NamedTuple):
 def kept_type(variant: Variant) -> type:
     """What these kernels keep of a ray between the passes: samples or packs of eight."""
     return packs.Pack if variant.packed else Sample
+
+
+def gradient_type(variant: Variant) -> type:
+    """What these kernels add to: the gradient, or that and parcels on their way to it."""
+    return parcels.Parcels if variant.packed else Gradient
 
 
 @wp.func
@@ -46,7 +51,7 @@ def ray_value(values: wp.array(dtype=real), ray: int) -> real:  # noqa: F811 (an
 def render_forward_kernel(variant: Variant) -> wp.Kernel:
     """Render rays; what it depends on of the variant is the contraction."""
     contraction = variant.contraction
-    walk = packs if variant.packed else integral
+    walk = integral_packed if variant.packed else integral
     integrate = walk.integrate
     Kept = kept_type(variant)
 
@@ -89,16 +94,17 @@ def render_forward_kernel(variant: Variant) -> wp.Kernel:
 def render_backward_kernel(variant: Variant) -> wp.Kernel:
     """Adjoint of render_forward, replaying its rays; gradients of samples are scaled."""
     contraction = variant.contraction
-    walk = packs if variant.packed else integral
+    walk = integral_packed if variant.packed else integral
     adj_integrate = walk.adj_integrate
     Kept = kept_type(variant)
+    OutGradient = gradient_type(variant)
     scaling = variant.scaling
     jacobian = variant.jacobian
 
     @wp.kernel(module="unique", enable_backward=False)
     def render_backward(
         first: int,  # this launch works on rays first, first + 1, ...
-        worker: int,  # row of adj_values and of kept
+        worker: int,  # row of kept; owner of a part of the gradient
         # scene
         grid: Grid,
         free: FreeSpace,
@@ -122,8 +128,7 @@ def render_backward_kernel(variant: Variant) -> wp.Kernel:
         capacity: int,  # of kept, for each worker: 1 in packs, else 0; nothing is kept
         kept: wp.array(dtype=Kept),  # [n_workers * capacity]
         # out
-        adj_values: wp.array2d(dtype=vec4),  # [n_workers, X * Y * Z], added to
-        touched: wp.array2d(dtype=wp.uint8),  # [n_workers, n_tiles] as in interp.adj_gather
+        out_gradient: OutGradient,  # of the grid's values, added to
     ):
         i = first + wp.tid()
         ray = prepare_ray(
@@ -152,8 +157,7 @@ def render_backward_kernel(variant: Variant) -> wp.Kernel:
             jacobian,
             kept,
             worker,
-            adj_values,
-            touched,
+            out_gradient,
         )
 
     return render_backward
@@ -163,16 +167,17 @@ def render_backward_kernel(variant: Variant) -> wp.Kernel:
 def render_train_kernel(variant: Variant) -> wp.Kernel:
     """Forward, loss and adjoint of a batch in one launch."""
     contraction = variant.contraction
-    walk = packs if variant.packed else integral
+    walk = integral_packed if variant.packed else integral
     integrate, adj_integrate = walk.integrate, walk.adj_integrate
     Kept = kept_type(variant)
+    OutGradient = gradient_type(variant)
     scaling = variant.scaling
     jacobian = variant.jacobian
 
     @wp.kernel(module="unique", enable_backward=False)
     def render_train(
         first: int,  # this launch works on rays first, first + 1, ...
-        worker: int,  # row of adj_values and of kept
+        worker: int,  # row of kept; owner of a part of the gradient
         # scene
         grid: Grid,
         free: FreeSpace,
@@ -191,8 +196,7 @@ def render_train_kernel(variant: Variant) -> wp.Kernel:
         # out
         out_error: wp.array(dtype=real),  # [n_rays] squared error
         out_n_samples: wp.array(dtype=wp.int32),  # [n_rays]
-        adj_values: wp.array2d(dtype=vec4),  # [n_workers, X * Y * Z], added to
-        touched: wp.array2d(dtype=wp.uint8),  # [n_workers, n_tiles] as in interp.adj_gather
+        out_gradient: OutGradient,  # of the grid's values, added to
     ):
         i = first + wp.tid()
         row = worker * capacity
@@ -222,8 +226,7 @@ def render_train_kernel(variant: Variant) -> wp.Kernel:
             jacobian,
             kept,
             worker,
-            adj_values,
-            touched,
+            out_gradient,
         )
 
     return render_train

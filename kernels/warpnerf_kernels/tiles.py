@@ -21,34 +21,19 @@ def tile_of(node: int) -> int:
     return node // wp.static(TILE)
 
 
-@wp.func
-def flagged(touched: wp.array2d(dtype=wp.uint8), worker: int, tile: int) -> bool:
-    """Whether a worker may have added to a tile of its row."""
-    if touched[worker, tile] != wp.uint8(0):
-        return True
-    if tile > 0:
-        return touched[worker, tile - 1] != wp.uint8(0)
-    return False
-
-
 @wp.func_native("""
-int first = end;
-for (int worker = 0; worker < touched.shape[0]; ++worker) {
-    const wp::uint8* flags = touched.data + (size_t)worker * touched.shape[1];
-    int t = tile;
-    if (t < end && !flags[t] && !(t > 0 && flags[t - 1])) {
-        wp::uint64 eight = 0;
-        for (++t; t + 8 <= first && !eight; t += 8) memcpy(&eight, flags + t, 8);
-        if (eight) t -= 8;
-        while (t < first && !flags[t]) ++t;
-    }
-    if (t < first) first = t;
+const wp::uint8* flags = touched.data;
+int t = tile;
+if (t < end && !flags[t] && !(t > 0 && flags[t - 1])) {
+    wp::uint64 eight = 0;
+    for (++t; t + 8 <= end && !eight; t += 8) memcpy(&eight, flags + t, 8);
+    if (eight) t -= 8;
+    while (t < end && !flags[t]) ++t;
 }
-return first;
+return t;
 """)
-def next_tile(touched: wp.array2d(dtype=wp.uint8), tile: int, end: int) -> int:
-    """The first tile at or after `tile` to which any worker may have added; `end` if there is none
-    before it."""
+def next_tile(touched: wp.array(dtype=wp.uint8), tile: int, end: int) -> int:
+    """The first tile at or after `tile` that may hold gradient; `end` if there is none before."""
     ...
 
 
@@ -59,14 +44,4 @@ __builtin_prefetch(values.data + node);
 """)
 def prefetch(values: wp.array(dtype=vec4), node: int):
     """Bring a node's cache line in, ahead of its use; CUDA has other ways to wait."""
-    ...
-
-
-@wp.func_native("""
-#if !defined(__CUDA_ARCH__)
-__builtin_prefetch(rows.data + (size_t)row * rows.shape[1] + node);
-#endif
-""")
-def prefetch_row(rows: wp.array2d(dtype=vec4), row: int, node: int):
-    """The same in one of several rows."""
     ...

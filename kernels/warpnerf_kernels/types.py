@@ -29,6 +29,14 @@ class Grid:
 
 
 @wp.struct
+class Gradient:
+    """The gradient of a loss with respect to a grid's values; see tiles.py."""
+
+    values: wp.array(dtype=vec4)  # [X * Y * Z]
+    touched: wp.array(dtype=wp.uint8)  # [n_tiles] 1 where a pair of nodes begins that got some
+
+
+@wp.struct
 class FreeSpace:
     """Where nothing needs sampling: over the grid's domain, cells of their own size."""
 

@@ -1,4 +1,4 @@
-"""The words that packs.py is written in: vectors of eight lanes, in C++ for Clang."""
+"""The words of packs.py and parcels.py: vectors of eight lanes, in C++ for Clang."""
 
 import warp as wp
 
@@ -73,6 +73,13 @@ auto sum = [&](vec x) -> float {
     quad h = x.lo + x.hi;
     return (h[0] + h[2]) + (h[1] + h[3]);
 };
+auto bits = [&](ivec x) -> unsigned {  // bit n: lane n is not 0
+    typedef bool flags __attribute__((ext_vector_type(8)));
+    return __builtin_bit_cast(unsigned char, __builtin_convertvector(x, flags));
+};
+auto each = [&](unsigned lanes, auto visit) {  // the lanes whose bits are set
+    for (; lanes; lanes &= lanes - 1) visit(__builtin_ctz(lanes));
+};
 auto count = [&](ivec x) -> int { return -__builtin_reduce_add(x); };
 // In lane i the sum, or product, of lanes 0 to i.
 auto running_sum = [&](vec x) -> vec {
@@ -124,5 +131,6 @@ auto fetch = [&](const auto* node, const auto& size) {
 };
 """
 )
-"""What a native function of packs.py begins with. vec and ivec hold a number for each of eight
-steps, quad the four channels of a node; names with _at are the same where they lie in memory."""
+"""What a native function of packs.py or parcels.py begins with. vec and ivec hold a number for each
+of eight steps, quad the four channels of a node; names with _at are the same where they lie in
+memory."""

@@ -1,0 +1,109 @@
+"""Several workers, one gradient: who adds where, and that nothing is lost on the way."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+from drive import Kernels, Problem, assert_close, make_problem, unbounded
+from test_kernel_render import early, masked
+from warpnerf_kernels import parcels
+
+from warpnerf import adjoint
+from warpnerf.render import Steps
+
+PLANES = 5
+"""Of nodes along x, in the problems here."""
+
+
+@pytest.fixture(autouse=True)
+def _(on_cpu: None) -> None: ...
+
+
+def problem(seed: int) -> Problem:
+    """Rays enough for chains of several blocks."""
+    p = make_problem(seed, n_rays=301, steps=Steps(near=0.0, far=4.0, step=0.04))
+    return replace(p, raw=np.random.default_rng(seed).normal(size=(PLANES, 7, 6, 4)))
+
+
+def of(threads: int) -> Kernels:
+    return Kernels("float32", "cpu", threads=threads, packed=True)
+
+
+@pytest.mark.parametrize("threads", [2, 3, 4, PLANES + 2])
+@pytest.mark.parametrize("scaling", ["none", "clamped"])
+def test_one_thread_against_more(threads: int, scaling: str) -> None:
+    for seed in range(3):
+        for p in (problem(seed), early(masked(problem(seed), seed))):
+            error, gradient = of(1).train(p, scaling)
+            again = of(threads).train(p, scaling)
+            assert np.array_equal(again[0], error)  # no sum over rays
+            assert_close(again[1], gradient, 3e-6)
+            assert_close(of(threads).backward(p, scaling), of(1).backward(p, scaling), 3e-6)
+
+
+@pytest.mark.parametrize("contraction", ["none", "linf"])
+def test_rays_in_turns(contraction: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where parcels of all rays do not fit, nor those of one."""
+    p = problem(1)
+    if contraction != "none":
+        p = unbounded(p, contraction, 0.2)
+    at_once = of(2).train(p)
+    for samples in (1, 20_000):
+        monkeypatch.setattr(adjoint, "SAMPLES", samples)
+        in_turns = of(2).train(p)
+        assert np.array_equal(in_turns[0], at_once[0])
+        assert_close(in_turns[1], at_once[1], 3e-6)
+        assert_close(of(2).backward(p), of(1).backward(p), 3e-6)
+
+
+def test_workers_add_to_no_planes_but_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before anything is delivered, and for each delivery by itself."""
+    p = problem(2)
+    whole = of(1).backward(p)
+    seen = []
+
+    def deliver_in_turns(kernels: Kernels) -> None:
+        launch = kernels.workers.launch
+
+        def spy(kernel: wp.Kernel, n: int, size: wp.vec3i, sent: parcels.Parcels) -> None:
+            planes = -(-PLANES // n)
+            for worker in range(n):
+                before = sent.gradient.values.numpy().copy()
+                wp.launch(kernel, 1, inputs=[worker, size, sent], device="cpu")
+                changed = sent.gradient.values.numpy() != before
+                changed = np.flatnonzero(changed.reshape(whole.shape).any((1, 2, 3)))
+                assert len(changed) and (changed // planes == worker).all()
+                seen.append(worker)
+            launch(kernel, n, size, sent)  # there is nothing left
+
+        monkeypatch.setattr(kernels.workers, "launch", spy)
+
+    for threads in (2, 3):
+        kernels = of(threads)
+        deliver_in_turns(kernels)
+        assert_close(kernels.backward(p), whole, 3e-6)
+    assert seen == [0, 1, 0, 1, 2]
+
+
+def test_what_a_worker_adds_at_once_is_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All rays given to one worker of three: what it does not own is in parcels."""
+    p = problem(3)
+    whole = of(1).backward(p)
+    kernels = of(3)
+    launch, make_parcels = kernels.workers.launch_owned, adjoint._make_parcels
+    planes: list[list[int]] = []
+
+    def by_owner(kernel: wp.Kernel, n: int, *arguments: Any, begin: int = 0) -> None:
+        if "backward" not in kernel.key:
+            return launch(kernel, n, *arguments, begin=begin)
+        wp.launch(kernel, n, inputs=[0, len(planes), *arguments], device="cpu")
+        found = arguments[-1].gradient.values.numpy().reshape(whole.shape)
+        planes.append(np.flatnonzero(found.any((1, 2, 3))).tolist())
+
+    monkeypatch.setattr(kernels.workers, "launch_owned", by_owner)
+    monkeypatch.setattr(adjoint, "_make_parcels", lambda n, workers: make_parcels(3 * n, workers))
+    for _ in range(3):
+        assert_close(kernels.backward(p), whole, 3e-6)
+    assert planes == [[0, 1], [2, 3], [4]]
