@@ -306,6 +306,7 @@ def test_other_threads_are_allowed_and_noted(trained: tuple[Path, str]) -> None:
         (("--near", "0.1"), "march.near is 0.1"),
         (("--seed", "1"), "seed is 1"),
         (("--downscale", "8"), "--downscale does not go with --resume"),
+        (("--downscale", "0"), "--downscale does not go with --resume"),
         (("--preset", "fast"), "--preset does not go with --resume"),
         (("--overwrite",), "--overwrite does not go with --resume"),
         (("--output", "elsewhere"), "--output does not go with --resume"),

@@ -26,13 +26,15 @@ def test_a_table_and_a_plan(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert {path.name for path in tmp_path.iterdir()} == {"scene", "plan.png"}
 
 
-def test_json_is_all_that_is_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_transforms(tmp_path, 6)
-    assert inspect_command(str(tmp_path), json=True, near=50.0, output=tmp_path / "a.png") == 0
-    facts = json.loads(capsys.readouterr().out)
+def test_json(tmp_path: Path) -> None:
+    write_transforms(tmp_path / "scene", 6)
+    file = tmp_path / "facts.json"
+    assert inspect_command(str(tmp_path / "scene"), json=file, near=50.0) == 0
+    facts = json.loads(file.read_text())
     assert facts["views"] == 6
     assert any("the near plane begins 50" in oddity for oddity in facts["odd"])
-    assert (tmp_path / "a.png").exists()
+    with pytest.raises(InputError, match=r"--json .*its folder does not exist"):
+        inspect_command(str(tmp_path / "scene"), json=tmp_path / "nowhere" / "facts.json")
 
 
 @pytest.mark.parametrize("output", ["plan.jpg", "nowhere/plan.png", "folder.png"])

@@ -90,11 +90,12 @@ def test_grid_size_makes_cubes() -> None:
 
 def test_a_grid_larger_than_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("warpnerf.grid.usable_memory", lambda: 64 * 10**3)
-    require_memory((10, 10, 10))
+    cpu = wp.get_device("cpu")
+    require_memory((10, 10, 10), cpu)
     with pytest.raises(InputError, match=r"grid\.voxels: a grid of .* use fewer voxels"):
-        require_memory((10, 10, 11))
+        require_memory((10, 10, 11), cpu)
     with pytest.raises(InputError, match=r"grid\.voxels must give fewer than \d+ nodes"):
-        require_memory((20000, 20000, 20000))
+        require_memory((20000, 20000, 20000), cpu)
 
 
 def test_free_cells_of_a_grid(workers: Workers) -> None:

@@ -106,7 +106,7 @@ def train_command(
     if resume is not None:
         fixed = {"output": output, "preset": preset, "downscale": downscale, "overwrite": overwrite}
         for name, value in fixed.items():
-            if value:
+            if value is not None and value is not False:
                 raise InputError(
                     f"--{name} does not go with --resume: the run in {resume} goes on as it was "
                     "begun; leave it out."
@@ -347,7 +347,7 @@ def main(arguments: list[str] | None = None) -> int:
             file=sys.stderr,
         )
         return BAD_INPUT
-    except OSError as error:
+    except (OSError, FloatingPointError) as error:
         print(f"warpnerf: error: {error}", file=sys.stderr)
         return FAILED
     except Stopped as stopped:

@@ -154,8 +154,8 @@ def grid_size(extent: np.ndarray, voxels: int) -> tuple[int, int, int]:
     return int(size[0]), int(size[1]), int(size[2])
 
 
-def require_memory(size: tuple[int, int, int]) -> None:
-    """Raise InputError if training a grid of this size does not fit this machine's memory.
+def require_memory(size: tuple[int, int, int], device: wp.Device) -> None:
+    """Raise InputError if training a grid of this size does not fit the memory of the device.
 
     It takes values, two moments and a gradient, of 16 bytes a node.
     """
@@ -165,12 +165,12 @@ def require_memory(size: tuple[int, int, int]) -> None:
             "fewer voxels."
         )
     needed = math.prod(size) * 16 * 4
-    total = usable_memory()
+    total = device.total_memory if device.is_cuda else usable_memory()
     if total is not None and needed > total:
         raise InputError(
             f"grid.voxels: a grid of {size[0]} x {size[1]} x {size[2]} nodes needs "
-            f"{needed / 2**30:.1f} GiB to train, but this machine has {total / 2**30:.1f} GiB; use "
-            "fewer voxels."
+            f"{needed / 2**30:.1f} GiB to train, but {device} has {total / 2**30:.1f} GiB; "
+            "use fewer voxels."
         )
 
 

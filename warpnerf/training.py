@@ -310,7 +310,7 @@ class Trainer:
         border = 0.0 if contraction == "none" else config.border
         extent = (scene.box_max - scene.box_min) * (1.0 + border)
         final = grid_size(extent, config.voxels)
-        require_memory(final)
+        require_memory(final, self.workers.device)
         size = grid_size(extent, self._voxels(0))
         voxel = float((extent / (np.array(final) - 1)).min())
         n = math.prod(size)

@@ -7,6 +7,7 @@ from pathlib import Path
 import tyro
 
 from warpnerf.checks import InputError, require_at_least
+from warpnerf.commands.machine import require_writable, write_json
 from warpnerf.memory import usable_cores
 
 
@@ -14,7 +15,7 @@ def inspect_command(
     scene: tyro.conf.Positional[str],
     /,
     output: Path | None = None,
-    json: bool = False,
+    json: Path | None = None,
     downscale: int = 1,
     content_distance: float | None = None,
     near: float = 0.0,
@@ -25,7 +26,7 @@ def inspect_command(
     Args:
         scene: Folder with transforms.json or transforms_train.json, or builtin:room.
         output: FILE.png for a plan: cameras, box and content distance from above and the side.
-        json: Print JSON instead of a table.
+        json: Also write all of it to this file.
         downscale: As training will be given.
         content_distance: As training will be given; by default the estimate.
         near: As training will be given.
@@ -38,6 +39,7 @@ def inspect_command(
             raise InputError(f"--output {output}: the plan is a PNG; let its name end in .png.")
         if not output.parent.is_dir():
             raise InputError(f"--output {output}: its folder does not exist; make it first.")
+    require_writable(json)
     if threads is not None:
         require_at_least("--threads", threads, 1)
     found = inspect(
@@ -47,7 +49,9 @@ def inspect_command(
         near=near,
         threads=threads or usable_cores(),
     )
-    print(found.to_json() if json else found, end="" if json else "\n")
+    print(found)
+    if json is not None:
+        write_json(json, found.to_json())
     if output is not None:
         from warpnerf.pictures import write_png
         from warpnerf.plan import plan_picture
@@ -56,6 +60,5 @@ def inspect_command(
             write_png(output, plan_picture(found))
         except OSError as error:
             raise InputError(f"--output {output} cannot be written: {error.strerror}.") from error
-        if not json:
-            print(f"wrote {output}")
+        print(f"wrote {output}")
     return 0
