@@ -74,8 +74,8 @@ def test_the_scene_is_complete(scene: Scene) -> None:
     names = [view.name for view in scene.views]
     assert names == sorted(set(names)) and {"train_00.png", "test_00.png"} <= set(names)
     train, test = scene.splits["train"], scene.splits["test"]
-    assert (len(train), len(test)) == (60, 10)
-    assert sorted((*train, *test)) == list(range(70))
+    assert (len(train), len(test)) == (30, 10)
+    assert sorted((*train, *test)) == list(range(40))
     assert all(names[index].startswith("train_") for index in train)
     assert np.allclose(scene.box_min, [-2.05, -2.55, -0.05])
     assert np.allclose(scene.box_max, [2.05, 2.55, 2.65])
@@ -119,7 +119,7 @@ def test_depth_is_the_first_hit_through_pixel_centres(scene: Scene) -> None:
 def test_first_hit_against_a_distance_field(solids: tuple[Box, ...], scene: Scene) -> None:
     rng = np.random.default_rng(0)
     origins = scene.views[0].camera.position + np.zeros((4000, 3))
-    origins[::2] = scene.views[60].camera.position
+    origins[::2] = scene.views[30].camera.position
     directions = rng.normal(size=origins.shape)
     directions[:3] = np.eye(3)  # along the axes: one over zero
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -175,7 +175,7 @@ def test_cameras_are_upright_and_clear_of_everything(scene: Scene, solids: tuple
 def test_images_are_upright(scene: Scene) -> None:
     """Ceiling, walls and sky are above and light; the wooden floor is below and brown."""
     level = [view for view in scene.views if view.camera.forward[2] > -0.35]
-    assert len(level) > 25
+    assert len(level) > 20
     for view in level:  # the others look down on things that stand on the floor
         z = points_of(view)[:, 2].reshape(120, 160)
         assert z[:60].mean() > z[60:].mean() + 0.1, view.name
@@ -186,7 +186,7 @@ def test_images_are_upright(scene: Scene) -> None:
 def test_near_and_far_things_are_seen(scene: Scene) -> None:
     depths = np.stack([scene.views[index].depth for index in scene.splits["train"]])
     nearest = depths.min(axis=(1, 2))
-    assert nearest.min() > 0.2 and np.sum(nearest < 0.5) >= 12
+    assert nearest.min() > 0.2 and np.sum(nearest < 0.5) >= 8
     assert np.mean(depths < 0.5) > 0.02 and np.mean(depths > 3.0) > 0.2
     crate = np.array([0.385, -1.565, 0.52])
     away = [np.linalg.norm(camera.position - crate) for camera in scene.training_cameras]
@@ -205,8 +205,8 @@ def reprojected(scene: Scene, turn: tuple[int, int] = (1, 1)) -> Iterator[np.nda
 
     turn -1 reads the rows or columns of both images backwards.
     """
-    for first in range(0, 70, 3):
-        a, b = scene.views[first], scene.views[(first + 4) % 70]
+    for first in range(0, 40, 2):
+        a, b = scene.views[first], scene.views[(first + 3) % 40]
         points = points_of(a)
         local = (points - b.camera.position) @ b.camera.c2w[:, :3]
         ahead = -local[:, 2]
