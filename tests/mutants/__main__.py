@@ -116,7 +116,7 @@ def main() -> int:
             results = pool.map(lambda mutant: check(mutant, folder, cache), chosen)
             for mutant, (verdict, reason) in zip(chosen, results, strict=True):
                 counts[verdict] += 1
-                print(f"{verdict:9}{mutant.file:16}{mutant.name:52}{reason}", flush=True)
+                print(f"{verdict:9}{mutant.file:20}{mutant.name:52}{reason}", flush=True)
     summary = ", ".join(f"{count} {verdict}" for verdict, count in counts.items())
     print(f"{len(chosen)} mutants: {summary}; {time.monotonic() - started:.0f} s")
     return 0 if counts["killed"] == len(chosen) else 1
