@@ -20,6 +20,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import packed
+import parcels
 import plain
 from mutant import KERNELS, Mutant
 
@@ -28,7 +29,7 @@ COPIED = ("kernels", "warpnerf", "tests")
 TIME_LIMIT = 300.0
 """Seconds for the tests of one mutant; one that runs longer never ends, and is noticed as well."""
 
-MUTANTS = (*plain.MUTANTS, *packed.MUTANTS)
+MUTANTS = (*plain.MUTANTS, *packed.MUTANTS, *parcels.MUTANTS)
 
 
 def copy_to(folder: Path) -> None:
