@@ -201,6 +201,13 @@ class Kernels:
     def backward(self, p: Problem, scaling: str = "none", jacobian: str = "none") -> Float64:
         """The gradient [X, Y, Z, 4] of the outputs' product with the problem's adjoints."""
         gradient = self.no_gradient(p.raw.shape)
+        self.add_backward(p, gradient, scaling, jacobian)
+        return found_gradient(gradient).reshape(p.raw.shape)
+
+    def add_backward(
+        self, p: Problem, gradient: Any, scaling: str = "none", jacobian: str = "none"
+    ) -> None:
+        """Add that to a kernel's Gradient."""
         variant = self.variant(p, scaling, jacobian)
         self.adjoint(p, self.render.render_backward_kernel(variant), variant).run(
             p.n_rays,
@@ -214,7 +221,6 @@ class Kernels:
             self.array(p.adj_depth),
             *self.scratch(variant, 0),
         )
-        return found_gradient(gradient).reshape(p.raw.shape)
 
     def adjoint(self, p: Problem, kernel: wp.Kernel, variant: Any) -> AdjointLaunch:
         """How to launch a kernel that ends in a gradient."""

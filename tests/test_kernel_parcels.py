@@ -9,6 +9,7 @@ import warp as wp
 from drive import Kernels, Problem, assert_close, make_problem, unbounded
 from test_kernel_render import early, masked
 from warpnerf_kernels import parcels
+from warpnerf_kernels.tiles import TILE
 
 from warpnerf import adjoint
 from warpnerf.render import Steps
@@ -18,7 +19,18 @@ PLANES = 5
 
 
 @pytest.fixture(autouse=True)
-def _(on_cpu: None) -> None: ...
+def _(on_cpu: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Memory begins with what shows where it is read before it is written."""
+    make_parcels = adjoint._make_parcels
+
+    def unwritten(n_samples: int, n_workers: int) -> parcels.Parcels:
+        made = make_parcels(n_samples, n_workers)
+        made.contents.numpy().view(np.uint8).fill(255)  # not a number
+        for blocks in (made.next, made.first, made.used):
+            blocks.fill_(1 << 24)  # in no one's memory
+        return made
+
+    monkeypatch.setattr(adjoint, "_make_parcels", unwritten)
 
 
 def problem(seed: int) -> Problem:
@@ -41,6 +53,40 @@ def test_one_thread_against_more(threads: int, scaling: str) -> None:
             assert np.array_equal(again[0], error)  # no sum over rays
             assert_close(again[1], gradient, 3e-6)
             assert_close(of(threads).backward(p, scaling), of(1).backward(p, scaling), 3e-6)
+
+
+def one_sample_each(nodes: Any, size: tuple[int, int, int], seed: int = 0) -> Problem:
+    """Rays that meet a single sample, at positions [n_rays, 3] between the nodes of such a grid."""
+    p = make_problem(seed, n_rays=len(nodes), size=size, steps=Steps(near=0.0, far=0.1, step=0.1))
+    at = p.box_min + nodes * (p.box_max - p.box_min) / (np.array(size) - 1)
+    return replace(p, origins=at - 0.05 * p.directions)
+
+
+@pytest.mark.parametrize("n", [1, parcels.BLOCK - 1, parcels.BLOCK, 2 * parcels.BLOCK + 1])
+def test_chains_of_every_length(n: int) -> None:
+    """Each worker has a parcel of each of its n rays for every other one that owns planes."""
+    size = (PLANES, 7, 6)
+    for threads, plane in ((2, 2), (3, 1), (3, 3)):
+        nodes = np.random.default_rng(n).uniform(size=(threads * n, 3)) * (1, 6, 5) + (plane, 0, 0)
+        p = one_sample_each(nodes, size)
+        assert (of(1).forward(p).n_samples == 1).all()
+        assert_close(of(threads).backward(p), of(1).backward(p), 3e-6)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_only_tiles_around_a_sample_are_flagged(threads: int) -> None:
+    size = (PLANES, 4, 40)
+    kernels = of(threads)
+    for node in np.random.default_rng(threads).uniform(size=(20, 1, 3)) * (PLANES - 1, 3, 39):
+        p = one_sample_each(node, size)
+        gradient = kernels.no_gradient(size)
+        kernels.add_backward(p, gradient)
+        nodes = np.flatnonzero(gradient.values.numpy().any(axis=1))
+        assert len(nodes) == 8
+        # A pair of nodes along z flags the tile that it begins in.
+        assert np.array_equal(
+            np.flatnonzero(gradient.touched.numpy()), np.unique(nodes[::2] // TILE)
+        )
 
 
 @pytest.mark.parametrize("contraction", ["none", "linf"])

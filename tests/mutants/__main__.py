@@ -20,6 +20,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import packed
+import parcels
 import plain
 from mutant import KERNELS, Mutant
 
@@ -28,7 +29,7 @@ COPIED = ("kernels", "warpnerf", "tests")
 TIME_LIMIT = 300.0
 """Seconds for the tests of one mutant; one that runs longer never ends, and is noticed as well."""
 
-MUTANTS = (*plain.MUTANTS, *packed.MUTANTS)
+MUTANTS = (*plain.MUTANTS, *packed.MUTANTS, *parcels.MUTANTS)
 
 
 def copy_to(folder: Path) -> None:
@@ -116,7 +117,7 @@ def main() -> int:
             results = pool.map(lambda mutant: check(mutant, folder, cache), chosen)
             for mutant, (verdict, reason) in zip(chosen, results, strict=True):
                 counts[verdict] += 1
-                print(f"{verdict:9}{mutant.file:16}{mutant.name:52}{reason}", flush=True)
+                print(f"{verdict:9}{mutant.file:20}{mutant.name:52}{reason}", flush=True)
     summary = ", ".join(f"{count} {verdict}" for verdict, count in counts.items())
     print(f"{len(chosen)} mutants: {summary}; {time.monotonic() - started:.0f} s")
     return 0 if counts["killed"] == len(chosen) else 1
