@@ -147,8 +147,7 @@ def share_memory(of: TrainingPass, to: TrainingPass) -> None:
     for name, value in vars(of).items():
         if isinstance(value, wp.array | Gradients):
             vars(to)[name] = value
-    if of.launch.scratch():
-        vars(to.launch)["_parcels"] = vars(of.launch)["_parcels"]
+    to.launch.parcels = of.launch.parcels
 
 
 def check(ours: WarpAdjoint, theirs: dict[Scaling, TorchPipeline]) -> None:

@@ -72,14 +72,13 @@ def update_stream(data: wp.array(dtype=wp.float32), worker: int, n_workers: int)
 @wp.func_native(
     WIDE
     + """
-const size_t n_lines = grid.shape[0] / 16;
+const size_t n_lines = grid.shape[0] / 16, n_own = n_lines / n_workers;
 const wide* from = (const wide*)grid.data;
-wide* to = (wide*)gradient.data + worker * (n_lines / n_workers);
+wide* to = (wide*)gradient.data + worker * n_own;
 for (unsigned i = 0; i < (unsigned)count; ++i) {
     unsigned long long x = (i + 1ull + ((unsigned long long)worker << 32)) * 0x9E3779B97F4A7C15ull;
     x = (x ^ (x >> 32)) * 0xD6E8FEB86659FD93ull;
-    const size_t line = ((x >> 32) * n_lines) >> 32;
-    to[line / n_workers] += from[line];
+    to[((x >> 32) * n_own) >> 32] += from[((x >> 32) * n_lines) >> 32];
 }
 """
 )

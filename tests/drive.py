@@ -107,6 +107,7 @@ class Kernels:
     def __init__(self, name: str, device: str, threads: int = 1, packed: bool = False) -> None:
         self.workers = Workers(device, threads)
         self.device = self.workers.device
+        # One thread, for plain kernels that add.
         self.alone = self.workers if self.device.is_cuda else Workers(device, 1)
         self.packed = packed
         self.precision = name

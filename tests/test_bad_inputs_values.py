@@ -58,7 +58,7 @@ NAN = math.nan
         ),
         pytest.param(
             ["--voxels", str(21 * 10**8)],
-            "GiB to train, but cpu has",
+            "GiB to train, but this machine has",
             id="61-more-than-the-memory",
             marks=pytest.mark.skipif(
                 (usable_memory() or 0) > 64 * 21 * 10**8, reason="this machine has 134 GB"

@@ -1,5 +1,6 @@
 """Several workers, one gradient: who adds where, and that nothing is lost on the way."""
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -26,7 +27,7 @@ def _(on_cpu: None, monkeypatch: pytest.MonkeyPatch) -> None:
     def unwritten(n_samples: int, n_workers: int) -> parcels.Parcels:
         made = make_parcels(n_samples, n_workers)
         made.contents.numpy().view(np.uint8).fill(255)  # not a number
-        for blocks in (made.next, made.first, made.used):
+        for blocks in (made.next, made.first_block, made.used):
             blocks.fill_(1 << 24)  # in no one's memory
         return made
 
@@ -64,7 +65,7 @@ def one_sample_each(nodes: Any, size: tuple[int, int, int], seed: int = 0) -> Pr
 
 @pytest.mark.parametrize("n", [1, parcels.BLOCK - 1, parcels.BLOCK, 2 * parcels.BLOCK + 1])
 def test_chains_of_every_length(n: int) -> None:
-    """Each worker has a parcel of each of its n rays for every other one that owns planes."""
+    """Each worker has a parcel of each of its n rays for the other one that owns a plane of it."""
     size = (PLANES, 7, 6)
     for threads, plane in ((2, 2), (3, 1), (3, 3)):
         nodes = np.random.default_rng(n).uniform(size=(threads * n, 3)) * (1, 6, 5) + (plane, 0, 0)
@@ -89,14 +90,41 @@ def test_only_tiles_around_a_sample_are_flagged(threads: int) -> None:
         )
 
 
+def most_steps(p: Problem) -> int:
+    length = float(np.linalg.norm(p.box_max - p.box_min))
+    return p.steps.most(length if p.contraction == "none" else math.inf)
+
+
+@pytest.mark.parametrize("near", [0.0, 0.5])
+@pytest.mark.parametrize("far", [0.9, 2.9, 40.0, 1e30])
+@pytest.mark.parametrize(("growth", "n_linear"), [(0.0, 0), (0.02, 12), (0.09, 30), (0.002, 3)])
+@pytest.mark.parametrize("contraction", ["none", "linf"])
+def test_no_ray_takes_more_steps_than_are_reckoned_with(
+    near: float, far: float, growth: float, n_linear: int, contraction: str
+) -> None:
+    """From corner to corner of the box through thin air, and from anywhere else."""
+    if contraction != "none" and far == 1e30 and growth == 0.0:
+        return  # a walk without end
+    steps = Steps(near=near, far=far, step=0.04, growth=growth, n_linear=n_linear)
+    p = make_problem(0, n_rays=40, steps=steps, contraction=contraction, density_scale=1e-6)
+    p = replace(p, border=0.0 if contraction == "none" else 0.2)
+    across = (p.box_max - p.box_min) / np.linalg.norm(p.box_max - p.box_min)
+    p.origins[0], p.directions[0] = p.box_min - (near + 1e-3) * across, across
+    taken = of(1).forward(p).n_samples
+    assert taken.max() <= most_steps(p)
+    if contraction != "none" or (growth == 0.0 and far > 10.0):
+        assert taken.max() >= most_steps(p) - 6
+
+
 @pytest.mark.parametrize("contraction", ["none", "linf"])
 def test_rays_in_turns(contraction: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where parcels of all rays do not fit, nor those of one."""
+    """Where parcels of all rays do not fit; of one for each worker, which do; and of none."""
     p = problem(1)
     if contraction != "none":
         p = unbounded(p, contraction, 0.2)
     at_once = of(2).train(p)
-    for samples in (1, 20_000):
+    most = most_steps(p)
+    for samples in (20_000, 2 * most, 2 * most - 1, 1):
         monkeypatch.setattr(adjoint, "SAMPLES", samples)
         in_turns = of(2).train(p)
         assert np.array_equal(in_turns[0], at_once[0])
@@ -105,7 +133,7 @@ def test_rays_in_turns(contraction: str, monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_workers_add_to_no_planes_but_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Before anything is delivered, and for each delivery by itself."""
+    """Each delivery by itself."""
     p = problem(2)
     whole = of(1).backward(p)
     seen = []

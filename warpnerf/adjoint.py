@@ -15,18 +15,18 @@ from warpnerf_kernels.types import vec4
 from warpnerf.parallel import Workers
 
 SAMPLES = 1 << 19
-"""Samples whose gradients may be in parcels at a time, of all workers together: 34 MB at most. Rays
+"""Samples whose gradients may be in parcels at a time, of all workers together: about 34 MB. Rays
 that might have more take turns, so memory grows with neither rays nor samples."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Gradients:
-    """The gradient of a loss with respect to a grid's values."""
+    """The gradient of a loss with respect to a grid's values, all of them; a kernel's Gradient."""
 
     values: wp.array
-    """[X * Y * Z] vec4; zero in tiles that are not flagged."""
+    """[X * Y * Z] vec4; zero in tiles that are not flagged, nor the one before them."""
     touched: wp.array
-    """[n_tiles] uint8, 1 where a tile has a gradient; see warpnerf_kernels.tiles."""
+    """[n_tiles] uint8, 1 where a pair of nodes begins that got some; see warpnerf_kernels.tiles."""
 
     @staticmethod
     def zeros(size: tuple[int, int, int], workers: Workers) -> Gradients:
@@ -89,22 +89,20 @@ class AdjointLaunch:
         self._kernel = kernel
         self._size = size
         self._workers = workers
-        self._rays = max(1, n_rays)
-        self._packed = variant.packed
-        if self._packed:
-            samples = max(most_steps, SAMPLES // workers.count)  # of each worker
-            rays = samples // most_steps * workers.count
-            self._rays = -(-self._rays // -(-self._rays // rays))  # alike from turn to turn
-            self._parcels = _make_parcels(samples if workers.count > 1 else 0, workers.count)
+        self._rays_a_turn = max(1, n_rays)
+        self.parcels: parcels.Parcels | None = None
+        """What the workers leave for each other; None: kernels are plain."""
+        if variant.packed:
+            # Where rays are so long that those of one for each worker would not fit, fewer work.
+            count = min(workers.count, max(1, SAMPLES // most_steps))
+            if count < workers.count:
+                self._workers = Workers("cpu", count)
+            if count > 1:
+                turns = math.ceil(n_rays / (SAMPLES // count // most_steps * count))
+                self._rays_a_turn = math.ceil(n_rays / max(1, turns)) or 1  # all turns alike
+            self.parcels = _make_parcels(SAMPLES // count if count > 1 else 0, count)
         elif not workers.device.is_cuda:
             self._workers = Workers("cpu", 1)
-
-    def scratch(self) -> list[wp.array]:
-        """The arrays that it has allocated."""
-        if not self._packed:
-            return []
-        made = self._parcels
-        return [made.contents, made.next, made.first, made.end, made.used]
 
     def run(self, n_rays: int, gradient: Any, *arguments: Any) -> None:
         """Add a batch's gradient.
@@ -114,24 +112,25 @@ class AdjointLaunch:
             gradient: A kernel's Gradient, in the kernel's precision.
             arguments: The kernel's, without the first two and the last.
         """
-        if not self._packed:
+        if self.parcels is None:
             self._workers.launch_owned(self._kernel, n_rays, *arguments, gradient)
             return
         count = self._workers.count
-        self._parcels.gradient = gradient
-        for begin in range(0, n_rays, self._rays):
-            end = min(begin + self._rays, n_rays)
-            self._parcels.used.zero_()
-            self._workers.launch_owned(self._kernel, end, *arguments, self._parcels, begin=begin)
+        self.parcels.gradient = gradient
+        for begin in range(0, n_rays, self._rays_a_turn):
+            end = min(begin + self._rays_a_turn, n_rays)
+            self.parcels.used.zero_()
+            self.parcels.end.zero_()  # in case that the last turn was interrupted
+            self._workers.launch_owned(self._kernel, end, *arguments, self.parcels, begin=begin)
             if count > 1:
                 size = wp.vec3i(*self._size)
-                self._workers.launch(parcels.deliver, count, size, self._parcels)
+                self._workers.launch(parcels.deliver_parcels, count, size, self.parcels)
 
 
 def _make_parcels(n_samples: int, n_workers: int) -> parcels.Parcels:
     """No parcels, with room for those of so many samples of each worker."""
+    row = -(-n_workers // 16) * 16  # whole cache lines, which no two workers share
     # A sample goes to two others at most, and each of these may have begun a block.
-    line = -(-n_workers // 16) * 16  # a worker's row shares no cache line with another's
     n_blocks = n_workers + -(-2 * n_samples // parcels.BLOCK)
 
     def room(n: int, dtype: Any = wp.int32) -> wp.array:
@@ -140,8 +139,8 @@ def _make_parcels(n_samples: int, n_workers: int) -> parcels.Parcels:
     made = parcels.Parcels()
     made.contents = room(n_blocks * parcels.BLOCK, parcels.Parcel)  # no memory until it is used
     made.next = room(n_blocks)
-    made.first = room(line)
-    made.end = room(line)
+    made.first_block = room(row)
+    made.end = room(row)
     made.end.zero_()
-    made.used = room(line)
+    made.used = room(row)
     return made

@@ -22,6 +22,9 @@ Background = Literal["auto", "white", "black", "random"]
 MAX_VOXELS = 2**31
 """Nodes are counted in 32 bits."""
 
+TRAINING_BYTES = 64
+"""Memory that a node takes: values, two moments and a gradient, 16 each."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class GridConfig:
@@ -79,6 +82,11 @@ class MarchConfig:
         require_positive("march.step_voxels", self.step_voxels)
         require_at_least("march.near", self.near, 0.0)
         require_at_least("march.growth", self.growth, 0.0)
+        if 0 < self.growth < 1e-4:
+            raise InputError(
+                f"march.growth must be 0 or at least 0.0001, not {self.growth}: a smaller one is "
+                "lost in float32."
+            )
         if self.far is not None and not self.near < self.far < math.inf:
             raise InputError(
                 f"march.far must be finite and beyond march.near, not {self.far}; leave it out for "

@@ -13,7 +13,7 @@ from warpnerf_kernels import contraction, interp, occupancy, types
 from warpnerf_kernels.types import FreeSpace, Grid, March, vec3, vec4
 
 from warpnerf.checks import InputError
-from warpnerf.config import MAX_VOXELS, Contraction
+from warpnerf.config import MAX_VOXELS, TRAINING_BYTES, Contraction
 from warpnerf.memory import usable_memory
 from warpnerf.parallel import Workers
 
@@ -155,21 +155,19 @@ def grid_size(extent: np.ndarray, voxels: int) -> tuple[int, int, int]:
 
 
 def require_memory(size: tuple[int, int, int], device: wp.Device) -> None:
-    """Raise InputError if training a grid of this size does not fit the memory of the device.
-
-    It takes values, two moments and a gradient, of 16 bytes a node.
-    """
+    """Raise InputError if training a grid of this size does not fit the memory of the device."""
     if math.prod(size) >= MAX_VOXELS:
         raise InputError(
             f"grid.voxels must give fewer than {MAX_VOXELS} nodes, not {math.prod(size)}; use "
             "fewer voxels."
         )
-    needed = math.prod(size) * 16 * 4
+    needed = math.prod(size) * TRAINING_BYTES
     total = device.total_memory if device.is_cuda else usable_memory()
+    where = device if device.is_cuda else "this machine"
     if total is not None and needed > total:
         raise InputError(
             f"grid.voxels: a grid of {size[0]} x {size[1]} x {size[2]} nodes needs "
-            f"{needed / 2**30:.1f} GiB to train, but {device} has {total / 2**30:.1f} GiB; "
+            f"{needed / 2**30:.1f} GiB to train, but {where} has {total / 2**30:.1f} GiB; "
             "use fewer voxels."
         )
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from warpnerf.camera import Camera
 from warpnerf.checks import InputError, require_at_least, require_positive
-from warpnerf.config import PRESETS, TrainConfig
+from warpnerf.config import PRESETS, TRAINING_BYTES, TrainConfig
 from warpnerf.data import load_scene
 from warpnerf.data.survey import Survey, survey
 from warpnerf.scene import Scene, find_focus, share_aimed_at, up_direction
@@ -267,7 +267,7 @@ def _cost(scene: Scene, config: TrainConfig, threads: int) -> Cost:
     voxels = config.grid.voxels
     images = sum(view.image.nbytes for view in scene.views)
     pixels = sum(camera.width * camera.height for camera in scene.training_cameras)
-    memory = 16 * 4 * voxels + images + 4 * pixels
+    memory = TRAINING_BYTES * voxels + images + 4 * pixels
 
     with_alpha = any(view.image.shape[2] == 4 for view in scene.views)
     kind = "unbounded" if scene.unbounded else "object" if with_alpha else "room"

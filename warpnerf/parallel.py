@@ -67,7 +67,7 @@ class Workers:
     def launch_owned(self, kernel: wp.Kernel, n: int, *arguments: Any, begin: int = 0) -> None:
         """Run kernel(first, worker, *arguments) over items begin..n-1, of much work each.
 
-        It writes to rows that a worker owns; a worker's items all come before the next one's.
+        It writes to what a worker owns; a worker's items all come before the next one's.
         """
         self._launch(kernel, n, lambda worker: (worker, *arguments), RAYS, begin)
 

@@ -52,14 +52,19 @@ class Steps:
     """A ray ends where less light than this would pass."""
 
     def most(self, length: float) -> int:
-        """How many steps a ray can take within `length` scene units, at most."""
+        """How many steps a ray can take, at most.
+
+        Args:
+            length: Of its way through the box, scene units; infinite where space is folded.
+        """
         linear = self.near + self.n_linear * self.step  # where growing steps begin
         if self.growth == 0.0 or self.far <= linear:
             shortest, in_all = self.step, (self.far - self.near) / self.step
         else:
             shortest = min(self.step, self.growth * linear)
             in_all = self.n_linear + math.log(self.far / linear) / math.log1p(self.growth)
-        return min(int(min(in_all, length / shortest, 1e9)) + 4, 10**9)  # as prepare_ray counts
+        # prepare_ray rounds outwards, and adds a step at each end.
+        return int(min(in_all, length / shortest, 1e9)) + 4
 
     def struct(self, types: ModuleType = types) -> Any:
         """The steps as kernels take them, in the precision of the given types."""
@@ -169,7 +174,9 @@ def scratch(
 
 
 class TrainingPass:
-    """Forward, loss and scaled adjoint of ray batches in one launch, into gradients of its own.
+    """Forward, loss and scaled adjoint of ray batches, into a gradient of its own.
+
+    That is one launch, or as many as AdjointLaunch takes.
 
     Loss: mean over rays of the squared error, summed over the channels.
     """

@@ -176,7 +176,7 @@ class TrialKernels:
             self._array(trial.depth_slope),
             *scratch(self._render, variant, 1, self._workers),  # nothing is kept between launches
         )
-        return _total(gradient).reshape(trial.raw.shape)
+        return _found(gradient).reshape(trial.raw.shape)
 
     def train(self, trial: Trial, scaling: Scaling = "none") -> tuple[np.ndarray, np.ndarray]:
         """The training launch: squared errors [n_rays], the gradient [X, Y, Z, 4] of their mean."""
@@ -195,7 +195,7 @@ class TrialKernels:
             error,
             n_samples,
         )
-        return error.numpy(), _total(gradient).reshape(trial.raw.shape)
+        return error.numpy(), _found(gradient).reshape(trial.raw.shape)
 
     def gather(self, values: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Values [X, Y, Z, 4] at points [n, 3] in grid coordinates: [n, 4]."""
@@ -222,7 +222,7 @@ class TrialKernels:
             self._array(out, self._types.vec4),
             gradient,
         )
-        return _total(gradient).reshape(*size, 4)
+        return _found(gradient).reshape(*size, 4)
 
     def _forward(self, trial: Trial) -> tuple[wp.array, ...]:
         out = (
@@ -302,8 +302,8 @@ class TrialKernels:
         return wp.zeros(shape, dtype=dtype or self._types.real, device=self._workers.device)
 
 
-def _total(gradient: Any) -> np.ndarray:
-    """[n_nodes, 4] float64.
+def _found(gradient: Any) -> np.ndarray:
+    """What was added, [n_nodes, 4] float64.
 
     NaN in tiles that hold gradient and are not flagged: the optimiser would not see them.
     """

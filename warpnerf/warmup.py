@@ -40,7 +40,7 @@ def training_kernels(
     return [
         camera.sample_pixels,
         render.render_train_kernel(variant),
-        *([parcels.deliver] if variant.packed else []),
+        *([parcels.deliver_parcels] if variant.packed else []),
         regularize.total_variation_backward,
         adam.adam_step,
         occupancy.mark_occupied,

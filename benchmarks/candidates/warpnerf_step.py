@@ -84,8 +84,10 @@ class WarpStep:
 
     def scratch_bytes(self) -> int:
         """All arrays of the training pass but the gradient."""
-        launch = self._pass.launch
-        arrays = [*vars(self._pass).values(), self._pass.gradients.touched, *launch.scratch()]
+        parcels = self._pass.launch.parcels
+        arrays = [*vars(self._pass).values(), self._pass.gradients.touched]
+        if parcels is not None:
+            arrays += [parcels.contents, parcels.next]
         return sum(array.capacity for array in arrays if isinstance(array, wp.array))
 
 

@@ -4,7 +4,7 @@ The forward pass composites samples front to back; the backward pass walks the s
 needs of the rest of the ray only what lies behind: it starts with that, and sheds it on its way.
 Both get their samples from ``next_sample``, the one place that decides where a ray is sampled.
 
-This is the specification, a sample at a time. packs.py does the same for eight at a time.
+This is the specification, a sample at a time. integral_packed.py does the same, eight at a time.
 """
 
 import warp as wp
@@ -178,7 +178,7 @@ def adj_integrate(
     scaling: int,
     jacobian: int,
     kept: wp.array(dtype=Sample),  # read, as integrate left it
-    worker: int,  # of which there must be one on the CPU
+    worker: int,  # not used: all add to one gradient, on the CPU from one thread at a time
     gradient: Gradient,  # added to
 ):
     """Adjoint of integrate. With G_i = dL/dw_i = <adj_rgb, c_i> + adj_depth t_i,

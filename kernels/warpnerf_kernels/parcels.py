@@ -37,7 +37,7 @@ class Parcels:
     contents: wp.array2d(dtype=Parcel)  # [n_workers, BLOCK * n_blocks] by sender
     next: wp.array2d(dtype=wp.int32)  # [n_workers, n_blocks] the block that follows in the chain
     # By sender, in rows of whole cache lines, and by receiver:
-    first: wp.array2d(dtype=wp.int32)  # the chain's first block
+    first_block: wp.array2d(dtype=wp.int32)  # of the chain
     end: wp.array2d(dtype=wp.int32)  # one past its last parcel; 0 if there is none
     used: wp.array2d(dtype=wp.int32)  # by sender alone: blocks that are in use
     gradient: Gradient  # where it all goes
@@ -47,9 +47,10 @@ WORDS = (
     VECTORS
     + f"constexpr int BLOCK = {BLOCK}, AHEAD = 16;"
     + r"""
-const int n_workers = parcels.end.shape[0], line = parcels.end.shape[1];
-const int planes = (size.c[0] + n_workers - 1) / n_workers;  // that a worker owns:
-const int own_first = worker * planes, own_end = own_first + planes;
+const int n_workers = parcels.end.shape[0];
+const int row = parcels.end.shape[1];  // numbers in a sender's row
+const int n_planes = (size.c[0] + n_workers - 1) / n_workers;  // of nodes, for each worker
+const int own_first = worker * n_planes, own_end = own_first + n_planes;
 const int stride_y = size.c[2], stride_x = stride_y * size.c[1];
 auto* values = parcels.gradient.values.data;
 auto* flags = parcels.gradient.touched.data;
@@ -58,10 +59,11 @@ auto add_column = [&](int node, float share, quad low, quad high) {
     quad_at* pair = (quad_at*)(values + node);
     pair[0] = fma(quad(share), low, quad(pair[0]));
     pair[1] = fma(quad(share), high, quad(pair[1]));
-    flags[(unsigned)node / TILE] = 1;
+    flags[(unsigned)node / TILE] = 1;  // on the border of two parts by either, with the same 1
 };
 """
 )
+"""What hand_out and take_in begin with; it uses their arguments size, worker and parcels."""
 
 
 @wp.func_native(
@@ -83,9 +85,9 @@ to_quads(
 auto send = [&](int n, int receiver) {
     auto* contents = parcels.contents.data + (size_t)worker * parcels.contents.shape[1];
     int* next = parcels.next.data + (size_t)worker * parcels.next.shape[1];
-    int& used = parcels.used.data[worker * line];
-    int& first = parcels.first.data[worker * line + receiver];
-    int& end = parcels.end.data[worker * line + receiver];
+    int& used = parcels.used.data[worker * row];
+    int& first = parcels.first_block.data[worker * row + receiver];
+    int& end = parcels.end.data[worker * row + receiver];
     if (end % BLOCK == 0) {
         if (end == 0) first = used;
         else next[end / BLOCK - 1] = used;
@@ -123,9 +125,9 @@ if ((lower & upper & visited) == visited) {
     each(visited, [&](int n) {
         const bool own_lower = lower >> n & 1, own_upper = upper >> n & 1;
         if (own_lower) add_lower(n);
-        else send(n, i[n] / planes);
+        else send(n, i[n] / n_planes);
         if (own_upper) add_upper(n);
-        else if (own_lower || (i[n] + 1) % planes == 0) send(n, (i[n] + 1) / planes);
+        else if (own_lower || (i[n] + 1) % n_planes == 0) send(n, (i[n] + 1) / n_planes);
     });
 }
 """
@@ -162,15 +164,15 @@ auto add = [&](const auto& parcel) {
 for (int sender = 0; sender < n_workers; ++sender) {
     const auto* contents = parcels.contents.data + (size_t)sender * parcels.contents.shape[1];
     const int* next = parcels.next.data + (size_t)sender * parcels.next.shape[1];
-    int block = parcels.first.data[sender * line + worker];
-    int& end = parcels.end.data[sender * line + worker];
+    int block = parcels.first_block.data[sender * row + worker];
+    int& end = parcels.end.data[sender * row + worker];
     while (end) {
         const auto* parcel = contents + (size_t)BLOCK * block;
         const bool is_last = block == (end - 1) / BLOCK;
-        const int count = is_last ? end - BLOCK * block : BLOCK;
-        for (int n = 0; n < AHEAD && n < count; ++n) fetch(values + parcel[n].base, size);
-        for (int n = 0; n < count; ++n) {
-            if (n + AHEAD < count) fetch(values + parcel[n + AHEAD].base, size);
+        const int n_here = is_last ? end - BLOCK * block : BLOCK;
+        for (int n = 0; n < AHEAD && n < n_here; ++n) fetch(values + parcel[n].base, size);
+        for (int n = 0; n < n_here; ++n) {
+            if (n + AHEAD < n_here) fetch(values + parcel[n + AHEAD].base, size);
             add(parcel[n]);
         }
         if (is_last) end = 0;
@@ -185,6 +187,6 @@ def take_in(size: wp.vec3i, worker: int, parcels: Parcels):
 
 
 @wp.kernel
-def deliver(first: int, size: wp.vec3i, parcels: Parcels):
+def deliver_parcels(first: int, size: wp.vec3i, parcels: Parcels):
     """Add what lies in parcels to the grid's gradient, each worker to its own part."""
     take_in(size, first + wp.tid(), parcels)
