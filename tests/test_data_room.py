@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from warpnerf.camera import Camera
-from warpnerf.data import room, room_textures
-from warpnerf.data.raytrace import Ball, Box, Cylinder, Room
+from warpnerf.data import raytrace, room, room_textures
+from warpnerf.data.solids import Ball, Box, Cylinder, Room
 from warpnerf.scene import Scene, View
 
 
@@ -107,6 +107,24 @@ def test_building_twice_gives_the_same() -> None:
         assert a.depth is not None and b.depth is not None
         assert np.array_equal(a.image, b.image) and np.array_equal(a.depth, b.depth)
         assert np.array_equal(a.camera.c2w, b.camera.c2w)
+
+
+def test_views_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    scenes = []
+    for threads in (1, 3):
+        monkeypatch.setattr(raytrace, "usable_cores", lambda threads=threads: threads)
+        scenes.append(room.room_scene(downscale=5))
+    for a, b, camera in zip(*(scene.views for scene in scenes), scenes[0].cameras, strict=True):
+        image, depth = room.photograph(camera, samples=4)
+        for view in (a, b):
+            assert np.array_equal(view.image, image) and np.array_equal(view.depth, depth)
+
+
+def test_remainders_are_those_of_numpy() -> None:
+    x = np.random.default_rng(0).normal(0, 30, 10_000).astype(np.float32)
+    x[:3] = -1.0, 0.0, 2.0
+    np.testing.assert_array_equal(room_textures._part(x), np.mod(x, 1))
+    np.testing.assert_array_equal(room_textures._odd(x), np.floor(x) % 2)
 
 
 def test_depth_is_the_first_hit_through_pixel_centres(scene: Scene) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from warpnerf.camera import Camera
 from warpnerf.checks import InputError, require_rays
-from warpnerf.data.raytrace import Ball, Box, Cylinder, Light, Room, Texture, Tracer, Vec3
+from warpnerf.data.raytrace import Light, Tracer, in_threads
 from warpnerf.data.room_textures import (
     checks,
     globe,
@@ -28,6 +28,7 @@ from warpnerf.data.room_textures import (
     stripes,
     wood,
 )
+from warpnerf.data.solids import Ball, Box, Cylinder, Room, Texture, Vec3
 from warpnerf.scene import Scene, View
 
 WIDTH, HEIGHT = 160, 120
@@ -315,13 +316,17 @@ def room_scene(downscale: int = 1) -> Scene:
         inside = first_hit(camera.position[None], camera.forward[None])[0] > 0.0
         return photograph(camera, samples)[0] if inside else None
 
-    views = []
+    cameras = {}
     for kind, poses in (("test", _TEST), ("train", tuple(_train_poses()))):
         for k, (eye, target) in enumerate(poses):
             c2w = _look(eye, target, roll=0.03 * np.sin(2.4 * k))
-            camera = _camera(c2w).downscaled(downscale)
-            image, depth = photograph(camera, samples)
-            views.append(View(name=f"{kind}_{k:02d}.png", camera=camera, image=image, depth=depth))
+            cameras[f"{kind}_{k:02d}.png"] = _camera(c2w).downscaled(downscale)
+    _tracer()  # before there are threads: it has its own
+    pictures = in_threads(lambda camera: photograph(camera, samples), cameras.values())
+    views = [
+        View(name=name, camera=camera, image=image, depth=depth)
+        for (name, camera), (image, depth) in zip(cameras.items(), pictures, strict=True)
+    ]
     train = range(len(_TEST), len(views))
     seen = [view.depth for view in views[train.start :] if view.depth is not None]
     content_distance = float(np.median(np.stack(seen)))

@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from warpnerf.data.raytrace import Surface, Texture
+from warpnerf.data.solids import Surface, Texture
 
 
 def _hash(i: np.ndarray, j: np.ndarray | int) -> np.ndarray:
@@ -38,7 +38,17 @@ def _noise(u: np.ndarray, v: np.ndarray, size: float) -> np.ndarray:
     table = _noise_table()
     scale = len(table) / size
     i, j = ((a * scale).astype(np.int32) & (len(table) - 1) for a in (u, v))
-    return table[j, i]
+    return table.take(j * len(table) + i)
+
+
+def _part(x: np.ndarray) -> np.ndarray:
+    """What is left of x above the next lower whole number: np.mod(x, 1), sooner."""
+    return x - np.floor(x)
+
+
+def _odd(x: np.ndarray) -> np.ndarray:
+    """1.0 where the next lower whole number is odd, else 0.0."""
+    return 2 * _part(np.floor(x) / 2)
 
 
 def _linear(colour: str) -> np.ndarray:
@@ -81,7 +91,7 @@ def stripes(a: str, b: str, width: float, upright: bool = True) -> Texture:
 
     def paint(at: Surface) -> np.ndarray:
         across = at.u if upright else at.v
-        band = np.floor(across / width) % 2
+        band = _odd(across / width)
         return _tint(_mix(rgb_a, rgb_b, band), at.u, at.v, 0.4, 0.18)
 
     return paint
@@ -92,7 +102,7 @@ def checks(a: str, b: str, size: float) -> Texture:
     rgb_a, rgb_b = _linear(a), _linear(b)
 
     def paint(at: Surface) -> np.ndarray:
-        band = np.floor(at.u / size) % 2 + np.floor(at.v / size) % 2
+        band = _odd(at.u / size) + _odd(at.v / size)
         return _tint(_mix(rgb_a, rgb_b, band / 2), at.u, at.v, 0.3, 0.15)
 
     return paint
@@ -106,7 +116,7 @@ def spines(width: float, palette: tuple[str, ...], seed: int) -> Texture:
         cell = np.floor(at.u / width)
         bend = 0.6 * (_hash(cell.astype(np.int32), seed) - 0.5)
         book = (cell + (at.u / width - cell > 0.5 + bend)).astype(np.int32)
-        rgb = colours[:, (_hash(book, seed + 1) * len(palette)).astype(np.int32)]
+        rgb = colours.take((_hash(book, seed + 1) * len(palette)).astype(np.int32), axis=1)
         label = np.abs(np.mod(at.v, 0.34) - 0.1 - 0.12 * _hash(book, seed + 2)) < 0.018
         edge = np.abs(at.u / width - cell - 0.5 - bend) < 0.07
         rgb = _mix(rgb, _linear("e6d9b4"), 0.8 * label) * (1 - 0.6 * edge)
@@ -119,7 +129,7 @@ def leaves(at: Surface) -> np.ndarray:
     """Foliage: light and dark leaves."""
     wave = _noise(at.u + 0.3 * at.points[2], at.v, 0.9)
     rgb = _mix(_linear("2f5d2b"), _linear("8fb356"), np.clip(4 * wave - 1.5, 0, 1))
-    return rgb * (1 - 0.45 * (np.mod(at.v * 18 + 6 * wave, 1) < 0.25))
+    return rgb * (1 - 0.45 * (_part(at.v * 18 + 6 * wave) < 0.25))
 
 
 def globe(at: Surface) -> np.ndarray:
@@ -175,10 +185,10 @@ def rug(at: Surface) -> np.ndarray:
     """Borders, and a field of diamonds."""
     x, y = at.u + 0.05, at.v
     edge = np.minimum(0.95 - np.abs(x), 1.1 - np.abs(y))
-    diamond = np.abs(np.mod(x / 0.3, 1) - 0.5) + np.abs(np.mod(y / 0.3, 1) - 0.5)
+    diamond = np.abs(_part(x / 0.3) - 0.5) + np.abs(_part(y / 0.3) - 0.5)
     rgb = _mix(_linear("8e3b36"), _linear("d8c39a"), (diamond < 0.3) & (diamond > 0.14))
     rgb = _mix(rgb, _linear("3c5570"), diamond < 0.08)
-    zigzag = np.abs(np.mod((x + y) / 0.08, 1) - 0.5) < 0.25
+    zigzag = np.abs(_part((x + y) / 0.08) - 0.5) < 0.25
     border = _mix(_linear("33465c"), _linear("cdb98f"), zigzag)
     rgb = _mix(
         _mix(rgb, border, edge < 0.16),
@@ -196,13 +206,13 @@ def floor(at: Surface) -> np.ndarray:
     plank = _hash(tone, np.floor(along).astype(np.int32))
     rgb = _mix(_linear("a9794a"), _linear("7d5531"), plank)
     grain = np.sin(at.u * 160 + 12 * _noise(at.v * 0.25, at.u + plank, 0.9))
-    gap = (np.mod(at.u / 0.13, 1) < 0.05) | (np.mod(along, 1) < 0.008)
+    gap = (_part(at.u / 0.13) < 0.05) | (_part(along) < 0.008)
     return _tint(rgb * (1 + 0.1 * grain) * (1 - 0.6 * gap), at.v * 0.2, at.u, 0.5, 0.2)
 
 
 def _wall(at: Surface, paper: np.ndarray) -> np.ndarray:
     """Wallpaper [3, n] above a panelled dado and a skirting board."""
-    panel = np.maximum(np.abs(np.mod(at.u / 0.5, 1) - 0.5) / 0.42, np.abs(at.v - 0.5) / 0.3)
+    panel = np.maximum(np.abs(_part(at.u / 0.5) - 0.5) / 0.42, np.abs(at.v - 0.5) / 0.3)
     dado = _mix(_linear("d9d3c3"), _linear("b9b2a0"), np.abs(panel - 1) < 0.06)
     dado = _mix(dado, _linear("efe9da"), (at.v < 0.12) | (at.v > 0.88))
     return _tint(_mix(paper, dado, at.v < 0.93), at.u, at.v, 1.6, 0.13)
@@ -211,8 +221,8 @@ def _wall(at: Surface, paper: np.ndarray) -> np.ndarray:
 def wall_flowers(at: Surface) -> np.ndarray:
     """Wallpaper: a lattice of small flowers."""
     column = np.floor(at.u / 0.16)
-    x = np.mod(at.u / 0.16, 1) - 0.5
-    y = np.mod(at.v / 0.16 + 0.5 * np.mod(column, 2), 1) - 0.5
+    x = _part(at.u / 0.16) - 0.5
+    y = _part(at.v / 0.16 + 0.5 * _odd(column)) - 0.5
     near = np.hypot(x, y)
     petals = near < 0.22 + 0.1 * np.cos(5 * np.arctan2(y, x))
     rgb = _mix(_linear("b9c6b2"), _linear("f0e7d2"), petals)
@@ -221,7 +231,7 @@ def wall_flowers(at: Surface) -> np.ndarray:
 
 def wall_stripes(at: Surface) -> np.ndarray:
     """Wallpaper: broad and narrow stripes."""
-    phase = np.mod(at.u / 0.2, 1)
+    phase = _part(at.u / 0.2)
     rgb = _mix(_linear("cdb894"), _linear("e3d7bd"), phase < 0.5)
     return _wall(at, _mix(rgb, _linear("a3643f"), np.abs(phase - 0.75) < 0.05))
 
@@ -229,7 +239,7 @@ def wall_stripes(at: Surface) -> np.ndarray:
 def wall_door(at: Surface) -> np.ndarray:
     """Striped wallpaper with a panelled door."""
     x, z = at.u - 1.0, at.v
-    panel = np.maximum(np.abs(np.abs(x) - 0.2) / 0.14, np.abs(np.mod(z / 0.66, 1) - 0.5) / 0.38)
+    panel = np.maximum(np.abs(np.abs(x) - 0.2) / 0.14, np.abs(_part(z / 0.66) - 0.5) / 0.38)
     door = wood("b58d5f", "8a6238", upright=True)(at) * (1 - 0.45 * (np.abs(panel - 1) < 0.08))
     door = _mix(door, _linear("efe9da"), np.maximum(np.abs(x) - 0.42, z - 2.0) > 0)
     return _mix(wall_stripes(at), door, (np.abs(x) < 0.5) & (z < 2.08))
@@ -237,7 +247,7 @@ def wall_door(at: Surface) -> np.ndarray:
 
 def ceiling(at: Surface) -> np.ndarray:
     """Plaster coffers between beams."""
-    beam = (np.abs(np.mod(at.v / 0.8 + 0.5, 1) - 0.5) < 0.075)[None]
+    beam = (np.abs(_part(at.v / 0.8 + 0.5) - 0.5) < 0.075)[None]
     plaster = _tint(_linear("e8e3d6"), at.u, at.v, 1.2, 0.15)
     return np.where(beam, wood("9c7349", "6f4c2b")(at), plaster)
 
