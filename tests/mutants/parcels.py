@@ -162,7 +162,7 @@ MUTANTS = [
     Mutant("take_in: the last block is full", "parcels.py",
            "block == (end - 1) / BLOCK", "block == end / BLOCK", LENGTHS),
     Mutant("take_in: the first block is the last", "parcels.py",
-           "is_last = block == (end - 1) / BLOCK", "is_last = true", TWO),
+           "is_last = block == (end - 1) / BLOCK", "is_last = true", THREE),
     Mutant("take_in: one parcel too few", "parcels.py",
            "is_last ? end - BLOCK * block :", "is_last ? end - BLOCK * block - 1 :", LENGTHS),
     Mutant("take_in: one parcel too few of a full block", "parcels.py",
