@@ -35,14 +35,14 @@ def kernels64(device: str) -> Kernels:
 @pytest.fixture(scope="session", params=["plain", "packed"])
 def kernels32(device: str, request: pytest.FixtureRequest) -> Kernels:
     if request.param == "packed" and device != "cpu":
-        pytest.skip("packs of eight samples are the CPU's form of the kernels")
+        pytest.skip("packs of samples are the CPU's form of the kernels")
     return Kernels("float32", device, packed=request.param == "packed")
 
 
 @pytest.fixture(scope="session")
 def packed(device: str) -> Kernels:
     if device != "cpu":
-        pytest.skip("packs of eight samples are the CPU's form of the kernels")
+        pytest.skip("packs of samples are the CPU's form of the kernels")
     return Kernels("float32", device, packed=True)
 
 

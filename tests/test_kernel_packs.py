@@ -1,4 +1,4 @@
-"""Eight samples at a time: held to the plain kernels, and to the oracle on every path of theirs."""
+"""Sixteen samples at a time: held to the plain kernels, and to the oracle on all their paths."""
 
 from dataclasses import replace
 

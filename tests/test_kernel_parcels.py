@@ -1,11 +1,14 @@
 """Several workers, one gradient: who adds where, and that nothing is lost on the way."""
 
+import itertools
 import math
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+import reference
+import torch
 import warp as wp
 from drive import Kernels, Problem, assert_close, make_problem, unbounded
 from test_kernel_render import early, masked
@@ -132,6 +135,80 @@ def test_rays_in_turns(contraction: str, monkeypatch: pytest.MonkeyPatch) -> Non
         assert_close(of(2).backward(p), of(1).backward(p), 3e-6)
 
 
+def middles(p: Problem) -> np.ndarray:
+    """Where along x rays have half of their steps behind them, in shares of the grid."""
+    at = reference.sample_distances(
+        p.steps.near, p.steps.far, p.steps.step, p.steps.growth, p.steps.n_linear, most_steps(p)
+    )
+    points = p.origins[:, None] + at.t.numpy()[:, None] * p.directions[:, None]
+    box_min, box_max = torch.tensor(p.box_min), torch.tensor(p.box_max)
+    u = reference.grid_coordinates(
+        torch.tensor(points), box_min, box_max, p.raw.shape, p.contraction, p.border
+    ).numpy() / (np.array(p.raw.shape[:3]) - 1)
+    inside = ((u >= 0) & (u <= 1)).all(axis=2) & at.before_far.numpy()
+    return np.array(
+        [x[found][found.sum() // 2] for x, found in zip(u[..., 0], inside, strict=True)]
+    )
+
+
+@pytest.mark.parametrize("contraction", ["none", "linf", "l2"])
+@pytest.mark.parametrize("threads", [2, 3])
+def test_each_worker_has_the_rays_nearest_its_part(
+    contraction: str, threads: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    p = problem(4)
+    if contraction != "none":
+        steps = Steps(near=0.07, far=40.0, step=0.03, n_linear=60, growth=0.02)
+        p = replace(unbounded(p, contraction, 0.2), steps=steps)
+    met = of(1).forward(p).n_samples > 3
+    p = replace(p, origins=p.origins[met], directions=p.directions[met])
+    p = replace(
+        p,
+        background=p.background[:1],
+        **{
+            name: getattr(p, name)[met]
+            for name in ("target", "adj_rgb", "adj_opacity", "adj_depth")
+        },
+    )
+    monkeypatch.setattr(adjoint, "SAMPLES", p.n_rays * most_steps(p) // 2)
+    launches = []
+    kernels = of(threads)
+    adjoint_of = kernels.adjoint
+    monkeypatch.setattr(
+        kernels, "adjoint", lambda *given: launches.append(adjoint_of(*given)) or launches[-1]
+    )
+    kernels.backward(p)
+    (launch,) = launches
+    order, middle = launch.order.numpy(), middles(p)
+    turns = [order[i : i + launch.rays_a_turn] for i in range(0, p.n_rays, launch.rays_a_turn)]
+    assert len(turns) >= 2
+    first = 0
+    for turn in turns:
+        assert sorted(turn) == list(range(first, first + len(turn)))
+        first += len(turn)
+        shares = np.split(turn, [len(turn) * w // threads for w in range(1, threads)])
+        for share, following in itertools.pairwise(shares):
+            # Which of two steps is the middle one is no matter.
+            assert middle[share].max() <= middle[following].min() + 0.06
+        for share in shares:
+            assert (np.diff(share) > 0).all()  # neighbours stay neighbours
+
+
+def test_workers_take_rays_in_the_order_that_they_are_given(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    p = problem(5)
+    whole = of(2).train(p)
+
+    def all_but_the_last(launch: adjoint.AdjointLaunch, begin: int, end: int) -> None:
+        launch.order.numpy()[begin:end] = [*range(end - 2, begin - 1, -1), begin]
+
+    monkeypatch.setattr(adjoint.AdjointLaunch, "_share_out", all_but_the_last)
+    error, _ = of(2).train(p)
+    assert np.array_equal(error[:-1], whole[0][:-1])
+    assert whole[0][-1] != 0 and error[-1] == 0
+
+
 def test_workers_add_to_no_planes_but_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each delivery by itself."""
     p = problem(2)
@@ -141,7 +218,10 @@ def test_workers_add_to_no_planes_but_their_own(monkeypatch: pytest.MonkeyPatch)
     def deliver_in_turns(kernels: Kernels) -> None:
         launch = kernels.workers.launch
 
-        def spy(kernel: wp.Kernel, n: int, size: wp.vec3i, sent: parcels.Parcels) -> None:
+        def spy(kernel: wp.Kernel, n: int, *arguments: Any) -> None:
+            if kernel is not parcels.deliver_parcels:
+                return launch(kernel, n, *arguments)
+            size, sent = arguments
             planes = -(-PLANES // n)
             for worker in range(n):
                 before = sent.gradient.values.numpy().copy()

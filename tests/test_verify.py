@@ -88,7 +88,7 @@ def coarse_when_packed(method: Callable[..., Any]) -> Callable[..., Any]:
         ("gradient", never_above_one, ["beyond", "its own s(t)"]),
         ("train", sum_for_mean, ["training launch"]),
         ("train", brighter_when_scaled, ["image has the same bits"]),
-        ("see", coarse_when_packed, ["in packs of eight"]),
+        ("see", coarse_when_packed, ["in packs of sixteen"]),
     ],
 )
 def test_each_can_fail(

@@ -87,9 +87,11 @@ class AdjointLaunch:
             workers: Where to work.
         """
         self._kernel = kernel
+        self._contraction = variant.contraction
         self._size = size
         self._workers = workers
-        self._rays_a_turn = max(1, n_rays)
+        self.rays_a_turn = max(1, n_rays)
+        """As many go into one launch."""
         self.parcels: parcels.Parcels | None = None
         """What the workers leave for each other; None: kernels are plain."""
         if variant.packed:
@@ -99,8 +101,12 @@ class AdjointLaunch:
                 self._workers = Workers("cpu", count)
             if count > 1:
                 turns = math.ceil(n_rays / (SAMPLES // count // most_steps * count))
-                self._rays_a_turn = math.ceil(n_rays / max(1, turns)) or 1  # all turns alike
+                self.rays_a_turn = math.ceil(n_rays / max(1, turns)) or 1  # all turns alike
             self.parcels = _make_parcels(SAMPLES // count if count > 1 else 0, count)
+            self._middles = wp.empty(n_rays, dtype=wp.uint16, device="cpu")
+            self.order = wp.array(np.arange(n_rays), dtype=wp.int32, device="cpu")
+            """[n_rays] which ray is whose: all of the first worker's, all of the second's, ..."""
+            self.parcels.order = self.order
         elif not workers.device.is_cuda:
             self._workers = Workers("cpu", 1)
 
@@ -117,14 +123,35 @@ class AdjointLaunch:
             return
         count = self._workers.count
         self.parcels.gradient = gradient
-        for begin in range(0, n_rays, self._rays_a_turn):
-            end = min(begin + self._rays_a_turn, n_rays)
+        if count > 1:
+            grid, _, march, origins, directions = arguments[:5]
+            self._workers.launch(
+                parcels.find_middles_kernel(self._contraction),
+                n_rays,
+                grid,
+                march,
+                origins,
+                directions,
+                self._middles,
+            )
+        for begin in range(0, n_rays, self.rays_a_turn):
+            end = min(begin + self.rays_a_turn, n_rays)
+            if count > 1:
+                self._share_out(begin, end)
             self.parcels.used.zero_()
             self.parcels.end.zero_()  # in case that the last turn was interrupted
             self._workers.launch_owned(self._kernel, end, *arguments, self.parcels, begin=begin)
             if count > 1:
                 size = wp.vec3i(*self._size)
                 self._workers.launch(parcels.deliver_parcels, count, size, self.parcels)
+
+    def _share_out(self, begin: int, end: int) -> None:
+        """Give each worker the rays whose middles lie nearest its part; their order stays."""
+        n = end - begin
+        along_x = np.argsort(self._middles.numpy()[begin:end], kind="stable")
+        worker = np.empty(n, np.uint16)
+        worker[along_x] = (np.arange(1, n + 1) * self._workers.count - 1) // n  # as launches do
+        self.order.numpy()[begin:end] = begin + np.argsort(worker, kind="stable")
 
 
 def _make_parcels(n_samples: int, n_workers: int) -> parcels.Parcels:

@@ -29,8 +29,8 @@ JACOBIANS = {
     "paper": gradscale.JACOBIAN_PAPER,
 }
 
-KEPT_PACKS = 128
-"""Packs of eight steps that a CPU worker keeps of a ray between the two passes; later ones are
+KEPT_PACKS = 64
+"""Packs of sixteen steps that a CPU worker keeps of a ray between the two passes; later ones are
 made again."""
 
 

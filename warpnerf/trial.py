@@ -146,7 +146,7 @@ class TrialKernels:
         Args:
             name: float32 or float64.
             workers: Where to work.
-            packed: Eight samples at a time; in float32 on the CPU.
+            packed: Sixteen samples at a time; in float32 on the CPU.
         """
         self._workers = workers
         self._packed = packed

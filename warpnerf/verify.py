@@ -166,8 +166,8 @@ def _checks(workers: Workers) -> Iterator[tuple[str, float, Measure]]:
     pairs = [("float32 to float64", plain, exact)]
     if on_cpu:
         pairs += [
-            ("float32 in packs of eight to float64", packed, exact),
-            ("float32 in packs of eight to one by one", packed, plain),
+            ("float32 in packs of sixteen to float64", packed, exact),
+            ("float32 in packs of sixteen to one by one", packed, plain),
         ]
     for name, kernels, other in pairs:
         # Steps that grow to several units amplify rounding, to 4e-5 as measured.

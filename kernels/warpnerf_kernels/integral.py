@@ -4,7 +4,7 @@ The forward pass composites samples front to back; the backward pass walks the s
 needs of the rest of the ray only what lies behind: it starts with that, and sheds it on its way.
 Both get their samples from ``next_sample``, the one place that decides where a ray is sampled.
 
-This is the specification, a sample at a time. integral_packed.py does the same, eight at a time.
+This is the specification, a sample at a time. integral_packed.py does the same, sixteen at a time.
 """
 
 import warp as wp

@@ -1,4 +1,4 @@
-"""integral.py for the CPU: the same walk, a pack of eight steps at a time."""
+"""integral.py for the CPU: the same walk, a pack of sixteen steps at a time."""
 
 import warp as wp
 
@@ -26,7 +26,7 @@ def next_pack(
     packs: wp.array(dtype=Pack),  # written
     slot: int,
 ) -> int:
-    """Fill a pack with the next eight steps worth a look; returns the step after them.
+    """Fill a pack with sixteen steps from the next one worth a look; returns the step after them.
 
     That is ray.end where nothing is left, or not enough light. Free space is passed over as in the
     plain walk.

@@ -3,16 +3,22 @@
 Rays cross the grid in every direction; adding as they go, threads would race for its nodes. So each
 worker owns a part of the grid, some planes of nodes along x, and is the only one to add to it. What
 its rays have for its own part it adds at once; what they have for another's it leaves in parcels, a
-sample in each. Once all rays are through, each worker adds what the others have left for it. What
-is added to a node, and in which order, depends on nothing but the rays and the number of workers.
+sample in each. Once all rays are through, each worker adds what the others have left for it. That
+is the less, the more of a ray goes through the part of the worker that has it: they are shared out
+by where their middles lie. What is added to a node, and in which order, depends on nothing but the
+rays and the number of workers.
 
 Like packs.py this is C++ on Clang's vector types, for float32 on the CPU.
 """
 
+from functools import cache
+
 import warp as wp
 
+from .contraction import contract
+from .march import prepare_ray, step_edge
 from .packs import Pack
-from .types import Gradient
+from .types import Gradient, Grid, March, real, vec3
 from .vectors import VECTORS, float3, float4
 
 wp.set_module_options({"enable_backward": False})
@@ -41,6 +47,7 @@ class Parcels:
     end: wp.array2d(dtype=wp.int32)  # one past its last parcel; 0 if there is none
     used: wp.array2d(dtype=wp.int32)  # by sender alone: blocks that are in use
     gradient: Gradient  # where it all goes
+    order: wp.array(dtype=wp.int32)  # [n_rays] in which workers take the rays
 
 
 WORDS = (
@@ -75,7 +82,7 @@ each(own(load_int(packs.data[later].i)), [&](int n) {
     fetch(values + packs.data[later].base.c[n], size);
 });
 vec red = load(pack.red), green = load(pack.green), blue = load(pack.blue);
-quad adj[8];
+quad adj[LANES];
 to_quads(
     load(pack.sigma_slope) * load(pack.adj_sigma),
     red * (1.0f - red) * load(pack.adj_red),
@@ -116,7 +123,7 @@ const unsigned visited = bits(load_int(pack.visited));
 const unsigned lower = own(i), upper = own(i + 1);
 if ((lower & upper & visited) == visited) {
     #pragma clang loop unroll(full)
-    for (int n = 0; n < 8; ++n) {
+    for (int n = 0; n < LANES; ++n) {
         if (!(visited >> n & 1)) continue;
         add_lower(n);
         add_upper(n);
@@ -190,3 +197,26 @@ def take_in(size: wp.vec3i, worker: int, parcels: Parcels):
 def deliver_parcels(first: int, size: wp.vec3i, parcels: Parcels):
     """Add what lies in parcels to the grid's gradient, each worker to its own part."""
     take_in(size, first + wp.tid(), parcels)
+
+
+@cache
+def find_middles_kernel(contraction: int) -> wp.Kernel:
+    """Where in the grid, from its first plane of nodes to its last, a ray's middle step lies."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def find_middles(
+        first: int,
+        grid: Grid,
+        march: March,
+        origins: wp.array(dtype=vec3),  # [n_rays] scene units
+        directions: wp.array(dtype=vec3),  # [n_rays] unit vectors
+        out_middle: wp.array(dtype=wp.uint16),  # [n_rays] 0 to 65535
+    ):
+        i = first + wp.tid()
+        ray = prepare_ray(grid, march, origins[i], directions[i], real(0.0), contraction)
+        t = wp.min(step_edge(march, (ray.begin + ray.end) // 2), march.far)
+        q = contract(ray.q_origin + t * ray.q_direction, grid.border, contraction)
+        x = (q[0] * grid.to_nodes[0] + grid.middle[0]) / (real(2.0) * grid.middle[0])
+        out_middle[i] = wp.uint16(wp.clamp(x, real(0.0), real(1.0)) * real(65535.0))
+
+    return find_middles

@@ -2,7 +2,7 @@
 
 What selects a variant (``scaling``, ``jacobian``, ``contraction``) is a constant in each kernel, so
 the compiler drops what a variant does not use. So is the choice between the plain integral, a
-sample at a time, and the packed one, eight at a time, which is for the CPU.
+sample at a time, and the packed one, sixteen at a time, which is for the CPU.
 """
 
 from functools import cache
@@ -22,11 +22,11 @@ class Variant(NamedTuple):
     contraction: int
     scaling: int
     jacobian: int
-    packed: bool  # eight samples at a time; float32 on the CPU only
+    packed: bool  # sixteen samples at a time; float32 on the CPU only
 
 
 def kept_type(variant: Variant) -> type:
-    """What these kernels keep of a ray between the passes: samples or packs of eight."""
+    """What these kernels keep of a ray between the passes: samples or packs of sixteen."""
     return packs.Pack if variant.packed else Sample
 
 
@@ -45,6 +45,18 @@ def ray_value(values: wp.array(dtype=vec3), ray: int) -> vec3:
 def ray_value(values: wp.array(dtype=real), ray: int) -> real:  # noqa: F811 (an overload)
     """One value for all rays, or one per ray."""
     return values[wp.min(ray, values.shape[0] - 1)]
+
+
+@wp.func
+def ray_of(turn: int, gradient: Gradient) -> int:
+    """The ray whose turn it is: they come as they are."""
+    return turn
+
+
+@wp.func
+def ray_of(turn: int, gradient: parcels.Parcels) -> int:  # noqa: F811 (an overload)
+    """The ray whose turn it is: each worker has those that are nearest its part of the grid."""
+    return gradient.order[turn]
 
 
 @cache
@@ -130,7 +142,7 @@ def render_backward_kernel(variant: Variant) -> wp.Kernel:
         # out
         out_gradient: OutGradient,  # of the grid's values, added to
     ):
-        i = first + wp.tid()
+        i = ray_of(first + wp.tid(), out_gradient)
         ray = prepare_ray(
             grid, march, origins[i], directions[i], ray_value(offsets, i), contraction
         )
@@ -198,7 +210,7 @@ def render_train_kernel(variant: Variant) -> wp.Kernel:
         out_n_samples: wp.array(dtype=wp.int32),  # [n_rays]
         out_gradient: OutGradient,  # of the grid's values, added to
     ):
-        i = first + wp.tid()
+        i = ray_of(first + wp.tid(), out_gradient)
         row = worker * capacity
         behind_all = ray_value(background, i)
         ray = prepare_ray(

@@ -1,26 +1,40 @@
-"""The words of packs.py and parcels.py: vectors of eight lanes, in C++ for Clang."""
+"""The words of packs.py and parcels.py: vectors of sixteen lanes, in C++ for Clang."""
 
 import warp as wp
 
 from .tiles import TILE
 
-LANES = 8
-"""Steps in a pack, and numbers in a vector."""
+LANES = 16
+"""Steps in a pack, and numbers in a vector: as many as the widest processors compute at once. On
+others a vector is two or four of theirs, which do not wait for each other."""
 
 lanes = wp.types.vector(LANES, wp.float32)
 lanes_int = wp.types.vector(LANES, wp.int32)
 float3 = wp.types.vector(3, wp.float32)
 float4 = wp.types.vector(4, wp.float32)
 
+
+def _moved_up(n: int) -> str:
+    """The lanes of a vector, n places up, and in the first n the first lane of another vector."""
+    return ", ".join(str(LANES if lane < n else lane - n) for lane in range(LANES))
+
+
 VECTORS = (
-    f"constexpr int TILE = {TILE};"
-    r"""
-// Eight lanes; four channels of a node; and both where they lie in memory.
-typedef float vec __attribute__((ext_vector_type(8)));
-typedef int ivec __attribute__((ext_vector_type(8)));
+    f"constexpr int LANES = {LANES}, TILE = {TILE};\n"
+    + "".join(
+        f"#define UP_{n}(x, below) __builtin_shufflevector(x, below, {_moved_up(n)})\n"
+        for n in (1, 2, 4, 8)
+    )
+    + r"""
+// Sixteen lanes; eight numbers: half the lanes, or two nodes; four: the channels of a node.
+typedef float vec __attribute__((ext_vector_type(LANES)));
+typedef int ivec __attribute__((ext_vector_type(LANES)));
+typedef float octet __attribute__((ext_vector_type(8)));
 typedef float quad __attribute__((ext_vector_type(4)));
-typedef float vec_at __attribute__((ext_vector_type(8), aligned(4), may_alias));
-typedef int ivec_at __attribute__((ext_vector_type(8), aligned(4), may_alias));
+// The same where they lie in memory.
+typedef float vec_at __attribute__((ext_vector_type(LANES), aligned(4), may_alias));
+typedef int ivec_at __attribute__((ext_vector_type(LANES), aligned(4), may_alias));
+typedef float octet_at __attribute__((ext_vector_type(8), aligned(4), may_alias));
 typedef float quad_at __attribute__((ext_vector_type(4), aligned(4), may_alias));
 
 auto load = [&](const auto& x) -> vec { return *(const vec_at*)&x; };
@@ -70,12 +84,13 @@ auto log1p = [&](vec y) -> vec {
 auto sigmoid = [&](vec x) -> vec { return 1.0f / (1.0f + exponential(-x)); };
 
 auto sum = [&](vec x) -> float {
-    quad h = x.lo + x.hi;
+    octet g = x.lo + x.hi;
+    quad h = g.lo + g.hi;
     return (h[0] + h[2]) + (h[1] + h[3]);
 };
 auto bits = [&](ivec x) -> unsigned {  // bit n: lane n is not 0
-    typedef bool flags __attribute__((ext_vector_type(8)));
-    return __builtin_bit_cast(unsigned char, __builtin_convertvector(x, flags));
+    typedef bool flags __attribute__((ext_vector_type(LANES)));
+    return __builtin_bit_cast(unsigned short, __builtin_convertvector(x, flags));
 };
 auto each = [&](unsigned lanes, auto visit) {  // the lanes whose bits are set
     for (; lanes; lanes &= lanes - 1) visit(__builtin_ctz(lanes));
@@ -84,42 +99,64 @@ auto count = [&](ivec x) -> int { return -__builtin_reduce_add(x); };
 // In lane i the sum, or product, of lanes 0 to i.
 auto running_sum = [&](vec x) -> vec {
     vec zero = all(0.0f);
-    x += __builtin_shufflevector(x, zero, 8, 0, 1, 2, 3, 4, 5, 6);
-    x += __builtin_shufflevector(x, zero, 8, 8, 0, 1, 2, 3, 4, 5);
-    return x + __builtin_shufflevector(x, zero, 8, 8, 8, 8, 0, 1, 2, 3);
+    x += UP_1(x, zero);
+    x += UP_2(x, zero);
+    x += UP_4(x, zero);
+    return x + UP_8(x, zero);
 };
 auto running_product = [&](vec x) -> vec {
     vec one = all(1.0f);
-    x *= __builtin_shufflevector(x, one, 8, 0, 1, 2, 3, 4, 5, 6);
-    x *= __builtin_shufflevector(x, one, 8, 8, 0, 1, 2, 3, 4, 5);
-    return x * __builtin_shufflevector(x, one, 8, 8, 8, 8, 0, 1, 2, 3);
+    x *= UP_1(x, one);
+    x *= UP_2(x, one);
+    x *= UP_4(x, one);
+    return x * UP_8(x, one);
 };
-// Eight quads as four vectors, one a channel, and back.
-auto to_lanes = [&](const quad* q, vec& a, vec& b, vec& c, vec& d) {
-    vec q04 = __builtin_shufflevector(q[0], q[4], 0, 1, 2, 3, 4, 5, 6, 7);
-    vec q15 = __builtin_shufflevector(q[1], q[5], 0, 1, 2, 3, 4, 5, 6, 7);
-    vec q26 = __builtin_shufflevector(q[2], q[6], 0, 1, 2, 3, 4, 5, 6, 7);
-    vec q37 = __builtin_shufflevector(q[3], q[7], 0, 1, 2, 3, 4, 5, 6, 7);
-    vec ab0145 = __builtin_shufflevector(q04, q15, 0, 8, 1, 9, 4, 12, 5, 13);
-    vec ab2367 = __builtin_shufflevector(q26, q37, 0, 8, 1, 9, 4, 12, 5, 13);
-    vec cd0145 = __builtin_shufflevector(q04, q15, 2, 10, 3, 11, 6, 14, 7, 15);
-    vec cd2367 = __builtin_shufflevector(q26, q37, 2, 10, 3, 11, 6, 14, 7, 15);
+// Eight quads as four octets, one a channel, and back.
+auto to_octets = [&](const quad* q, octet& a, octet& b, octet& c, octet& d) {
+    octet q04 = __builtin_shufflevector(q[0], q[4], 0, 1, 2, 3, 4, 5, 6, 7);
+    octet q15 = __builtin_shufflevector(q[1], q[5], 0, 1, 2, 3, 4, 5, 6, 7);
+    octet q26 = __builtin_shufflevector(q[2], q[6], 0, 1, 2, 3, 4, 5, 6, 7);
+    octet q37 = __builtin_shufflevector(q[3], q[7], 0, 1, 2, 3, 4, 5, 6, 7);
+    octet ab0145 = __builtin_shufflevector(q04, q15, 0, 8, 1, 9, 4, 12, 5, 13);
+    octet ab2367 = __builtin_shufflevector(q26, q37, 0, 8, 1, 9, 4, 12, 5, 13);
+    octet cd0145 = __builtin_shufflevector(q04, q15, 2, 10, 3, 11, 6, 14, 7, 15);
+    octet cd2367 = __builtin_shufflevector(q26, q37, 2, 10, 3, 11, 6, 14, 7, 15);
     a = __builtin_shufflevector(ab0145, ab2367, 0, 1, 8, 9, 4, 5, 12, 13);
     b = __builtin_shufflevector(ab0145, ab2367, 2, 3, 10, 11, 6, 7, 14, 15);
     c = __builtin_shufflevector(cd0145, cd2367, 0, 1, 8, 9, 4, 5, 12, 13);
     d = __builtin_shufflevector(cd0145, cd2367, 2, 3, 10, 11, 6, 7, 14, 15);
 };
-auto to_quads = [&](vec a, vec b, vec c, vec d, quad* q) {
-    vec ab0145 = __builtin_shufflevector(a, b, 0, 8, 1, 9, 4, 12, 5, 13);
-    vec ab2367 = __builtin_shufflevector(a, b, 2, 10, 3, 11, 6, 14, 7, 15);
-    vec cd0145 = __builtin_shufflevector(c, d, 0, 8, 1, 9, 4, 12, 5, 13);
-    vec cd2367 = __builtin_shufflevector(c, d, 2, 10, 3, 11, 6, 14, 7, 15);
-    vec q04 = __builtin_shufflevector(ab0145, cd0145, 0, 1, 8, 9, 4, 5, 12, 13);
-    vec q15 = __builtin_shufflevector(ab0145, cd0145, 2, 3, 10, 11, 6, 7, 14, 15);
-    vec q26 = __builtin_shufflevector(ab2367, cd2367, 0, 1, 8, 9, 4, 5, 12, 13);
-    vec q37 = __builtin_shufflevector(ab2367, cd2367, 2, 3, 10, 11, 6, 7, 14, 15);
+auto octets_to_quads = [&](octet a, octet b, octet c, octet d, quad* q) {
+    octet ab0145 = __builtin_shufflevector(a, b, 0, 8, 1, 9, 4, 12, 5, 13);
+    octet ab2367 = __builtin_shufflevector(a, b, 2, 10, 3, 11, 6, 14, 7, 15);
+    octet cd0145 = __builtin_shufflevector(c, d, 0, 8, 1, 9, 4, 12, 5, 13);
+    octet cd2367 = __builtin_shufflevector(c, d, 2, 10, 3, 11, 6, 14, 7, 15);
+    octet q04 = __builtin_shufflevector(ab0145, cd0145, 0, 1, 8, 9, 4, 5, 12, 13);
+    octet q15 = __builtin_shufflevector(ab0145, cd0145, 2, 3, 10, 11, 6, 7, 14, 15);
+    octet q26 = __builtin_shufflevector(ab2367, cd2367, 0, 1, 8, 9, 4, 5, 12, 13);
+    octet q37 = __builtin_shufflevector(ab2367, cd2367, 2, 3, 10, 11, 6, 7, 14, 15);
     q[0] = q04.lo; q[1] = q15.lo; q[2] = q26.lo; q[3] = q37.lo;
     q[4] = q04.hi; q[5] = q15.hi; q[6] = q26.hi; q[7] = q37.hi;
+};
+// Sixteen quads as four vectors, one a channel, and back.
+auto to_lanes = [&](const quad* q, vec& a, vec& b, vec& c, vec& d) {
+    octet low[4], high[4];
+    to_octets(q, low[0], low[1], low[2], low[3]);
+    to_octets(q + 8, high[0], high[1], high[2], high[3]);
+    auto joined = [&](int channel) -> vec {
+        vec both;
+        both.lo = low[channel];
+        both.hi = high[channel];
+        return both;
+    };
+    a = joined(0);
+    b = joined(1);
+    c = joined(2);
+    d = joined(3);
+};
+auto to_quads = [&](vec a, vec b, vec c, vec d, quad* q) {
+    octets_to_quads(a.lo, b.lo, c.lo, d.lo, q);
+    octets_to_quads(a.hi, b.hi, c.hi, d.hi, q + 8);
 };
 // Bring the four columns of nodes around a sample into the cache, ahead of their use.
 auto fetch = [&](const auto* node, const auto& size) {
