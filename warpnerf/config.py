@@ -118,7 +118,7 @@ class OptimConfig:
     """Weight of the total variation of raw densities, per pair of neighbouring nodes."""
     tv_rgb: float = 1e-9
     """Weight of the total variation of raw colours."""
-    tv_every: int = 4
+    tv_every: int = 8
     """Steps from one total-variation gradient to the next, which counts that many times."""
 
     def __post_init__(self) -> None:

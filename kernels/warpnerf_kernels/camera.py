@@ -47,12 +47,21 @@ def distort(view: View, p: vec2) -> vec2:
 def undistort(view: View, distorted: vec2) -> vec2:
     """Inverse of distort, by Newton's method on the two equations.
 
-    The target moves out from the principal point in eight strides, so that each start is close.
+    The target moves out from the principal point in eight strides, each as soon as p has caught up
+    with the last one, and p is first moved straight on as far: so each start is close.
     """
     p = vec2()
     two = real(2.0)
-    for iteration in range(32):
-        target = distorted * wp.min(real(1.0), real(iteration // 3 + 1) / real(8.0))
+    share = real(0.0)  # of its way that the target has come
+    left = int(4)  # steps to take once p is close to where it ends: quadratic convergence
+    for _ in range(40):
+        if wp.length_sq(distort(view, p) - share * distorted) < real(1.0e-6):
+            if share == real(1.0):
+                left -= 1
+            further = wp.min(share + real(0.125), real(1.0))
+            if share > real(0.0):
+                p = p * (further / share)
+            share = further
         x = p[0]
         y = p[1]
         r2 = x * x + y * y
@@ -64,9 +73,11 @@ def undistort(view: View, distorted: vec2) -> vec2:
         a = radial + two * x * x * slope + two * p1 * y + real(6.0) * p2 * x
         b = two * x * y * slope + two * p1 * x + two * p2 * y
         d = radial + two * y * y * slope + real(6.0) * p1 * y + two * p2 * x
-        residual = distort(view, p) - target
+        residual = distort(view, p) - share * distorted
         det = a * d - b * b
         p = p - vec2(d * residual[0] - b * residual[1], a * residual[1] - b * residual[0]) / det
+        if left == 0:
+            break
     return p
 
 

@@ -23,12 +23,6 @@ def huber(difference: real) -> real:
 
 
 @wp.func
-def adj_huber(difference: real, adj_y: real) -> real:
-    """Adjoint of huber."""
-    return wp.clamp(difference, real(-1.0), real(1.0)) * adj_y
-
-
-@wp.func
 def pair_variation(weight: vec4, a: vec4, b: vec4) -> real:
     """sum_c weight_c huber(a_c - b_c)."""
     d = a - b
@@ -41,15 +35,9 @@ def pair_variation(weight: vec4, a: vec4, b: vec4) -> real:
 
 
 @wp.func
-def adj_pair_variation(weight: vec4, a: vec4, b: vec4) -> vec4:
-    """Adjoint of pair_variation with respect to a."""
-    d = a - b
-    return vec4(
-        adj_huber(d[0], weight[0]),
-        adj_huber(d[1], weight[1]),
-        adj_huber(d[2], weight[2]),
-        adj_huber(d[3], weight[3]),
-    )
+def adj_pair_variation(a: vec4, b: vec4) -> vec4:
+    """Adjoint of huber(a_c - b_c) with respect to a_c, for each channel c."""
+    return wp.max(wp.min(a - b, vec4(real(1.0))), vec4(real(-1.0)))
 
 
 @wp.func
@@ -69,26 +57,27 @@ def node_variation(values: wp.array(dtype=vec4), size: wp.vec3i, weight: vec4, n
 
 
 @wp.func
-def adj_node_variation(values: wp.array(dtype=vec4), size: wp.vec3i, weight: vec4, n: int) -> vec4:
-    """d TV / d x at a node: of all its pairs, towards larger and smaller indices."""
-    k = n % size[2]
-    j = (n // size[2]) % size[1]
-    i = n // (size[2] * size[1])
+def adj_node_variation(
+    values: wp.array(dtype=vec4), size: wp.vec3i, weight: vec4, n: int, j: int, k: int
+) -> vec4:
+    """d TV / d x at node n = (i, j, k): of all its pairs, towards larger and smaller indices."""
+    stride_y = size[2]
+    stride_x = size[1] * size[2]
     value = values[n]
     total = vec4()
-    if i > 0:
-        total += adj_pair_variation(weight, value, values[flat_index(i - 1, j, k, size)])
-    if i + 1 < size[0]:
-        total += adj_pair_variation(weight, value, values[flat_index(i + 1, j, k, size)])
+    if n >= stride_x:
+        total += adj_pair_variation(value, values[n - stride_x])
+    if n + stride_x < values.shape[0]:
+        total += adj_pair_variation(value, values[n + stride_x])
     if j > 0:
-        total += adj_pair_variation(weight, value, values[flat_index(i, j - 1, k, size)])
+        total += adj_pair_variation(value, values[n - stride_y])
     if j + 1 < size[1]:
-        total += adj_pair_variation(weight, value, values[flat_index(i, j + 1, k, size)])
+        total += adj_pair_variation(value, values[n + stride_y])
     if k > 0:
-        total += adj_pair_variation(weight, value, values[n - 1])
+        total += adj_pair_variation(value, values[n - 1])
     if k + 1 < size[2]:
-        total += adj_pair_variation(weight, value, values[n + 1])
-    return total
+        total += adj_pair_variation(value, values[n + 1])
+    return wp.cw_mul(weight, total)
 
 
 @wp.kernel
@@ -132,7 +121,17 @@ def total_variation_backward(
     tile = next_tile(gradient.touched, tile_of(start), last)
     while tile < last:
         node = tile * wp.static(TILE)
-        for n in range(wp.max(start, node), wp.min(end, node + wp.static(TILE))):
-            if not (gradient.values[n] == vec4()):
-                gradient.values[n] += adj_node_variation(values, size, weight, n)
+        first_node = wp.max(start, node)
+        j = (first_node // size[2]) % size[1]
+        k = first_node % size[2]
+        for n in range(first_node, wp.min(end, node + wp.static(TILE))):
+            adj = gradient.values[n]
+            if not (adj == vec4()):
+                gradient.values[n] = adj + adj_node_variation(values, size, weight, n, j, k)
+            k += 1  # on to the next node, without dividing for each
+            if k == size[2]:
+                k = 0
+                j += 1
+                if j == size[1]:
+                    j = 0
         tile = next_tile(gradient.touched, tile + 1, last)
