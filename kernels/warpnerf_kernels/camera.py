@@ -47,21 +47,21 @@ def distort(view: View, p: vec2) -> vec2:
 def undistort(view: View, distorted: vec2) -> vec2:
     """Inverse of distort, by Newton's method on the two equations.
 
-    The target moves out from the principal point in eight strides, each as soon as p has caught up
-    with the last one, and p is first moved straight on as far: so each start is close.
+    The target moves out from the principal point in eight strides of one step each, for which p is
+    first moved straight on as far; steps follow until p is close to where it ends.
     """
     p = vec2()
     two = real(2.0)
     share = real(0.0)  # of its way that the target has come
-    left = int(4)  # steps to take once p is close to where it ends: quadratic convergence
+    left = int(4)  # steps to take once p is close: each doubles the digits
     for _ in range(40):
-        if wp.length_sq(distort(view, p) - share * distorted) < real(1.0e-6):
-            if share == real(1.0):
-                left -= 1
-            further = wp.min(share + real(0.125), real(1.0))
+        if share < real(1.0):
+            further = share + real(0.125)
             if share > real(0.0):
                 p = p * (further / share)
             share = further
+        elif wp.length_sq(distort(view, p) - distorted) < real(1.0e-6):
+            left -= 1
         x = p[0]
         y = p[1]
         r2 = x * x + y * y
