@@ -101,7 +101,7 @@ def test_throughput(tmp_path):
             assert 0 < row["least_ms"] == max(bounds["arithmetic"], bounds["traffic"])
     rows = record["memory"]
     assert [row["n_samples"] for row in rows] == [64 * 8, 64 * 16, 64 * 32]
-    assert len({row["warpnerf_bytes"] for row in rows}) == 1
+    assert len({row["warpnerf_room_bytes"] for row in rows}) == 1
     assert rows[0]["torch_bytes"] < rows[1]["torch_bytes"] < rows[2]["torch_bytes"]
     plot = tmp_path / "record.png"
     assert plot.exists() == (f"plot: {plot}" in printed)

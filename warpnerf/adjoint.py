@@ -14,9 +14,10 @@ from warpnerf_kernels.types import vec4
 
 from warpnerf.parallel import Workers
 
-SAMPLES = 1 << 19
-"""Samples whose gradients may be in parcels at a time, of all workers together: about 34 MB. Rays
-that might have more take turns, so memory grows with neither rays nor samples."""
+SAMPLES = 1 << 21
+"""Samples whose gradients may be in parcels at a time, of all workers together: room for 67 MB with
+two workers, for 134 MB with more, of which only what is used takes memory: a few MB. Rays that
+might have more samples take turns, so memory grows with neither rays nor samples."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -158,7 +159,7 @@ def _make_parcels(n_samples: int, n_workers: int) -> parcels.Parcels:
     """No parcels, with room for those of so many samples of each worker."""
     row = -(-n_workers // 16) * 16  # whole cache lines, which no two workers share
     # A sample goes to two others at most, and each of these may have begun a block.
-    n_blocks = n_workers + -(-2 * n_samples // parcels.BLOCK)
+    n_blocks = n_workers + -(-min(2, n_workers - 1) * n_samples // parcels.BLOCK)
 
     def room(n: int, dtype: Any = wp.int32) -> wp.array:
         return wp.empty((n_workers, n), dtype=dtype, device="cpu")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import warp as wp
+from warpnerf_kernels.parcels import BLOCK
 from warpnerf_kernels.tiles import STRETCH, TILE, next_tile, tile_of
 from warpnerf_kernels.types import Gradient, vec4
 from workload import Workload
@@ -82,13 +83,16 @@ class WarpStep:
         """Visited steps of the last step."""
         return int(self._pass.n_samples.numpy().sum())
 
-    def scratch_bytes(self) -> int:
-        """All arrays of the training pass but the gradient."""
-        parcels = self._pass.launch.parcels
+    def scratch_bytes(self) -> tuple[int, int]:
+        """All arrays of the training pass but the gradient: what the last step used, and room."""
         arrays = [*vars(self._pass).values(), self._pass.gradients.touched]
-        if parcels is not None:
-            arrays += [parcels.contents, parcels.next]
-        return sum(array.capacity for array in arrays if isinstance(array, wp.array))
+        used = sum(array.capacity for array in arrays if isinstance(array, wp.array))
+        parcels = self._pass.launch.parcels
+        if parcels is None:
+            return used, used
+        room = used + parcels.contents.capacity + parcels.next.capacity
+        a_block = BLOCK * parcels.contents.capacity // parcels.contents.size
+        return used + int(parcels.used.numpy()[:, 0].sum()) * a_block, room
 
 
 def obstacle(device: str) -> str | None:
