@@ -91,9 +91,9 @@ def test_training_launch_against_autograd(
 
 
 def test_capacity_changes_nothing(packed: Kernels) -> None:
-    """Rays of up to eight packs: in one slot, in some, and in more than they need."""
+    """Rays of up to ten packs: in one slot, in some, and in more than they need."""
     for seed in range(N_SEEDS):
-        p = masked(make_problem(seed, steps=Steps(near=0.0, far=4.0, step=0.04)), seed)
+        p = masked(make_problem(seed, steps=Steps(near=0.0, far=4.0, step=0.02)), seed)
         for problem in (p, early(p)):
             in_one_slot = packed.train(problem, "clamped", capacity=1)
             for capacity in (2, 3, 5, 8, 64):

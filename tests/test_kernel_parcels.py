@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -10,7 +11,7 @@ import pytest
 import reference
 import torch
 import warp as wp
-from drive import Kernels, Problem, assert_close, make_problem, unbounded
+from drive import Kernels, Problem, assert_close, make_problem, unbounded, unit
 from test_kernel_render import early, masked
 from warpnerf_kernels import parcels
 from warpnerf_kernels.tiles import TILE
@@ -121,13 +122,13 @@ def test_no_ray_takes_more_steps_than_are_reckoned_with(
 
 @pytest.mark.parametrize("contraction", ["none", "linf"])
 def test_rays_in_turns(contraction: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where parcels of all rays do not fit; of one for each worker, which do; and of none."""
+    """Where parcels of all rays do not fit; of two for each worker, which do; and of fewer."""
     p = problem(1)
     if contraction != "none":
         p = unbounded(p, contraction, 0.2)
     at_once = of(2).train(p)
     most = most_steps(p)
-    for samples in (20_000, 2 * most, 2 * most - 1, 1):
+    for samples in (20_000, 4 * (most + parcels.RAY), 4 * most, 1):
         monkeypatch.setattr(adjoint, "SAMPLES", samples)
         in_turns = of(2).train(p)
         assert np.array_equal(in_turns[0], at_once[0])
@@ -171,27 +172,79 @@ def test_each_worker_has_the_rays_nearest_its_part(
         },
     )
     monkeypatch.setattr(adjoint, "SAMPLES", p.n_rays * most_steps(p) // 2)
-    launches = []
-    kernels = of(threads)
-    adjoint_of = kernels.adjoint
-    monkeypatch.setattr(
-        kernels, "adjoint", lambda *given: launches.append(adjoint_of(*given)) or launches[-1]
-    )
-    kernels.backward(p)
-    (launch,) = launches
-    order, middle = launch.order.numpy(), middles(p)
-    turns = [order[i : i + launch.rays_a_turn] for i in range(0, p.n_rays, launch.rays_a_turn)]
+    middle = middles(p)
+    turns = turns_of(lambda: of(threads).backward(p), monkeypatch)
     assert len(turns) >= 2
     first = 0
     for turn in turns:
-        assert sorted(turn) == list(range(first, first + len(turn)))
-        first += len(turn)
-        shares = np.split(turn, [len(turn) * w // threads for w in range(1, threads)])
-        for share, following in itertools.pairwise(shares):
+        assert len(turn) == threads
+        rays = np.concatenate(turn)
+        assert sorted(rays) == list(range(first, first + len(rays)))
+        first += len(rays)
+        for share, following in itertools.pairwise(turn):
             # Which of two steps is the middle one is no matter.
             assert middle[share].max() <= middle[following].min() + 0.06
-        for share in shares:
+        for share in turn:
             assert (np.diff(share) > 0).all()  # neighbours stay neighbours
+    assert first == p.n_rays
+
+
+def turns_of(launch: Callable[[], Any], monkeypatch: pytest.MonkeyPatch) -> list[list[np.ndarray]]:
+    """The rays of each worker in each turn of what is launched."""
+    turns = []
+    share_out = adjoint.AdjointLaunch._share_out
+
+    def spy(launch: adjoint.AdjointLaunch, begin: int, end: int) -> list[int]:
+        bounds = share_out(launch, begin, end)
+        assert (bounds[0], bounds[-1]) == (begin, end)
+        order = launch._order.numpy().copy()
+        turns.append([order[i:j] for i, j in itertools.pairwise(bounds)])
+        return bounds
+
+    monkeypatch.setattr(adjoint.AdjointLaunch, "_share_out", spy)
+    launch()
+    return turns
+
+
+@pytest.mark.parametrize("threads", [2, 3, 5])
+def test_each_worker_has_as_much_work(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cameras at one end of the box, where the rays that miss it begin too."""
+    p = problem(6)
+    p.origins[:] = p.box_max + 0.1
+    p.directions[:] = unit(np.random.default_rng(6).normal(size=p.directions.shape))
+    p.directions[::3] = unit(0.5 * (p.box_min + p.box_max) - p.origins[::3])
+    steps = of(1).forward(p).n_samples
+    assert 0.3 < (steps > 0).mean() < 0.6
+    (turn,) = turns_of(lambda: of(threads).backward(p), monkeypatch)
+    work = np.array([steps[share].sum() for share in turn])
+    assert work.max() < 1.2 * work.mean()
+
+
+def test_there_is_room_for_all_parcels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rays between the parts of the second and the third worker, a third of them the first's."""
+    p = problem(7)
+    nodes = np.random.default_rng(7).uniform(size=(p.n_rays, 3)) * (1, 0, 5) + (3, 0, 0)
+    voxel = (p.box_max - p.box_min) / (np.array(p.raw.shape[:3]) - 1)
+    p.origins[:] = p.box_min + nodes * voxel
+    p.directions[:] = (0, 1, 0)
+    p = replace(p, steps=Steps(near=0.0, far=4.0, step=0.004))
+    launches: list[adjoint.AdjointLaunch] = []
+    run = adjoint.AdjointLaunch.run
+    monkeypatch.setattr(
+        adjoint.AdjointLaunch,
+        "run",
+        lambda launch, *given: launches.append(launch) or run(launch, *given),
+    )
+    of(3).backward(p)
+    work = int(launches[0]._work.numpy().sum())
+    monkeypatch.setattr(adjoint, "SAMPLES", work + 3 * (most_steps(p) + parcels.RAY) + 2)
+    kernels = of(3)
+    turns = turns_of(lambda: kernels.backward(p), monkeypatch)
+    assert len(turns) == 1
+    made = launches[1].parcels
+    assert made is not None
+    most, room = made.used.numpy()[:, 0].max(), made.next.shape[1]
+    assert 0.9 * room < most <= room
 
 
 def test_workers_take_rays_in_the_order_that_they_are_given(
@@ -200,8 +253,9 @@ def test_workers_take_rays_in_the_order_that_they_are_given(
     p = problem(5)
     whole = of(2).train(p)
 
-    def all_but_the_last(launch: adjoint.AdjointLaunch, begin: int, end: int) -> None:
-        launch.order.numpy()[begin:end] = [*range(end - 2, begin - 1, -1), begin]
+    def all_but_the_last(launch: adjoint.AdjointLaunch, begin: int, end: int) -> list[int]:
+        launch._order.numpy()[begin:end] = [*range(end - 2, begin - 1, -1), begin]
+        return [begin, (begin + end) // 2, end]
 
     monkeypatch.setattr(adjoint.AdjointLaunch, "_share_out", all_but_the_last)
     error, _ = of(2).train(p)
@@ -249,10 +303,10 @@ def test_what_a_worker_adds_at_once_is_its_own(monkeypatch: pytest.MonkeyPatch) 
     launch, make_parcels = kernels.workers.launch_owned, adjoint._make_parcels
     planes: list[list[int]] = []
 
-    def by_owner(kernel: wp.Kernel, n: int, *arguments: Any, begin: int = 0) -> None:
+    def by_owner(kernel: wp.Kernel, items: Any, *arguments: Any) -> None:
         if "backward" not in kernel.key:
-            return launch(kernel, n, *arguments, begin=begin)
-        wp.launch(kernel, n, inputs=[0, len(planes), *arguments], device="cpu")
+            return launch(kernel, items, *arguments)
+        wp.launch(kernel, items[-1], inputs=[0, len(planes), *arguments], device="cpu")
         found = arguments[-1].gradient.values.numpy().reshape(whole.shape)
         planes.append(np.flatnonzero(found.any((1, 2, 3))).tolist())
 

@@ -70,6 +70,7 @@ PATHS: dict[str, Path] = {
     "far inside the box": lambda seed: make_problem(
         seed, steps=Steps(near=0.4, far=1.3, step=0.08)
     ),
+    "many steps": lambda seed: make_problem(seed, steps=Steps(near=0.0, far=4.0, step=0.02)),
     "mask": lambda seed: masked(make_problem(seed), seed),
     "early stop": lambda seed: early(make_problem(seed)),
     "linf": lambda seed: unbounded(make_problem(seed), "linf", 0.2),
@@ -343,3 +344,20 @@ def test_rays_that_miss_see_the_background(kernels64: Kernels) -> None:
     assert not kernels64.backward(away).any()
     before_near = replace(p, steps=replace(p.steps, near=10.0, far=20.0))
     assert not kernels64.forward(before_near).n_samples.any()
+
+
+@pytest.mark.parametrize("contraction", ["none", "linf"])
+def test_rays_that_are_not_finite_see_the_background(contraction: str, kernels32: Kernels) -> None:
+    """They would walk on for a thousand million steps."""
+    p = make_problem(5, steps=Steps(near=0.0, far=1e30, step=0.08))
+    if contraction != "none":
+        steps = Steps(near=0.0, far=1e6, step=0.08, n_linear=30, growth=0.05)
+        p = replace(unbounded(p, contraction, 0.2), steps=steps)
+    lost = [0, 3, 4]
+    p.directions[lost[0]] = np.nan
+    p.directions[lost[1], 1] = np.inf
+    p.origins[lost[2], 2] = np.nan
+    out = kernels32.forward(p)
+    assert not out.n_samples[lost].any() and out.n_samples.any()
+    assert np.array_equal(out.rgb[lost], p.background[lost].astype(np.float32))
+    assert np.isfinite(kernels32.backward(p)).all()

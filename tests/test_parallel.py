@@ -41,8 +41,8 @@ def test_workers_own_contiguous_shares(on_cpu: None) -> None:
     assert workers.count == 3
     assert np.array_equal(owner.numpy(), np.repeat([0, 1, 2], [33, 33, 34]))
     owner.fill_(7)
-    workers.launch_owned(note_worker, 50, owner, begin=20)
-    assert np.array_equal(owner.numpy(), np.repeat([7, 0, 1, 2, 7], [20, 10, 10, 10, 50]))
+    workers.launch_owned(note_worker, [20, 25, 25, 90], owner)
+    assert np.array_equal(owner.numpy(), np.repeat([7, 0, 2, 7], [20, 5, 65, 10]))
 
 
 def test_cuda_gets_one_worker_and_the_cpu_its_cores(device: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
@@ -16,8 +17,8 @@ from warpnerf.parallel import Workers
 
 SAMPLES = 1 << 21
 """Samples whose gradients may be in parcels at a time, of all workers together: room for 67 MB with
-two workers, for 134 MB with more, of which only what is used takes memory: a few MB. Rays that
-might have more samples take turns, so memory grows with neither rays nor samples."""
+two workers and for 134 MB with more, of which what is used takes memory. Rays that might have more
+samples take turns, so memory grows with neither rays nor samples."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -91,23 +92,20 @@ class AdjointLaunch:
         self._contraction = variant.contraction
         self._size = size
         self._workers = workers
-        self.rays_a_turn = max(1, n_rays)
-        """As many go into one launch."""
         self.parcels: parcels.Parcels | None = None
         """What the workers leave for each other; None: kernels are plain."""
         if variant.packed:
-            # Where rays are so long that those of one for each worker would not fit, fewer work.
-            count = min(workers.count, max(1, SAMPLES // most_steps))
+            most_work = most_steps + parcels.RAY
+            # Where rays are so long that two for each worker would not fit, fewer work.
+            count = min(workers.count, max(1, SAMPLES // (2 * most_work)))
             if count < workers.count:
                 self._workers = Workers("cpu", count)
-            if count > 1:
-                turns = math.ceil(n_rays / (SAMPLES // count // most_steps * count))
-                self.rays_a_turn = math.ceil(n_rays / max(1, turns)) or 1  # all turns alike
-            self.parcels = _make_parcels(SAMPLES // count if count > 1 else 0, count)
+            room = SAMPLES // count if count > 1 else 0
+            self._work_a_turn = count * (room - most_work)  # a worker may get a ray more than it
+            self.parcels = _make_parcels(room, count)
+            self._order = wp.array(np.arange(n_rays), dtype=wp.int32, device="cpu")
+            self._work = wp.empty(n_rays, dtype=wp.int32, device="cpu")
             self._middles = wp.empty(n_rays, dtype=wp.uint16, device="cpu")
-            self.order = wp.array(np.arange(n_rays), dtype=wp.int32, device="cpu")
-            """[n_rays] which ray is whose: all of the first worker's, all of the second's, ..."""
-            self.parcels.order = self.order
         elif not workers.device.is_cuda:
             self._workers = Workers("cpu", 1)
 
@@ -115,44 +113,63 @@ class AdjointLaunch:
         """Add a batch's gradient.
 
         Args:
-            n_rays: Rays of the batch.
+            n_rays: Rays of the batch, no more than there is room for.
             gradient: A kernel's Gradient, in the kernel's precision.
-            arguments: The kernel's, without the first two and the last.
+            arguments: The kernel's, without the first two and the last: a grid, its free space,
+                how to march, origins, directions, and what else it takes.
         """
         if self.parcels is None:
             self._workers.launch_owned(self._kernel, n_rays, *arguments, gradient)
             return
-        count = self._workers.count
         self.parcels.gradient = gradient
-        if count > 1:
-            grid, _, march, origins, directions = arguments[:5]
-            self._workers.launch(
-                parcels.find_middles_kernel(self._contraction),
-                n_rays,
-                grid,
-                march,
-                origins,
-                directions,
-                self._middles,
-            )
-        for begin in range(0, n_rays, self.rays_a_turn):
-            end = min(begin + self.rays_a_turn, n_rays)
-            if count > 1:
-                self._share_out(begin, end)
+        self.parcels.order = self._order
+        if self._workers.count == 1:
+            self._workers.launch_owned(self._kernel, n_rays, *arguments, self.parcels)
+            return
+        self._measure(n_rays, *arguments[:5])
+        for begin, end in self._turns(n_rays):
+            bounds = self._share_out(begin, end)
             self.parcels.used.zero_()
             self.parcels.end.zero_()  # in case that the last turn was interrupted
-            self._workers.launch_owned(self._kernel, end, *arguments, self.parcels, begin=begin)
-            if count > 1:
-                size = wp.vec3i(*self._size)
-                self._workers.launch(parcels.deliver_parcels, count, size, self.parcels)
+            self._workers.launch_owned(self._kernel, bounds, *arguments, self.parcels)
+            size = wp.vec3i(*self._size)
+            self._workers.launch(parcels.deliver_parcels, self._workers.count, size, self.parcels)
 
-    def _share_out(self, begin: int, end: int) -> None:
-        """Give each worker the rays whose middles lie nearest its part; their order stays."""
-        n = end - begin
+    def _measure(
+        self, n_rays: int, grid: Any, free: Any, march: Any, origins: Any, directions: Any
+    ) -> None:
+        self._workers.launch(
+            parcels.measure_rays_kernel(self._contraction),
+            n_rays,
+            *(grid, march, origins, directions, self._work, self._middles),
+        )
+
+    def _turns(self, n_rays: int) -> Iterator[tuple[int, int]]:
+        """Where turns begin and end: of as many rays as there is room for what they might send."""
+        until = np.cumsum(self._work.numpy()[:n_rays], dtype=np.int64)
+        begin = 0
+        while begin < n_rays:
+            before = until[begin - 1] if begin else 0
+            end = int(np.searchsorted(until, before + self._work_a_turn, side="right"))
+            yield begin, max(begin + 1, end)
+            begin = max(begin + 1, end)
+
+    def _share_out(self, begin: int, end: int) -> list[int]:
+        """Give the workers rays begin..end-1 by where their middles lie, each as much work.
+
+        Returns:
+            [workers + 1] where in the order each worker's rays begin, and where the last one's
+            end. Among a worker's rays their order stays.
+        """
+        count = self._workers.count
         along_x = np.argsort(self._middles.numpy()[begin:end], kind="stable")
-        worker = np.empty(n, np.uint16)
-        worker[along_x] = (np.arange(1, n + 1) * self._workers.count - 1) // n  # as launches do
-        self.order.numpy()[begin:end] = begin + np.argsort(worker, kind="stable")
+        until = np.cumsum(self._work.numpy()[begin:end][along_x], dtype=np.int64)
+        before = np.concatenate(([0], until[:-1]))
+        worker = (before * count // until[-1]).astype(np.uint16)
+        of_ray = np.empty_like(worker)
+        of_ray[along_x] = worker
+        self._order.numpy()[begin:end] = begin + np.argsort(of_ray, kind="stable")
+        return (begin + np.searchsorted(worker, np.arange(count + 1))).tolist()
 
 
 def _make_parcels(n_samples: int, n_workers: int) -> parcels.Parcels:

@@ -7,7 +7,7 @@ whatever else the machine is doing.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -62,14 +62,21 @@ class Workers:
             arguments: The rest of the kernel's arguments.
             chunk: Items per launch, NODES or RAYS.
         """
-        self._launch(kernel, n, lambda worker: arguments, chunk, 0)
+        self._launch(kernel, self._alike(n), lambda worker: arguments, chunk)
 
-    def launch_owned(self, kernel: wp.Kernel, n: int, *arguments: Any, begin: int = 0) -> None:
-        """Run kernel(first, worker, *arguments) over items begin..n-1, of much work each.
+    def launch_owned(self, kernel: wp.Kernel, items: int | Sequence[int], *arguments: Any) -> None:
+        """Run kernel(first, worker, *arguments) over items of much work each.
 
-        It writes to what a worker owns; a worker's items all come before the next one's.
+        It writes to what a worker owns.
+
+        Args:
+            kernel: As for ``launch``; it is also told the worker's number.
+            items: How many there are, shared out alike; or [workers + 1] where the first worker's
+                begin, the second's, ..., and where the last one's end.
+            arguments: The rest of the kernel's arguments.
         """
-        self._launch(kernel, n, lambda worker: (worker, *arguments), RAYS, begin)
+        bounds = self._alike(items) if isinstance(items, int) else items
+        self._launch(kernel, bounds, lambda worker: (worker, *arguments), RAYS)
 
     def load(self, kernel: wp.Kernel) -> None:
         """Compile a kernel, or fetch it from the cache, once: else every thread would."""
@@ -77,25 +84,27 @@ class Workers:
             kernel_cache.load(kernel, self.device)
             self._loaded.add(kernel)
 
+    def _alike(self, n: int) -> list[int]:
+        return [n * worker // self.count for worker in range(self.count + 1)]
+
     def _launch(
         self,
         kernel: wp.Kernel,
-        end: int,
+        bounds: Sequence[int],
         arguments: Callable[[int], tuple[Any, ...]],
         chunk: int,
-        begin: int,
     ) -> None:
-        n = end - begin
-        if n == 0:
+        if bounds[0] == bounds[-1]:
             return
         self.load(kernel)
         if self.device.is_cuda:
-            wp.launch(kernel, n, inputs=[begin, *arguments(0)], device=self.device)
+            n = bounds[-1] - bounds[0]
+            wp.launch(kernel, n, inputs=[bounds[0], *arguments(0)], device=self.device)
             return
 
         def share(worker: int) -> None:
-            until = begin + n * (worker + 1) // self.count
-            for first in range(begin + n * worker // self.count, until, chunk):
+            until = bounds[worker + 1]
+            for first in range(bounds[worker], until, chunk):
                 inputs = [first, *arguments(worker)]
                 wp.launch(kernel, min(chunk, until - first), inputs=inputs, device=self.device)
 

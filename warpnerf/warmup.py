@@ -37,7 +37,7 @@ def training_kernels(
     Kernels that share a module with one of these are compiled along with it.
     """
     variant = _variant(contraction, scaling, jacobian, device)
-    shared_out = [parcels.find_middles_kernel(variant.contraction), parcels.deliver_parcels]
+    shared_out = [parcels.measure_rays_kernel(variant.contraction), parcels.deliver_parcels]
     return [
         camera.sample_pixels,
         *(shared_out if variant.packed else []),
@@ -114,7 +114,7 @@ def _contractions() -> list[Contraction]:
 def _words(kernel: wp.Kernel, contraction: Contraction, scaling: Scaling | None = None) -> str:
     """A kernel's name, and what it is compiled for where it has a module to itself."""
     name = str(kernel.key).rpartition("__")[2].replace("_", " ")
-    if not name.startswith(("render", "find middles")):
+    if not name.startswith(("render", "measure")):
         return name
     space = "" if contraction == "none" else ", space folded in"
     return name + space + (f", scaling {scaling}" if scaling and "render" in name else "")

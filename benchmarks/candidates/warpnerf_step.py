@@ -84,7 +84,7 @@ class WarpStep:
         return int(self._pass.n_samples.numpy().sum())
 
     def scratch_bytes(self) -> tuple[int, int]:
-        """All arrays of the training pass but the gradient: what the last step used, and room."""
+        """Of the training pass but the gradient: what the last turn used, and has room for."""
         arrays = [*vars(self._pass).values(), self._pass.gradients.touched]
         used = sum(array.capacity for array in arrays if isinstance(array, wp.array))
         parcels = self._pass.launch.parcels

@@ -48,7 +48,8 @@ def undistort(view: View, distorted: vec2) -> vec2:
     """Inverse of distort, by Newton's method on the two equations.
 
     The target moves out from the principal point in eight strides of one step each, for which p is
-    first moved straight on as far; steps follow until p is close to where it ends.
+    first moved straight on as far; steps follow until p is close to where it ends, and four more.
+    Where a lens folds over, and nothing is found, it ends wherever 40 steps lead.
     """
     p = vec2()
     two = real(2.0)

@@ -63,7 +63,10 @@ def prepare_ray(
     offset: real,
     contraction: int,
 ) -> Ray:
-    """Clip a ray to the box and to [near, far]; one step of slack at both ends absorbs rounding."""
+    """Clip a ray to the box and to [near, far]; one step of slack at both ends absorbs rounding.
+
+    A ray that is not finite, of a lens that folds over, meets nothing.
+    """
     ray = Ray()
     ray.offset = offset
     ray.q_origin = wp.cw_div(origin - grid.centre, grid.half)
@@ -75,7 +78,7 @@ def prepare_ray(
         interval = slab(ray.q_origin[2], ray.q_direction[2], interval)
     ray.begin = int(0)
     ray.end = int(0)
-    if interval[0] <= interval[1]:
+    if interval[0] <= interval[1] and wp.isfinite(ray.q_origin) and wp.isfinite(ray.q_direction):
         most = real(1.0e9)  # counts stay within int
         ray.begin = wp.max(0, int(wp.min(steps_before(march, interval[0]), most)) - 1)
         ray.end = int(wp.min(steps_before(march, interval[1]), most)) + 2

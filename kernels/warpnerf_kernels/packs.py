@@ -1,10 +1,10 @@
 """Sixteen samples of a ray at a time: integral.py in vectors, for a CPU's cores.
 
-A core computes many numbers as fast as one, but only where code says so; and it computes sixteen
-in little more time than eight, because a sample is a long chain of operations that wait for each
-other. Each function here is the vector form of the plain one that its docstring names, and tests
-hold the two together. CUDA, where threads are the vector, and float64, which is for checking, run
-the plain ones.
+A core computes many numbers as fast as one, but only where code says so. It computes sixteen in
+less time than eight twice, even where they take two instructions each: a sample is a long chain of
+operations that wait for each other. Each function here is the vector form of the plain one that its
+docstring names, and tests hold the two together. CUDA, where threads are the vector, and float64,
+which is for checking, run the plain ones.
 
 The bodies are C++ on Clang's vector types, which compile for any processor. A native function
 cannot return a vector: they hand on what they compute in a ``Pack``, scratch memory of a worker.

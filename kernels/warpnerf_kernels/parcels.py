@@ -4,11 +4,11 @@ Rays cross the grid in every direction; adding as they go, threads would race fo
 worker owns a part of the grid, some planes of nodes along x, and is the only one to add to it. What
 its rays have for its own part it adds at once; what they have for another's it leaves in parcels, a
 sample in each. Once all rays are through, each worker adds what the others have left for it. That
-is the less, the more of a ray goes through the part of the worker that has it: they are shared out
-by where their middles lie. What is added to a node, and in which order, depends on nothing but the
-rays and the number of workers.
+is the less, the more of a ray goes through the part of the worker that has it: rays are shared out
+along x by where their middles lie, to each worker as much work. What is added to a node, and in
+which order, depends on nothing but the rays and the number of workers.
 
-Like packs.py this is C++ on Clang's vector types, for float32 on the CPU.
+Like packs.py this is for float32 on the CPU, and most of it C++ on Clang's vector types.
 """
 
 from functools import cache
@@ -47,7 +47,7 @@ class Parcels:
     end: wp.array2d(dtype=wp.int32)  # one past its last parcel; 0 if there is none
     used: wp.array2d(dtype=wp.int32)  # by sender alone: blocks that are in use
     gradient: Gradient  # where it all goes
-    order: wp.array(dtype=wp.int32)  # [n_rays] in which workers take the rays
+    order: wp.array(dtype=wp.int32)  # [n_rays] all of the first worker's, of the second's, ...
 
 
 WORDS = (
@@ -143,7 +143,7 @@ def hand_out(
     size: wp.vec3i,
     packs: wp.array(dtype=Pack),
     slot: int,
-    later: int,  # slot of a pack whose turn comes soon
+    later: int,  # slot of a pack that comes soon
     worker: int,
     parcels: Parcels,
 ):
@@ -199,24 +199,30 @@ def deliver_parcels(first: int, size: wp.vec3i, parcels: Parcels):
     take_in(size, first + wp.tid(), parcels)
 
 
+RAY = 4
+"""What a ray takes besides its steps, in steps."""
+
+
 @cache
-def find_middles_kernel(contraction: int) -> wp.Kernel:
-    """Where in the grid, from its first plane of nodes to its last, a ray's middle step lies."""
+def measure_rays_kernel(contraction: int) -> wp.Kernel:
+    """How much work rays are, and where along x their middle steps lie."""
 
     @wp.kernel(module="unique", enable_backward=False)
-    def find_middles(
+    def measure_rays(
         first: int,
         grid: Grid,
         march: March,
         origins: wp.array(dtype=vec3),  # [n_rays] scene units
         directions: wp.array(dtype=vec3),  # [n_rays] unit vectors
-        out_middle: wp.array(dtype=wp.uint16),  # [n_rays] 0 to 65535
+        out_work: wp.array(dtype=wp.int32),  # [n_rays] steps in the grid, and RAY
+        out_middle: wp.array(dtype=wp.uint16),  # [n_rays] 0: first plane of nodes; 65535: last
     ):
         i = first + wp.tid()
         ray = prepare_ray(grid, march, origins[i], directions[i], real(0.0), contraction)
         t = wp.min(step_edge(march, (ray.begin + ray.end) // 2), march.far)
         q = contract(ray.q_origin + t * ray.q_direction, grid.border, contraction)
         x = (q[0] * grid.to_nodes[0] + grid.middle[0]) / (real(2.0) * grid.middle[0])
+        out_work[i] = ray.end - ray.begin + wp.static(RAY)
         out_middle[i] = wp.uint16(wp.clamp(x, real(0.0), real(1.0)) * real(65535.0))
 
-    return find_middles
+    return measure_rays

@@ -23,6 +23,12 @@ def huber(difference: real) -> real:
 
 
 @wp.func
+def adj_huber(difference: vec4) -> vec4:
+    """h'(d), for each channel."""
+    return wp.max(wp.min(difference, vec4(real(1.0))), vec4(real(-1.0)))
+
+
+@wp.func
 def pair_variation(weight: vec4, a: vec4, b: vec4) -> real:
     """sum_c weight_c huber(a_c - b_c)."""
     d = a - b
@@ -32,12 +38,6 @@ def pair_variation(weight: vec4, a: vec4, b: vec4) -> real:
         + weight[2] * huber(d[2])
         + weight[3] * huber(d[3])
     )
-
-
-@wp.func
-def adj_pair_variation(a: vec4, b: vec4) -> vec4:
-    """Adjoint of huber(a_c - b_c) with respect to a_c, for each channel c."""
-    return wp.max(wp.min(a - b, vec4(real(1.0))), vec4(real(-1.0)))
 
 
 @wp.func
@@ -66,17 +66,17 @@ def adj_node_variation(
     value = values[n]
     total = vec4()
     if n >= stride_x:
-        total += adj_pair_variation(value, values[n - stride_x])
-    if n + stride_x < values.shape[0]:
-        total += adj_pair_variation(value, values[n + stride_x])
+        total += adj_huber(value - values[n - stride_x])
+    if n < values.shape[0] - stride_x:  # their sum might be beyond int
+        total += adj_huber(value - values[n + stride_x])
     if j > 0:
-        total += adj_pair_variation(value, values[n - stride_y])
+        total += adj_huber(value - values[n - stride_y])
     if j + 1 < size[1]:
-        total += adj_pair_variation(value, values[n + stride_y])
+        total += adj_huber(value - values[n + stride_y])
     if k > 0:
-        total += adj_pair_variation(value, values[n - 1])
+        total += adj_huber(value - values[n - 1])
     if k + 1 < size[2]:
-        total += adj_pair_variation(value, values[n + 1])
+        total += adj_huber(value - values[n + 1])
     return wp.cw_mul(weight, total)
 
 

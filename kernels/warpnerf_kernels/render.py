@@ -48,15 +48,15 @@ def ray_value(values: wp.array(dtype=real), ray: int) -> real:  # noqa: F811 (an
 
 
 @wp.func
-def ray_of(turn: int, gradient: Gradient) -> int:
-    """The ray whose turn it is: they come as they are."""
-    return turn
+def ray_of(place: int, gradient: Gradient) -> int:
+    """The ray at a place in the order: they come as they are."""
+    return place
 
 
 @wp.func
-def ray_of(turn: int, gradient: parcels.Parcels) -> int:  # noqa: F811 (an overload)
-    """The ray whose turn it is: each worker has those that are nearest its part of the grid."""
-    return gradient.order[turn]
+def ray_of(place: int, gradient: parcels.Parcels) -> int:  # noqa: F811 (an overload)
+    """The ray at a place in the order, in which each worker's lie side by side."""
+    return gradient.order[place]
 
 
 @cache

@@ -169,5 +169,5 @@ auto fetch = [&](const auto* node, const auto& size) {
 """
 )
 """What a native function of packs.py or parcels.py begins with. vec and ivec hold a number for each
-of eight steps, quad the four channels of a node; names with _at are the same where they lie in
-memory."""
+of sixteen steps, octet for eight of them, quad the four channels of a node; names with _at are the
+same where they lie in memory."""

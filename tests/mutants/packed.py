@@ -159,7 +159,7 @@ MUTANTS = [
     Mutant("composite: early stop only between packs", "packs.py",
            "visited &= lit;", "", STOP),
     Mutant("composite: light beyond the stop", "packs.py",
-           "pack.transmittance.c[count(lit) - 1]", "pack.transmittance.c[7]", STOP),
+           "pack.transmittance.c[count(lit) - 1]", "pack.transmittance.c[LANES - 1]", STOP),
     Mutant("composite: what is no sample weighs", "packs.py",
            "vec weight = visited ? before * load(pack.alpha) : all(0.0f)",
            "vec weight = before * load(pack.alpha)", ANY),

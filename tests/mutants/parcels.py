@@ -10,6 +10,7 @@ THREE = f"{SEVERAL}[none-3]"
 AT_ONCE = "test_kernel_parcels.py::test_what_a_worker_adds_at_once_is_its_own"
 DELIVERED = "test_kernel_parcels.py::test_workers_add_to_no_planes_but_their_own"
 LENGTHS = "test_kernel_parcels.py::test_chains_of_every_length"
+WORK = "test_kernel_parcels.py::test_each_worker_has_as_much_work"
 NEAREST = "test_kernel_parcels.py::test_each_worker_has_the_rays_nearest_its_part"
 
 MUTANTS = [
@@ -23,7 +24,7 @@ MUTANTS = [
     Mutant("hand_out: what is no sample adds", "parcels.py",
            "        if (!(visited >> n & 1)) continue;\n", "", ANY),
     Mutant("hand_out: what is no sample adds or is sent", "parcels.py",
-           "each(visited, [&](int n)", "each(255u, [&](int n)", TWO),
+           "each(visited, [&](int n)", "each(65535u, [&](int n)", TWO),
     Mutant("hand_out: too much for the lower node", "parcels.py",
            "low = adj[n] - high", "low = adj[n]", ANY),
     Mutant("hand_out: column", "parcels.py",
@@ -180,17 +181,21 @@ MUTANTS = [
     Mutant("deliver: to one worker again and again", "parcels.py",
            "take_in(size, first + wp.tid(), parcels)", "take_in(size, wp.tid(), parcels)", TWO),
     # which rays are whose
-    Mutant("ray_of: as they come", "render.py", "return gradient.order[turn]", "return turn",
+    Mutant("ray_of: as they come", "render.py", "return gradient.order[place]", "return place",
            "test_kernel_parcels.py::test_workers_take_rays_in_the_order_that_they_are_given"),
-    Mutant("find_middles: where rays begin", "parcels.py", "(ray.begin + ray.end) // 2",
+    Mutant("measure_rays: where rays begin", "parcels.py", "(ray.begin + ray.end) // 2",
            "ray.begin", NEAREST),
-    Mutant("find_middles: beyond far", "parcels.py",
+    Mutant("measure_rays: beyond far", "parcels.py",
            "(ray.begin + ray.end) // 2", "(ray.begin + ray.end)", NEAREST),
-    Mutant("find_middles: along y", "parcels.py", "q[0] * grid.to_nodes[0]",
+    Mutant("measure_rays: along y", "parcels.py", "q[0] * grid.to_nodes[0]",
            "q[1] * grid.to_nodes[1]", NEAREST),
-    Mutant("find_middles: not contracted", "parcels.py",
+    Mutant("measure_rays: not contracted", "parcels.py",
            "contract(ray.q_origin + t * ray.q_direction, grid.border, contraction)",
            "ray.q_origin + t * ray.q_direction", NEAREST),
-    Mutant("find_middles: half of the grid", "parcels.py", "(real(2.0) * grid.middle[0])",
+    Mutant("measure_rays: half of the grid", "parcels.py", "(real(2.0) * grid.middle[0])",
            "grid.middle[0]", NEAREST),
+    Mutant("measure_rays: all alike", "parcels.py", "out_work[i] = ray.end - ray.begin +",
+           "out_work[i] =", WORK),
+    Mutant("measure_rays: where rays end", "parcels.py", "ray.end - ray.begin + wp", "ray.end + wp",
+           WORK),
 ]  # fmt: skip

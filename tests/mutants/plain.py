@@ -3,6 +3,7 @@
 from mutant import Mutant
 
 INTERP = "test_kernel_interp.py"
+LOST = "test_kernel_render.py::test_rays_that_are_not_finite_see_the_background"
 REGULARIZE = "test_kernel_regularize.py"
 ADAM = "test_kernel_adam.py"
 OCCUPANCY = "test_kernel_occupancy.py"
@@ -148,6 +149,10 @@ MUTANTS = [
            "if k < march.n_linear or", "if k <= march.n_linear or", GROWING),
     Mutant("growing length of the next step", "march.py",
            "step_edge(march, k) * march.growth", "step_edge(march, k + 1) * march.growth", GROWING),
+    Mutant("directions that are not finite", "march.py",
+           " and wp.isfinite(ray.q_direction):", ":", LOST),
+    Mutant("origins that are not finite", "march.py",
+           " and wp.isfinite(ray.q_origin) and", " and", LOST),
     Mutant("a slab's axis", "march.py",
            "slab(ray.q_origin[1], ray.q_direction[1], interval)",
            "slab(ray.q_origin[1], ray.q_direction[2], interval)", VALUES),
@@ -191,16 +196,17 @@ MUTANTS = [
     Mutant("variation: axis", "regularize.py",
            "values[n - stride_y]", "values[n - stride_x]", REGULARIZE),
     Mutant("variation: one side only", "regularize.py",
-           "        total += adj_pair_variation(value, values[n - 1])\n",
+           "        total += adj_huber(value - values[n - 1])\n",
            "        total += real(0.0) * value\n", REGULARIZE),
     Mutant("variation: huber's slope", "regularize.py",
-           "wp.max(wp.min(a - b, vec4(real(1.0))), vec4(real(-1.0)))", "a - b", REGULARIZE),
+           "return wp.max(wp.min(difference, vec4(real(1.0))), vec4(real(-1.0)))",
+           "return difference", REGULARIZE),
     Mutant("variation: weights dropped", "regularize.py",
            "wp.cw_mul(weight, total)", "total", REGULARIZE),
     Mutant("variation: across the first plane", "regularize.py",
            "if n >= stride_x:", "if n >= 0:", REGULARIZE),
     Mutant("variation: across the last plane", "regularize.py",
-           "if n + stride_x < values.shape[0]:", "if n + stride_x <= values.shape[0]:", REGULARIZE),
+           "if n < values.shape[0] - stride_x:", "if n <= values.shape[0] - stride_x:", REGULARIZE),
     Mutant("variation: rows not counted", "regularize.py",
            "                j += 1\n", "", REGULARIZE),
     Mutant("variation: planes not counted", "regularize.py",
