@@ -127,11 +127,18 @@ def test_skipping_in_float32_changes_no_bit(contraction: str, kernels32: Kernels
 
 def mark(kernels: Kernels, p: Problem, cells: Any, steps: Steps, alpha_min: float) -> Any:
     n = int(np.prod(cells))
+    n_stretches = int(np.prod(p.raw.shape[:2])) * int(cells[2])
+    highest = kernels.zeros(n_stretches)
     out = wp.zeros(n, dtype=wp.uint8, device=kernels.device)
+    occupancy = kernels.module("occupancy")
     kernels.workers.launch(
-        kernels.module("occupancy").mark_occupied,
+        occupancy.find_highest, n_stretches, kernels.grid(p), int(cells[2]), highest
+    )
+    kernels.workers.launch(
+        occupancy.mark_occupied,
         n,
         kernels.grid(p),
+        highest,
         wp.vec3i(*cells),
         steps.struct(kernels.types),
         CONTRACTIONS[p.contraction],

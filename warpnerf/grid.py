@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 from warpnerf_kernels import contraction, interp, occupancy, types
-from warpnerf_kernels.types import FreeSpace, Grid, March, vec3, vec4
+from warpnerf_kernels.types import FreeSpace, Grid, March, real, vec3, vec4
 
 from warpnerf.checks import InputError
 from warpnerf.config import MAX_VOXELS, TRAINING_BYTES, Contraction
@@ -203,10 +203,14 @@ class FreeCells:
         distance = wp.empty(n, dtype=wp.uint8, device=workers.device)
         spread = wp.empty_like(distance)
         cells = wp.vec3i(*size)
+        n_stretches = grid.size[0] * grid.size[1] * size[2]
+        highest = wp.empty(n_stretches, dtype=real, device=workers.device)
+        workers.launch(occupancy.find_highest, n_stretches, grid.struct(), size[2], highest)
         workers.launch(
             occupancy.mark_occupied,
             n,
             grid.struct(),
+            highest,
             cells,
             march,
             CONTRACTIONS[grid.contraction],

@@ -42,9 +42,28 @@ def longest_step(grid: Grid, march: March, c: vec3, contraction: int) -> real:
 
 
 @wp.kernel
+def find_highest(
+    first: int,
+    grid: Grid,
+    n_cells: int,  # MZ, along z
+    out_highest: wp.array(dtype=real),  # [X * Y * MZ]
+):
+    """The highest raw density in and next to a cell, in one of its columns of nodes along z."""
+    n = first + wp.tid()
+    ck = n % n_cells
+    column = (n // n_cells) * grid.size[2]
+    highest = real(-1.0e30)
+    for k in range(first_node(ck, n_cells, grid.size[2]), last_node(ck, n_cells, grid.size[2]) + 1):
+        raw = grid.values[column + k]
+        highest = wp.max(highest, raw[0])
+    out_highest[n] = highest
+
+
+@wp.kernel
 def mark_occupied(
     first: int,
     grid: Grid,
+    highest_in: wp.array(dtype=real),  # [X * Y * MZ] by find_highest
     size: wp.vec3i,  # cells
     march: March,
     contraction: int,
@@ -61,11 +80,7 @@ def mark_occupied(
         for j in range(
             first_node(cj, size[1], grid.size[1]), last_node(cj, size[1], grid.size[1]) + 1
         ):
-            for k in range(
-                first_node(ck, size[2], grid.size[2]), last_node(ck, size[2], grid.size[2]) + 1
-            ):
-                raw = grid.values[(i * grid.size[1] + j) * grid.size[2] + k]
-                highest = wp.max(highest, raw[0])
+            highest = wp.max(highest, highest_in[(i * grid.size[1] + j) * size[2] + ck])
     half = vec3(real(size[0]), real(size[1]), real(size[2])) / real(2.0)
     middle = vec3(real(ci), real(cj), real(ck)) + vec3(real(0.5)) - half
     outermost = vec3(
