@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import warp as wp
-from warpnerf_kernels.parcels import BLOCK
 from warpnerf_kernels.tiles import STRETCH, TILE, next_tile, tile_of
 from warpnerf_kernels.types import Gradient, vec4
 from workload import Workload
@@ -84,15 +83,17 @@ class WarpStep:
         return int(self._pass.n_samples.numpy().sum())
 
     def scratch_bytes(self) -> tuple[int, int]:
-        """Of the training pass but the gradient: what the last turn used, and has room for."""
+        """Of the training pass but the gradient: what a step uses, and what it has room for."""
         arrays = [*vars(self._pass).values(), self._pass.gradients.touched]
         used = sum(array.capacity for array in arrays if isinstance(array, wp.array))
         parcels = self._pass.launch.parcels
         if parcels is None:
             return used, used
         room = used + parcels.contents.capacity + parcels.next.capacity
-        a_block = BLOCK * parcels.contents.capacity // parcels.contents.size
-        return used + int(parcels.used.numpy()[:, 0].sum()) * a_block, room
+        contents = parcels.contents.numpy().view(np.uint8).reshape(parcels.contents.size, -1)
+        contents.fill(255)
+        self.step()
+        return used + int((contents != 255).any(axis=1).sum()) * contents.shape[1], room
 
 
 def obstacle(device: str) -> str | None:
