@@ -21,6 +21,7 @@ class ProgressBar:
         self._bar: Bar | None = None
         self._began = time.monotonic()
         self._line_at = 0.0
+        self._first: tuple[float, float] | None = None  # seconds and fraction of the first report
 
     def __enter__(self) -> ProgressBar:
         """Show the bar, where there is a terminal."""
@@ -52,7 +53,12 @@ class ProgressBar:
             self._bar.update(self._task, completed=fraction, description=text)
             return
         seconds = time.monotonic() - self._began
+        # What came before, such as compiling or what a run went on from, is not repeated.
+        self._first = self._first or (seconds, fraction)
         if seconds >= self._line_at or fraction >= 1.0:
-            left = seconds * (1.0 / max(fraction, 1e-6) - 1.0)
-            print(f"{fraction:4.0%}  {text}  {left:.0f} s left", flush=True)
+            line = f"{fraction:4.0%}  {text}"
+            if fraction > self._first[1]:
+                pace = (seconds - self._first[0]) / (fraction - self._first[1])
+                line += f"  {pace * (1.0 - fraction):.0f} s left"
+            print(line, flush=True)
             self._line_at = seconds + LINE_EVERY
