@@ -166,6 +166,17 @@ def test_marked_cells(kernels64: Kernels) -> None:
             assert (marked[cell] == 0) == near.all()
 
 
+def test_what_is_not_a_number_is_not_free(kernels64: Kernels) -> None:
+    raw = np.full((5, 5, 5, 4), -12.0)
+    steps = Steps(near=0.0, far=9.0, step=0.1)
+    raw[2, 2, 2, 0] = np.nan
+    marked = mark(kernels64, make_problem(0, raw=raw), (4, 4, 4), steps, 1e-3)
+    assert (marked[1:3, 1:3, 1:3] == 0).all()
+    raw[2, 2, 2, 0] = -12.0
+    marked = mark(kernels64, make_problem(0, raw=raw), (4, 4, 4), steps, 1e-3)
+    assert (marked > 0).all()
+
+
 def test_threshold_is_of_alpha(kernels64: Kernels) -> None:
     shift, factor, step = 0.3, 2.0, 0.1
     raw = np.full((3, 3, 3, 4), -1.0)

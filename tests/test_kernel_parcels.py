@@ -207,14 +207,21 @@ def turns_of(launch: Callable[[], Any], monkeypatch: pytest.MonkeyPatch) -> list
 
 
 @pytest.mark.parametrize("threads", [2, 3, 5])
-def test_each_worker_has_as_much_work(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Cameras at one end of the box, where the rays that miss it begin too."""
-    p = problem(6)
+@pytest.mark.parametrize("distance", [0.1, 9.0])
+def test_each_worker_has_as_much_work(
+    distance: float, threads: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Cameras at one end of the box, whose rays often miss it, and one on the other side of it."""
+    p = replace(problem(6), steps=Steps(near=0.0, far=20.0, step=0.04))
+    rng = np.random.default_rng(6)
+    middle = 0.5 * (p.box_min + p.box_max)
     p.origins[:] = p.box_max + 0.1
-    p.directions[:] = unit(np.random.default_rng(6).normal(size=p.directions.shape))
-    p.directions[::3] = unit(0.5 * (p.box_min + p.box_max) - p.origins[::3])
+    p.directions[:] = unit(rng.normal(size=p.directions.shape))
+    p.directions[::3] = unit(middle - p.origins[::3])
+    p.origins[1::3] = middle - (distance, 0.5, 0.5)
+    p.directions[1::3] = unit(middle - (0.3, 0, 0) - p.origins[1::3])
     steps = of(1).forward(p).n_samples
-    assert 0.3 < (steps > 0).mean() < 0.6
+    assert 0.5 < (steps > 0).mean() < 0.9
     (turn,) = turns_of(lambda: of(threads).backward(p), monkeypatch)
     work = np.array([steps[share].sum() for share in turn])
     assert work.max() < 1.2 * work.mean()

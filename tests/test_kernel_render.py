@@ -353,10 +353,11 @@ def test_rays_that_are_not_finite_see_the_background(contraction: str, kernels32
     if contraction != "none":
         steps = Steps(near=0.0, far=1e6, step=0.08, n_linear=30, growth=0.05)
         p = replace(unbounded(p, contraction, 0.2), steps=steps)
-    lost = [0, 3, 4]
+    lost = [0, 3, 4, 6]
     p.directions[lost[0]] = np.nan
     p.directions[lost[1], 1] = np.inf
     p.origins[lost[2], 2] = np.nan
+    p.directions[lost[3]] = 0.0
     out = kernels32.forward(p)
     assert not out.n_samples[lost].any() and out.n_samples.any()
     assert np.array_equal(out.rgb[lost], p.background[lost].astype(np.float32))

@@ -18,7 +18,7 @@ from warpnerf.parallel import Workers
 SAMPLES = 1 << 21
 """Samples whose gradients may be in parcels at a time, of all workers together: room for 67 MB with
 two workers and for 134 MB with more, of which what is used takes memory. Rays that might have more
-samples take turns, so memory grows with neither rays nor samples."""
+samples take turns, so parcels grow with neither rays nor samples."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -75,7 +75,7 @@ class Workers:
                 begin, the second's, ..., and where the last one's end.
             arguments: The rest of the kernel's arguments.
         """
-        bounds = self._alike(items) if isinstance(items, int) else items
+        bounds = items if isinstance(items, Sequence) else self._alike(items)
         self._launch(kernel, bounds, lambda worker: (worker, *arguments), RAYS)
 
     def load(self, kernel: wp.Kernel) -> None:

@@ -283,7 +283,7 @@ class _Render(torch.autograd.Function):
             kernels.render_backward_kernel(variant),
             variant,
             size,
-            call.steps.most(diagonal),
+            call.steps.most(1.01 * diagonal),  # directions may be a little too short
             len(origins),
             workers,
         )

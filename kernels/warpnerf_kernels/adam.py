@@ -25,7 +25,7 @@ def adam_step(
 ):
     """One step. An entry whose gradient is exactly zero keeps its value and its moments."""
     start = (first + wp.tid()) * span
-    end = wp.min(start + span, values.shape[0])
+    end = start + wp.min(span, values.shape[0] - start)  # start + span might be beyond int
     last = tile_of(end - 1) + 1
     tile = next_tile(gradient.touched, tile_of(start), last)
     while tile < last:

@@ -65,7 +65,7 @@ def prepare_ray(
 ) -> Ray:
     """Clip a ray to the box and to [near, far]; one step of slack at both ends absorbs rounding.
 
-    A ray that is not finite, of a lens that folds over, meets nothing.
+    A ray that is not finite or has no direction, of a lens that folds over, meets nothing.
     """
     ray = Ray()
     ray.offset = offset
@@ -78,7 +78,8 @@ def prepare_ray(
         interval = slab(ray.q_origin[2], ray.q_direction[2], interval)
     ray.begin = int(0)
     ray.end = int(0)
-    if interval[0] <= interval[1] and wp.isfinite(ray.q_origin) and wp.isfinite(ray.q_direction):
+    finite = wp.isfinite(ray.q_origin) and wp.isfinite(ray.q_direction)
+    if interval[0] <= interval[1] and finite and wp.length_sq(ray.q_direction) > real(0.0):
         most = real(1.0e9)  # counts stay within int
         ray.begin = wp.max(0, int(wp.min(steps_before(march, interval[0]), most)) - 1)
         ray.end = int(wp.min(steps_before(march, interval[1]), most)) + 2

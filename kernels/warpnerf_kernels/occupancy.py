@@ -48,14 +48,17 @@ def find_highest(
     n_cells: int,  # MZ, along z
     out_highest: wp.array(dtype=real),  # [X * Y * MZ]
 ):
-    """The highest raw density in and next to a cell, in one of its columns of nodes along z."""
+    """The highest raw density in and next to a cell, in one of its columns of nodes along z.
+
+    What is not a number counts as dense: it must be seen to be noticed.
+    """
     n = first + wp.tid()
     ck = n % n_cells
     column = (n // n_cells) * grid.size[2]
     highest = real(-1.0e30)
     for k in range(first_node(ck, n_cells, grid.size[2]), last_node(ck, n_cells, grid.size[2]) + 1):
         raw = grid.values[column + k]
-        highest = wp.max(highest, raw[0])
+        highest = wp.max(highest, wp.where(wp.isnan(raw[0]), real(1.0e30), raw[0]))
     out_highest[n] = highest
 
 
@@ -92,7 +95,7 @@ def mark_occupied(
     alpha = real(1.0) - wp.exp(-step * grid.density_scale * softplus(highest + grid.density_shift))
     if alpha <= alpha_min:
         out_distance[n] = wp.uint8(FAR + 1)
-    else:  # NaN as well: it must be seen to be noticed
+    else:
         out_distance[n] = wp.uint8(0)
 
 

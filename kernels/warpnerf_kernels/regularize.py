@@ -104,7 +104,7 @@ def total_variation_backward(
 ):
     """d TV / d x at the nodes that already have a gradient; unseen ones stay as they are."""
     start = (first + wp.tid()) * span
-    end = wp.min(start + span, values.shape[0])
+    end = start + wp.min(span, values.shape[0] - start)
     last = tile_of(end - 1) + 1
     stride_y = size[2]
     stride_x = size[1] * size[2]
