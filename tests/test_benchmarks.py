@@ -102,6 +102,7 @@ def test_throughput(tmp_path):
     rows = record["memory"]
     assert [row["n_samples"] for row in rows] == [64 * 8, 64 * 16, 64 * 32]
     assert len({row["warpnerf_room_bytes"] for row in rows}) == 1
+    assert all(0 < row["warpnerf_bytes"] <= row["warpnerf_room_bytes"] for row in rows)
     assert rows[0]["torch_bytes"] < rows[1]["torch_bytes"] < rows[2]["torch_bytes"]
     plot = tmp_path / "record.png"
     assert plot.exists() == (f"plot: {plot}" in printed)

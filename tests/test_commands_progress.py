@@ -2,23 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 
 from warpnerf.commands import progress
 from warpnerf.commands.progress import ProgressBar
 
+Lines = Callable[[list[tuple[float, float, str]]], list[str]]
 
-def test_plain_lines_are_few_and_end_with_the_last(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    now = 100.0
-    monkeypatch.setattr(progress.time, "monotonic", lambda: now)
-    with ProgressBar("first") as bar:
-        for step in range(1, 101):
-            now += 0.125
-            bar.report(step / 100, f"step {step}")
-    lines = capsys.readouterr().out.splitlines()
-    assert lines == [
+
+@pytest.fixture
+def lines_of(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Lines:
+    """What is printed of reports: seconds since the one before, fraction, words."""
+
+    def lines_of(reports: list[tuple[float, float, str]]) -> list[str]:
+        now = 100.0
+        monkeypatch.setattr(progress.time, "monotonic", lambda: now)
+        with ProgressBar("first") as bar:
+            for seconds, fraction, text in reports:
+                now += seconds
+                bar.report(fraction, text)
+        return capsys.readouterr().out.splitlines()
+
+    return lines_of
+
+
+def test_plain_lines_are_few_and_end_with_the_last(lines_of: Lines) -> None:
+    assert lines_of([(0.125, step / 100, f"step {step}") for step in range(1, 101)]) == [
         "  1%  step 1",
         " 41%  step 41  7 s left",
         " 81%  step 81  2 s left",
@@ -26,15 +37,9 @@ def test_plain_lines_are_few_and_end_with_the_last(
     ]
 
 
-def test_what_came_before_the_first_report_is_not_expected_again(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_came_before_the_first_report_is_not_expected_again(lines_of: Lines) -> None:
     """Half a minute of compiling, and a run that goes on from its middle."""
-    now = 100.0
-    monkeypatch.setattr(progress.time, "monotonic", lambda: now)
-    with ProgressBar("first") as bar:
-        now += 30.0
-        bar.report(0.5, "step 50")
-        now += 10.0
-        bar.report(0.6, "step 60")
-    assert capsys.readouterr().out.splitlines() == [" 50%  step 50", " 60%  step 60  40 s left"]
+    assert lines_of([(30.0, 0.5, "step 50"), (10.0, 0.6, "step 60")]) == [
+        " 50%  step 50",
+        " 60%  step 60  40 s left",
+    ]

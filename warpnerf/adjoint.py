@@ -126,7 +126,7 @@ class AdjointLaunch:
         if self._workers.count == 1:
             self._workers.launch_owned(self._kernel, n_rays, *arguments, self.parcels)
             return
-        self._measure(n_rays, *arguments[:5])
+        self._measure(n_rays, arguments)
         for begin, end in self._turns(n_rays):
             bounds = self._share_out(begin, end)
             self.parcels.used.zero_()
@@ -135,9 +135,9 @@ class AdjointLaunch:
             size = wp.vec3i(*self._size)
             self._workers.launch(parcels.deliver_parcels, self._workers.count, size, self.parcels)
 
-    def _measure(
-        self, n_rays: int, grid: Any, free: Any, march: Any, origins: Any, directions: Any
-    ) -> None:
+    def _measure(self, n_rays: int, arguments: tuple[Any, ...]) -> None:
+        """Find how much work each ray is, and where its middle lies."""
+        grid, _, march, origins, directions = arguments[:5]
         self._workers.launch(
             parcels.measure_rays_kernel(self._contraction),
             n_rays,
@@ -150,9 +150,10 @@ class AdjointLaunch:
         begin = 0
         while begin < n_rays:
             before = until[begin - 1] if begin else 0
-            end = int(np.searchsorted(until, before + self._work_a_turn, side="right"))
-            yield begin, max(begin + 1, end)
-            begin = max(begin + 1, end)
+            fitting = int(np.searchsorted(until, before + self._work_a_turn, side="right"))
+            end = max(begin + 1, fitting)
+            yield begin, end
+            begin = end
 
     def _share_out(self, begin: int, end: int) -> list[int]:
         """Give the workers rays begin..end-1 by where their middles lie, each as much work.

@@ -37,10 +37,10 @@ def training_kernels(
     Kernels that share a module with one of these are compiled along with it.
     """
     variant = _variant(contraction, scaling, jacobian, device)
-    shared_out = [parcels.measure_rays_kernel(variant.contraction), parcels.deliver_parcels]
+    sharing = [parcels.measure_rays_kernel(variant.contraction), parcels.deliver_parcels]
     return [
         camera.sample_pixels,
-        *(shared_out if variant.packed else []),
+        *(sharing if variant.packed else []),
         render.render_train_kernel(variant),
         regularize.total_variation_backward,
         adam.adam_step,

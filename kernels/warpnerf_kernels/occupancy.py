@@ -66,7 +66,7 @@ def find_highest(
 def mark_occupied(
     first: int,
     grid: Grid,
-    highest_in: wp.array(dtype=real),  # [X * Y * MZ] by find_highest
+    highest: wp.array(dtype=real),  # [X * Y * MZ] by find_highest
     size: wp.vec3i,  # cells
     march: March,
     contraction: int,
@@ -78,12 +78,12 @@ def mark_occupied(
     ck = n % size[2]
     cj = (n // size[2]) % size[1]
     ci = n // (size[2] * size[1])
-    highest = real(-1.0e30)
+    raw = real(-1.0e30)
     for i in range(first_node(ci, size[0], grid.size[0]), last_node(ci, size[0], grid.size[0]) + 1):
         for j in range(
             first_node(cj, size[1], grid.size[1]), last_node(cj, size[1], grid.size[1]) + 1
         ):
-            highest = wp.max(highest, highest_in[(i * grid.size[1] + j) * size[2] + ck])
+            raw = wp.max(raw, highest[(i * grid.size[1] + j) * size[2] + ck])
     half = vec3(real(size[0]), real(size[1]), real(size[2])) / real(2.0)
     middle = vec3(real(ci), real(cj), real(ck)) + vec3(real(0.5)) - half
     outermost = vec3(
@@ -92,7 +92,7 @@ def mark_occupied(
         (wp.abs(middle[2]) + real(0.5)) / half[2],
     )
     step = longest_step(grid, march, (real(1.0) + grid.border) * outermost, contraction)
-    alpha = real(1.0) - wp.exp(-step * grid.density_scale * softplus(highest + grid.density_shift))
+    alpha = real(1.0) - wp.exp(-step * grid.density_scale * softplus(raw + grid.density_shift))
     if alpha <= alpha_min:
         out_distance[n] = wp.uint8(FAR + 1)
     else:

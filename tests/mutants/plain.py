@@ -242,7 +242,7 @@ MUTANTS = [
     Mutant("occupancy: what is not a number is free", "occupancy.py",
            "wp.where(wp.isnan(raw[0]), real(1.0e30), raw[0])", "raw[0]", OCCUPANCY),
     Mutant("occupancy: one column for all", "occupancy.py",
-           "highest = wp.max(highest, highest_in", "highest = wp.max(real(-1.0e30), highest_in",
+           "raw = wp.max(raw, highest[", "raw = wp.max(real(-1.0e30), highest[",
            OCCUPANCY),
     Mutant("occupancy: density scale", "occupancy.py",
            "-step * grid.density_scale * softplus", "-step * softplus", OCCUPANCY),
