@@ -72,10 +72,10 @@ def test_65_a_flipped_bit_in_a_checkpoint(checkpoint: Path, command: str) -> Non
 def test_66_a_checkpoint_of_another_version(checkpoint: Path, command: str) -> None:
     with safe_open(checkpoint, framework="numpy") as file:
         metadata = file.metadata()
-    metadata["header"] = metadata["header"].replace("warpnerf-training-1", "warpnerf-training-2")
+    metadata["header"] = metadata["header"].replace("warpnerf-training-2", "warpnerf-training-3")
     save_file(load_file(checkpoint), checkpoint, metadata)
     said = refused(command, checkpoint)
-    assert f"{checkpoint} has format 'warpnerf-training-2'" in said
+    assert f"{checkpoint} has format 'warpnerf-training-3'" in said
     assert "use the version of warpnerf that wrote it" in said
 
 
@@ -106,12 +106,12 @@ def test_68_a_pickle_as_a_checkpoint(checkpoint: Path, command: str, protocol: i
 
 
 @EITHER
-@pytest.mark.parametrize("key", ["sha256", "mean"])
+@pytest.mark.parametrize("key", ["sha256", "moments"])
 def test_69_a_duplicate_key_in_a_checkpoint(checkpoint: Path, command: str, key: str) -> None:
     content = checkpoint.read_bytes()
     length = int.from_bytes(content[:8], "little")
     table = json.loads(content[8 : 8 + length])
-    value = table["__metadata__"]["sha256"] if key == "sha256" else table["mean"]
+    value = table["__metadata__"]["sha256"] if key == "sha256" else table["moments"]
     again = f'"{key}": {json.dumps(value)}, "{key}":'
     text = json.dumps(table).replace(f'"{key}":', again, 1).encode()
     checkpoint.write_bytes(len(text).to_bytes(8, "little") + text + content[8 + length :])

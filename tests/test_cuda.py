@@ -6,7 +6,7 @@ import pytest
 import warp as wp
 from warpnerf_kernels import contraction, gradscale, precision
 
-NAMES = ["interp", "adam", "regularize", "occupancy", "camera"]
+NAMES = ["interp", "regularize", "occupancy", "camera"]
 
 
 def compiled(module: wp.Module, folder: Path) -> str:
@@ -18,7 +18,8 @@ def compiled(module: wp.Module, folder: Path) -> str:
 def test_every_kernel_compiles_for_cuda(name: str, tmp_path: Path) -> None:
     wp.init()
     render = precision.load(name, "render")
-    modules = [wp.get_module(precision.load(name, module).__name__) for module in NAMES]
+    names = [*NAMES, "adam"] if name == "float32" else NAMES  # it packs what is in float32
+    modules = [wp.get_module(precision.load(name, module).__name__) for module in names]
     for folded in (contraction.NONE, contraction.LINF, contraction.L2):
         variant = render.Variant(
             folded, gradscale.CLAMPED, gradscale.JACOBIAN_DENSITY, packed=False

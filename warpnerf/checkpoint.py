@@ -18,19 +18,19 @@ from typing import Any, NoReturn
 import msgspec
 import numpy as np
 import warp as wp
+from warpnerf_kernels.adam import uint4
 from warpnerf_kernels.types import vec4
 
 from warpnerf.checks import InputError
 from warpnerf.config import Contraction, TrainConfig
 from warpnerf.field import Field
 from warpnerf.grid import FreeCells, VoxelGrid
-from warpnerf.optim import Moments
 from warpnerf.parallel import Workers
 from warpnerf.render import Steps
 from warpnerf.state import Progress, TrainingState
 
 FIELD = "warpnerf-field-1"
-TRAINING = "warpnerf-training-1"
+TRAINING = "warpnerf-training-2"
 """What a file holds, and the version of its format."""
 
 CHUNK = 1 << 24
@@ -72,13 +72,9 @@ def save_checkpoint(path: str | Path, state: TrainingState) -> None:
         "grown": state.grown,
         "progress": asdict(state.progress),
     }
-    shape = (*state.field.grid.size, 4)
-    moments = {
-        "mean": state.moments.mean.numpy().reshape(shape),
-        "square": state.moments.square.numpy().reshape(shape),
-    }
     header = {"format": TRAINING, "training": training} | _field_header(state.field)
-    _write(path, header, moments | _field_tensors(state.field))
+    moments = state.moments.numpy().reshape(*state.field.grid.size, 4)
+    _write(path, header, {"moments": moments} | _field_tensors(state.field))
 
 
 def load_field(path: str | Path, device: str = "cpu", threads: int | None = None) -> Field:
@@ -116,13 +112,11 @@ def load_checkpoint(path: str | Path) -> TrainingState:
     if not 0 <= training.grown <= len(training.config.grid.grow_at):
         _refuse(path, f"a grid cannot have grown {training.grown} times")
     workers = Workers("cpu")
-    shape = tensors["values"].shape
-    moments = {}
-    for name in ("mean", "square"):
-        moment = tensors.pop(name)
-        if moment.shape != shape or moment.dtype != np.float32 or not np.isfinite(moment).all():
-            _refuse(path, f"its tensor {name!r} does not fit its values")
-        moments[name] = wp.array(moment.reshape(-1, 4), dtype=vec4, device=workers.device)
+    moments = tensors.pop("moments")
+    fits = moments.shape == tensors["values"].shape and moments.dtype == np.uint32
+    # An exponent of ones stands for infinity or no number, in the upper half as in the lower.
+    if not fits or any(((moments >> place) & 0xFF == 0xFF).any() for place in (23, 8)):
+        _refuse(path, "its tensor 'moments' does not fit its values")
     return TrainingState(
         config=training.config,
         scene_digest=training.scene_digest,
@@ -131,7 +125,7 @@ def load_checkpoint(path: str | Path) -> TrainingState:
         grown=training.grown,
         progress=training.progress,
         field=_field(header, tensors, path, workers),
-        moments=Moments(**moments),
+        moments=wp.array(moments.reshape(-1, 4), dtype=uint4, device=workers.device),
     )
 
 
@@ -239,7 +233,7 @@ def _safetensors(
     Format: https://github.com/huggingface/safetensors#format. Wide types come first, so that all
     tensors are aligned.
     """
-    dtypes = {np.dtype(np.float32): "F32", np.dtype(np.uint8): "U8"}
+    dtypes = {np.dtype(np.float32): "F32", np.dtype(np.uint32): "U32", np.dtype(np.uint8): "U8"}
     table: dict[str, Any] = {"__metadata__": metadata}
     pieces, end = [], 0
     for name, tensor in sorted(tensors.items(), key=lambda item: (-item[1].itemsize, item[0])):
@@ -289,7 +283,7 @@ def _read(path: Path) -> tuple[_Header, dict[str, np.ndarray]]:
         _refuse(path, f"its header does not fit: {error}")
     names = {"values", "free_distance"}
     if header.training is not None:
-        names |= {"mean", "square"}
+        names |= {"moments"}
     if set(tensors) != names or (header.training is not None) != (kind == TRAINING):
         _refuse(
             path, f"it holds {', '.join(sorted(tensors))} instead of {', '.join(sorted(names))}"

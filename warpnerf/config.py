@@ -22,8 +22,8 @@ Background = Literal["auto", "white", "black", "random"]
 MAX_VOXELS = 2**31
 """Nodes are counted in 32 bits."""
 
-TRAINING_BYTES = 64
-"""Memory that a node takes: values, two moments and a gradient, 16 each."""
+TRAINING_BYTES = 48
+"""Memory that a node takes: values, two moments together, and a gradient, 16 each."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -69,41 +69,42 @@ class VoxelGrid:
         self,
         workers: Workers,
         size: tuple[int, int, int],
-        others: tuple[wp.array, ...] = (),
         box: tuple[np.ndarray, np.ndarray] | None = None,
-    ) -> tuple[VoxelGrid, tuple[wp.array, ...]]:
+    ) -> VoxelGrid:
         """The same field on another grid, trilinearly read off this one.
 
         Args:
             workers: Where to work.
             size: Nodes of the new grid.
-            others: Further arrays over the nodes, such as an optimiser's moments.
             box: Corners of the new grid, within this one's; None: the same. Not with contraction.
-
-        Returns:
-            The new grid, and the other arrays on it.
         """
         box_min, box_max = box or (self.box_min, self.box_max)
+        values = wp.empty(math.prod(size), dtype=vec4, device=workers.device)
+        grid = replace(self, values=values, size=size, box_min=box_min, box_max=box_max)
+        self.resample(interp.resample, self.values, grid, values, workers)
+        return grid
+
+    def resample(
+        self, kernel: wp.Kernel, source: wp.array, other: VoxelGrid, out: wp.array, workers: Workers
+    ) -> None:
+        """Read an array over this grid's nodes at another's.
+
+        Args:
+            kernel: ``interp.resample``, or one like it.
+            source: [n_nodes]
+            other: The other grid.
+            out: [other n_nodes] written.
+            workers: Where to work.
+        """
         old = (np.array(self.size) - 1) / (self.box_max - self.box_min)
-        new = (box_max - box_min) / (np.array(size) - 1)
-        scale, offset = vec3(*(old * new)), vec3(*(old * (box_min - self.box_min)))
-        n = math.prod(size)
-        resampled = []
-        for source in (self.values, *others):
-            out = wp.empty(n, dtype=vec4, device=workers.device)
-            workers.launch(
-                interp.resample,
-                n,
-                source,
-                wp.vec3i(*self.size),
-                scale,
-                offset,
-                wp.vec3i(*size),
-                out,
-            )
-            resampled.append(out)
-        grid = replace(self, values=resampled[0], size=size, box_min=box_min, box_max=box_max)
-        return grid, tuple(resampled[1:])
+        new = (other.box_max - other.box_min) / (np.array(other.size) - 1)
+        scale, offset = vec3(*(old * new)), vec3(*(old * (other.box_min - self.box_min)))
+        workers.launch(
+            kernel,
+            out.shape[0],
+            *(source, wp.vec3i(*self.size), scale, offset),
+            *(wp.vec3i(*other.size), out),
+        )
 
 
 def grid_struct(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import warp as wp
 from warpnerf_kernels import adam, regularize, tiles
@@ -15,28 +14,27 @@ from warpnerf.grid import VoxelGrid
 from warpnerf.parallel import NODES, Workers
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Moments:
-    """Adam's running moments of the gradient."""
+def no_moments(grid: VoxelGrid, workers: Workers) -> wp.array:
+    """Adam's running moments of a grid's gradient before the first step.
 
-    mean: wp.array
-    """[n_nodes] vec4."""
-    square: wp.array
-    """[n_nodes] vec4."""
+    Returns:
+        [n_nodes] of 16 bytes: per channel the mean and the mean square; see warpnerf_kernels.adam.
+    """
+    return wp.zeros(math.prod(grid.size), dtype=adam.uint4, device=workers.device)
 
-    @staticmethod
-    def zeros(grid: VoxelGrid, workers: Workers) -> Moments:
-        """Before the first step."""
-        n = math.prod(grid.size)
-        return Moments(
-            mean=wp.zeros(n, dtype=vec4, device=workers.device),
-            square=wp.zeros(n, dtype=vec4, device=workers.device),
-        )
+
+def resized_moments(
+    moments: wp.array, grid: VoxelGrid, other: VoxelGrid, workers: Workers
+) -> wp.array:
+    """Those of a grid on another, as ``VoxelGrid.resized`` makes it."""
+    out = no_moments(other, workers)
+    grid.resample(adam.resample_moments, moments, other, out, workers)
+    return out
 
 
 def adam_step(
     grid: VoxelGrid,
-    moments: Moments,
+    moments: wp.array,
     gradients: Gradients,
     step: int,
     decay: float,
@@ -47,7 +45,7 @@ def adam_step(
 
     Args:
         grid: Its values are updated; an entry whose gradient is exactly zero is left alone.
-        moments: Updated likewise.
+        moments: [n_nodes] updated likewise.
         gradients: Of a batch.
         step: Counts from 1.
         decay: Factor on the learning rates.
@@ -58,6 +56,7 @@ def adam_step(
     workers.launch(
         adam.adam_step,
         *_shares(grid, workers),
+        step,
         vec4(decay * config.learning_rate_density, rgb_rate, rgb_rate, rgb_rate),
         config.beta1,
         config.beta2,
@@ -66,8 +65,7 @@ def adam_step(
         1.0 / (1.0 - config.beta2**step),
         gradients.struct(),
         grid.values,
-        moments.mean,
-        moments.square,
+        moments,
         chunk=NODES // tiles.STRETCH,
     )
     gradients.touched.zero_()

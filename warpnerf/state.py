@@ -8,11 +8,11 @@ from dataclasses import dataclass, fields, is_dataclass
 from typing import Any
 
 import numpy as np
+import warp as wp
 
 from warpnerf.checks import InputError
 from warpnerf.config import TrainConfig
 from warpnerf.field import Field
-from warpnerf.optim import Moments
 from warpnerf.scene import Scene
 
 MAY_CHANGE = ("device", "threads", "checkpoint_every")
@@ -60,8 +60,8 @@ class TrainingState:
     """Where it stands: steps done, seconds, loss."""
     field: Field
     """Grid and free space; live arrays if it comes from a trainer, which its next step changes."""
-    moments: Moments
-    """Adam's, over the grid's nodes; likewise."""
+    moments: wp.array
+    """Adam's, [n_nodes] as ``warpnerf_kernels.adam`` packs them; likewise."""
 
     def require_same(self, scene: Scene, config: TrainConfig) -> None:
         """Raise InputError unless a training of this scene and configuration would go on as begun.

@@ -16,7 +16,7 @@ from warpnerf.config import Contraction, TrainConfig
 from warpnerf.field import Field
 from warpnerf.grid import FreeCells, VoxelGrid, grid_size, require_memory
 from warpnerf.memory import give_back
-from warpnerf.optim import Moments, adam_step, add_total_variation
+from warpnerf.optim import adam_step, add_total_variation, no_moments, resized_moments
 from warpnerf.parallel import Workers
 from warpnerf.rays import PixelSampler
 from warpnerf.render import Steps, TrainingPass
@@ -132,7 +132,7 @@ class Trainer:
         )
         self._grown = 0
         self.grid = self._first_grid(scene)
-        self.moments = Moments.zeros(self.grid, self.workers)
+        self.moments = no_moments(self.grid, self.workers)
         self.free = FreeCells.none(self.workers)
         self._started: float | None = None
         self._seconds = 0.0
@@ -269,7 +269,7 @@ class Trainer:
         field = state.field
         self.grid = replace(field.grid, values=copy(field.grid.values))
         self.free = replace(field.free, distance=copy(field.free.distance))
-        self.moments = Moments(mean=copy(state.moments.mean), square=copy(state.moments.square))
+        self.moments = copy(state.moments)
         self._grown = state.grown
         self._progress = state.progress
         self.steps_done = state.progress.step
@@ -355,10 +355,9 @@ class Trainer:
         extent = (box[1] - box[0]) * (1.0 + self.grid.border)
         size = grid_size(extent, self._voxels(grown))
         del self._pass  # gives its memory back before more is asked for
-        self.grid, (mean, square) = self.grid.resized(
-            self.workers, size, (self.moments.mean, self.moments.square), box
-        )
-        self.moments = replace(self.moments, mean=mean, square=square)
+        grid = self.grid.resized(self.workers, size, box)
+        self.moments = resized_moments(self.moments, self.grid, grid, self.workers)
+        self.grid = grid
         self._grown = grown
         give_back()
         self._pass = self._training_pass()

@@ -96,6 +96,20 @@ def adj_gather(
     wp.atomic_add(gradient.values, n11 + 1, fz * low)
 
 
+@wp.func
+def place_in(size: wp.vec3i, scale: vec3, offset: vec3, n: int, other_size: wp.vec3i) -> vec3:
+    """Grid coordinates, in a grid, of another's node n; of its nearest face, if it lies outside."""
+    k = n % other_size[2]
+    j = (n // other_size[2]) % other_size[1]
+    i = n // (other_size[2] * other_size[1])
+    u = wp.cw_mul(vec3(real(i), real(j), real(k)), scale) + offset
+    return vec3(
+        wp.clamp(u[0], real(0.0), real(size[0] - 1)),
+        wp.clamp(u[1], real(0.0), real(size[1] - 1)),
+        wp.clamp(u[2], real(0.0), real(size[2] - 1)),
+    )
+
+
 @wp.kernel
 def resample(
     first: int,
@@ -106,17 +120,9 @@ def resample(
     out_size: wp.vec3i,
     out_values: wp.array(dtype=vec4),  # [X' * Y' * Z']
 ):
-    """Another grid's nodes, read off this one; outside of it, its nearest face."""
+    """Another grid's nodes, read off this one."""
     n = first + wp.tid()
-    k = n % out_size[2]
-    j = (n // out_size[2]) % out_size[1]
-    i = n // (out_size[2] * out_size[1])
-    u = wp.cw_mul(vec3(real(i), real(j), real(k)), scale) + offset
-    u = vec3(
-        wp.clamp(u[0], real(0.0), real(size[0] - 1)),
-        wp.clamp(u[1], real(0.0), real(size[1] - 1)),
-        wp.clamp(u[2], real(0.0), real(size[2] - 1)),
-    )
+    u = place_in(size, scale, offset, n, out_size)
     node = lowest_node(u, size)
     fraction = u - vec3(real(node[0]), real(node[1]), real(node[2]))
     out_values[n] = gather(values, size, flat_index(node[0], node[1], node[2], size), fraction)

@@ -24,12 +24,15 @@ def tile_of(node: int) -> int:
 @wp.func_native("""
 const wp::uint8* flags = touched.data;
 int t = tile;
-if (t < end && !flags[t] && !(t > 0 && flags[t - 1])) {
-    wp::uint64 eight = 0;
-    for (++t; t + 8 <= end && !eight; t += 8) memcpy(&eight, flags + t, 8);
-    if (eight) t -= 8;
-    while (t < end && !flags[t]) ++t;
+if (t < end && t > 0 && flags[t - 1]) return t;
+#if !defined(__CUDA_ARCH__)  // eight at a time
+for (; t + 8 <= end; t += 8) {
+    wp::uint64 eight;
+    memcpy(&eight, flags + t, 8);
+    if (eight) return t + __builtin_ctzll(eight) / 8;  // the lowest byte is the first
 }
+#endif
+while (t < end && !flags[t]) ++t;
 return t;
 """)
 def next_tile(touched: wp.array(dtype=wp.uint8), tile: int, end: int) -> int:
