@@ -114,10 +114,11 @@ class OptimConfig:
     """Decay of the second moment."""
     epsilon: float = 1e-8
     """Added to the root of the second moment; gradients are of the mean over a batch's rays."""
-    tv_density: float = 1e-8
-    """Weight of the total variation of raw densities, per pair of neighbouring nodes."""
-    tv_rgb: float = 1e-9
-    """Weight of the total variation of raw colours."""
+    tv_density: float = 3e-9
+    """Weight of the total variation of raw densities, per pair of neighbouring nodes of the final
+    grid; of coarser ones as much more as the face between two nodes is larger."""
+    tv_rgb: float = 3e-10
+    """Weight of the total variation of raw colours, likewise."""
     tv_every: int = 8
     """Steps from one total-variation gradient to the next, which counts that many times."""
 

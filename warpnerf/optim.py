@@ -72,25 +72,27 @@ def adam_step(
 
 
 def add_total_variation(
-    grid: VoxelGrid, gradients: Gradients, config: OptimConfig, workers: Workers
+    grid: VoxelGrid, gradients: Gradients, n_final: int, config: OptimConfig, workers: Workers
 ) -> None:
     """Add the gradient of the grid's total variation at the nodes that have one already.
 
     Args:
         grid: The grid.
         gradients: Added to.
+        n_final: Nodes of the grid that the weights are meant for, with the same box.
         config: Holds the weights, and how many steps this one gradient stands for.
         workers: Where to work.
     """
     if config.tv_density == 0.0 and config.tv_rgb == 0.0:
         return
-    rgb = config.tv_every * config.tv_rgb
+    face = (n_final / math.prod(grid.size)) ** (2.0 / 3.0)  # 1: as in the final grid
+    density, rgb = (face * config.tv_every * w for w in (config.tv_density, config.tv_rgb))
     workers.launch(
         regularize.total_variation_backward,
         *_shares(grid, workers),
         grid.values,
         wp.vec3i(*grid.size),
-        vec4(config.tv_every * config.tv_density, rgb, rgb, rgb),
+        vec4(density, rgb, rgb, rgb),
         gradients.struct(),
         chunk=NODES // tiles.STRETCH,
     )

@@ -194,7 +194,9 @@ class Trainer:
         batch = self._sampler.draw(self.steps_done)
         self._pass.run(self.grid, self.free, self.march_steps(), batch)
         if self.steps_done % config.optim.tv_every == 0:
-            add_total_variation(self.grid, self._pass.gradients, config.optim, self.workers)
+            add_total_variation(
+                self.grid, self._pass.gradients, config.grid.voxels, config.optim, self.workers
+            )
         self.steps_done += 1
         adam_step(
             self.grid,

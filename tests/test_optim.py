@@ -1,0 +1,38 @@
+"""The host's side of the optimiser."""
+
+import numpy as np
+import pytest
+import reference
+import torch
+import warp as wp
+from warpnerf_kernels.types import vec4
+
+from warpnerf.adjoint import Gradients
+from warpnerf.config import OptimConfig
+from warpnerf.grid import VoxelGrid
+from warpnerf.optim import add_total_variation
+from warpnerf.parallel import Workers
+
+
+@pytest.mark.parametrize("coarser", [1, 8])
+def test_total_variation_counts_the_face_between_two_nodes(coarser: int, device: str) -> None:
+    """Of eight times fewer nodes each pair stands for four times the area."""
+    size, workers = (4, 5, 3), Workers(device, 2)
+    raw = torch.tensor(np.random.default_rng(0).normal(size=(*size, 4)), requires_grad=True)
+    weights = torch.tensor([3e-2, 2e-3, 2e-3, 2e-3], dtype=torch.float64)
+    every = 5
+    reference.total_variation(raw, coarser ** (2 / 3) * every * weights).backward()
+    grid = VoxelGrid(
+        values=wp.array(raw.detach().numpy().reshape(-1, 4), dtype=vec4, device=workers.device),
+        size=size,
+        box_min=np.zeros(3),
+        box_max=np.ones(3),
+    )
+    gradients = Gradients.zeros(size, workers)
+    gradients.values.fill_(1.0)
+    gradients.touched.fill_(1)
+    config = OptimConfig(tv_density=3e-2, tv_rgb=2e-3, tv_every=every)
+    add_total_variation(grid, gradients, coarser * 60, config, workers)
+    added = gradients.values.numpy().reshape(*size, 4) - 1.0
+    assert raw.grad is not None
+    np.testing.assert_allclose(added, raw.grad.numpy(), atol=1e-6)
