@@ -61,7 +61,7 @@ NAN = math.nan
             "GiB to train, but this machine has",
             id="61-more-than-the-memory",
             marks=pytest.mark.skipif(
-                (usable_memory() or 0) > 64 * 21 * 10**8, reason="this machine has 134 GB"
+                (usable_memory() or 0) > 40 * 21 * 10**8, reason="this machine has 84 GB"
             ),
         ),
         pytest.param(["--near", "-1"], "march.near", id="near-negative"),

@@ -137,7 +137,7 @@ def test_many_steps_end_where_full_precision_does(kernels: Kernels) -> None:
             )
         )
     off = np.abs(values - exact[0].numpy())
-    assert (off.mean(axis=0) < 0.05 * RATE).all() and off.mean() > 0.0
+    assert (off.mean(axis=0) < 0.05 * RATE).all() and off.mean() > 1e-5  # moments do matter
 
 
 def test_tiles_that_are_not_flagged_are_passed_over(kernels: Kernels) -> None:

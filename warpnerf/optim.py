@@ -26,8 +26,18 @@ def no_moments(grid: VoxelGrid, workers: Workers) -> wp.array:
 def resized_moments(
     moments: wp.array, grid: VoxelGrid, other: VoxelGrid, workers: Workers
 ) -> wp.array:
-    """Those of a grid on another, as ``VoxelGrid.resized`` makes it."""
-    out = no_moments(other, workers)
+    """Moments on another grid, trilinearly read off a first one.
+
+    Args:
+        moments: [grid n_nodes] as ``no_moments`` describes them.
+        grid: Theirs.
+        other: The other one, from ``VoxelGrid.resized``.
+        workers: Where to work.
+
+    Returns:
+        [other n_nodes] likewise.
+    """
+    out = wp.empty(math.prod(other.size), dtype=adam.uint4, device=workers.device)
     grid.resample(adam.resample_moments, moments, other, out, workers)
     return out
 
@@ -72,20 +82,20 @@ def adam_step(
 
 
 def add_total_variation(
-    grid: VoxelGrid, gradients: Gradients, n_final: int, config: OptimConfig, workers: Workers
+    grid: VoxelGrid, gradients: Gradients, n_asked: int, config: OptimConfig, workers: Workers
 ) -> None:
     """Add the gradient of the grid's total variation at the nodes that have one already.
 
     Args:
         grid: The grid.
         gradients: Added to.
-        n_final: Nodes of the grid that the weights are meant for, with the same box.
+        n_asked: Nodes of the grid that the weights are meant for: the final one, or about so.
         config: Holds the weights, and how many steps this one gradient stands for.
         workers: Where to work.
     """
     if config.tv_density == 0.0 and config.tv_rgb == 0.0:
         return
-    face = (n_final / math.prod(grid.size)) ** (2.0 / 3.0)  # 1: as in the final grid
+    face = (n_asked / math.prod(grid.size)) ** (2.0 / 3.0)
     density, rgb = (face * config.tv_every * w for w in (config.tv_density, config.tv_rgb))
     workers.launch(
         regularize.total_variation_backward,

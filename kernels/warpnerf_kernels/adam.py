@@ -47,6 +47,7 @@ auto join = [&](number mean, number square, bits noise) -> bits {
 @wp.func_native(
     WORDS
     + r"""
+static_assert(sizeof(values.data->c[0]) == sizeof(float), "moments are cut out of float32");
 for (int c = 0; c < 4; c += AT_ONCE) {
     number& adj_at = *(number*)&gradient.values.data[node].c[c];
     number& value_at = *(number*)&values.data[node].c[c];

@@ -98,7 +98,7 @@ def adj_gather(
 
 @wp.func
 def place_in(size: wp.vec3i, scale: vec3, offset: vec3, n: int, other_size: wp.vec3i) -> vec3:
-    """Grid coordinates, in a grid, of another's node n; of its nearest face, if it lies outside."""
+    """Where another grid's node n lies, in this one's coordinates; outside, on its face."""
     k = n % other_size[2]
     j = (n // other_size[2]) % other_size[1]
     i = n // (other_size[2] * other_size[1])

@@ -232,7 +232,7 @@ MUTANTS = [
            ADAM),
     Mutant("Adam: each step rounds alike", "adam.py",
            "(as_bits(g) + step * 0x9e3779b9u)", "as_bits(g)", ADAM),
-    Mutant("Adam: a square's rounding reaches the mean", "adam.py",
+    Mutant("Adam: a square rounded up by as much as two", "adam.py",
            "(noise & 0x7fffu)", "(noise & 0xffffu)", ADAM),
     Mutant("Adam: moments resampled towards zero", "adam.py", "0x80004000u", "0u", ADAM),
     Mutant("Adam: moments resampled with axes swapped", "adam.py",
