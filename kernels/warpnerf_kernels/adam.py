@@ -10,8 +10,8 @@ On the CPU a node's four channels are worked on at once, in Clang's vector types
 
 import warp as wp
 
-from .interp import flat_index, lowest_node, place_in
-from .tiles import TILE, next_tile, tile_of
+from .interp import place_in
+from .tiles import TILE, next_tile, prefetch, tile_of
 from .types import Gradient, vec3, vec4
 
 wp.set_module_options({"enable_backward": False})
@@ -83,20 +83,6 @@ def step_node(
     ...
 
 
-@wp.func_native("""
-#if !defined(__CUDA_ARCH__)
-__builtin_prefetch(gradient.values.data + node);
-__builtin_prefetch(values.data + node);
-__builtin_prefetch(moments.data + node);
-#endif
-""")
-def prefetch_node(
-    node: int, gradient: Gradient, values: wp.array(dtype=vec4), moments: wp.array(dtype=uint4)
-):
-    """Bring all of a node into the cache, ahead of its use; CUDA has other ways to wait."""
-    ...
-
-
 @wp.kernel
 def adam_step(
     first: int,
@@ -121,7 +107,10 @@ def adam_step(
     later_last = tile_of(later_end - 1) + 1
     tile = next_tile(gradient.touched, last, later_last)
     while tile < later_last:  # what the next thread will need: a CPU runs them one by one
-        prefetch_node(tile * wp.static(TILE), gradient, values, moments)
+        node = tile * wp.static(TILE)
+        prefetch(gradient.values, node)
+        prefetch(values, node)
+        prefetch(moments, node)
         tile = next_tile(gradient.touched, tile + 1, later_last)
     tile = next_tile(gradient.touched, tile_of(start), last)
     while tile < last:
@@ -188,8 +177,5 @@ def resample_moments(
 ):
     """interp.resample for moments."""
     n = first + wp.tid()
-    u = place_in(size, scale, offset, n, out_size)
-    node = lowest_node(u, size)
-    fraction = u - vec3(float(node[0]), float(node[1]), float(node[2]))
-    base = flat_index(node[0], node[1], node[2], size)
+    base, fraction = place_in(size, scale, offset, n, out_size)
     gather_moments(moments, size, base, fraction, out_moments, n)

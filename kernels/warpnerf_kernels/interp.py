@@ -97,17 +97,23 @@ def adj_gather(
 
 
 @wp.func
-def place_in(size: wp.vec3i, scale: vec3, offset: vec3, n: int, other_size: wp.vec3i) -> vec3:
-    """Where another grid's node n lies, in this one's coordinates; outside, on its face."""
+def place_in(size: wp.vec3i, scale: vec3, offset: vec3, n: int, other_size: wp.vec3i):
+    """Where another grid's node n lies in this one: lowest node around, and fraction.
+
+    Outside of this one, its nearest face is meant.
+    """
     k = n % other_size[2]
     j = (n // other_size[2]) % other_size[1]
     i = n // (other_size[2] * other_size[1])
     u = wp.cw_mul(vec3(real(i), real(j), real(k)), scale) + offset
-    return vec3(
+    u = vec3(
         wp.clamp(u[0], real(0.0), real(size[0] - 1)),
         wp.clamp(u[1], real(0.0), real(size[1] - 1)),
         wp.clamp(u[2], real(0.0), real(size[2] - 1)),
     )
+    node = lowest_node(u, size)
+    fraction = u - vec3(real(node[0]), real(node[1]), real(node[2]))
+    return flat_index(node[0], node[1], node[2], size), fraction
 
 
 @wp.kernel
@@ -122,7 +128,5 @@ def resample(
 ):
     """Another grid's nodes, read off this one."""
     n = first + wp.tid()
-    u = place_in(size, scale, offset, n, out_size)
-    node = lowest_node(u, size)
-    fraction = u - vec3(real(node[0]), real(node[1]), real(node[2]))
-    out_values[n] = gather(values, size, flat_index(node[0], node[1], node[2], size), fraction)
+    base, fraction = place_in(size, scale, offset, n, out_size)
+    out_values[n] = gather(values, size, base, fraction)

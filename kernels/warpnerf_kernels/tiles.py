@@ -4,9 +4,9 @@ A pair of nodes along z flags the tile that its lower node lies in. So a tile ma
 it is flagged itself, or if the one before is, whose last pair may reach into it.
 """
 
-import warp as wp
+from typing import Any
 
-from .types import vec4
+import warp as wp
 
 TILE = 4
 """Nodes in a tile: in float32, a cache line."""
@@ -45,6 +45,6 @@ def next_tile(touched: wp.array(dtype=wp.uint8), tile: int, end: int) -> int:
 __builtin_prefetch(values.data + node);
 #endif
 """)
-def prefetch(values: wp.array(dtype=vec4), node: int):
+def prefetch(values: wp.array(dtype=Any), node: int):
     """Bring a node's cache line in, ahead of its use; CUDA has other ways to wait."""
     ...
