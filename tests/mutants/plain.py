@@ -270,6 +270,8 @@ MUTANTS = [
            "x * radial + two * p2 * x * y + p1 * (r2", CAMERA),
     Mutant("camera: undistorted in one stride", "camera.py",
            "share + real(0.125)", "share + real(1.0)", CAMERA),
+    Mutant("camera: every lens changes little", "camera.py",
+           "< real(0.5):", "< real(50.0):", CAMERA),
     Mutant("camera: no waiting until it is close", "camera.py",
            "< real(1.0e-6)", "< real(1.0e6)", CAMERA),
     Mutant("camera: one step at the end", "camera.py", "left = int(4)", "left = int(1)", CAMERA),
