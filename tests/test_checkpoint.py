@@ -170,7 +170,7 @@ def test_metadata_tell_what_a_file_is(tmp_path: Path) -> None:
     with safe_open(tmp_path / "training", framework="numpy") as file:
         metadata = file.metadata()
     header = json.loads(metadata["header"])
-    assert header["format"] == "warpnerf-training-2"
+    assert header["format"] == "warpnerf-training-3"
     assert header["training"]["progress"]["step"] == 3
     assert header["training"]["config"]["grid"]["voxels"] == TrainConfig().grid.voxels
     assert len(metadata["sha256"]) == 64
@@ -198,7 +198,7 @@ def test_a_short_write_is_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 @pytest.mark.parametrize(
     ("header", "tensors", "says"),
     [
-        (lambda text: text.replace("training-2", "training-3"), {}, "training-3"),
+        (lambda text: text.replace("training-3", "training-4"), {}, "training-4"),
         (lambda text: text[:-1], {}, "header"),
         (lambda text: "[" * 100_000, {}, "header"),
         (lambda text: "[]", {}, "header"),
@@ -208,6 +208,7 @@ def test_a_short_write_is_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         (lambda text: text.replace('"border": 0.0', '"border": "wide"'), {}, "border"),
         (lambda text: text.replace('"border": 0.0', '"border": 7.0'), {}, "rendered"),
         (lambda text: text.replace('"grown": 2', '"grown": 9'), {}, "9 times"),
+        (lambda text: text.replace('"updates": 5', '"updates": 6'), {}, "6 updates"),
         (lambda text: text.replace('"seed": 0', '"seed": -1'), {}, "seed"),
         (lambda text: text.replace('"step": 5', '"step": "five"'), {}, "step"),
         (None, {"extra": np.zeros(3, np.float32)}, "extra"),

@@ -199,7 +199,7 @@ def test_eval_of_a_bad_run(trained: tuple[Path, str], tmp_path: Path, damage: st
     assert "Traceback" not in err
 
 
-GROWING = (*TINY, "--steps", "203")
+GROWING = (*TINY, "--steps", "210")
 """Grows at step 200, and trains on for a few steps."""
 
 
@@ -346,12 +346,12 @@ def test_a_new_run_wants_scene_and_output(tmp_path: Path) -> None:
 SPOIL = """
 import sys
 from warpnerf import cli, training
-step = training.Trainer.step
+update = training.Trainer.update
 def spoiled(self):
-    step(self)
+    update(self)
     if self.steps_done == int(sys.argv[1]):
         self.grid.values.fill_(float("nan"))
-training.Trainer.step = spoiled
+training.Trainer.update = spoiled
 sys.exit(cli.main(sys.argv[2:]))
 """
 

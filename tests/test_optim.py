@@ -20,8 +20,8 @@ def test_total_variation_counts_the_face_between_two_nodes(coarser: int, device:
     size, workers = (4, 5, 3), Workers(device, 2)
     raw = torch.tensor(np.random.default_rng(0).normal(size=(*size, 4)), requires_grad=True)
     weights = torch.tensor([3e-2, 2e-3, 2e-3, 2e-3], dtype=torch.float64)
-    every = 5
-    reference.total_variation(raw, coarser ** (2 / 3) * every * weights).backward()
+    every, n_steps = 5, 4
+    reference.total_variation(raw, coarser ** (2 / 3) * every * n_steps**0.5 * weights).backward()
     grid = VoxelGrid(
         values=wp.array(raw.detach().numpy().reshape(-1, 4), dtype=vec4, device=workers.device),
         size=size,
@@ -32,7 +32,7 @@ def test_total_variation_counts_the_face_between_two_nodes(coarser: int, device:
     gradients.values.fill_(1.0)
     gradients.touched.fill_(1)
     config = OptimConfig(tv_density=3e-2, tv_rgb=2e-3, tv_every=every)
-    add_total_variation(grid, gradients, coarser * 60, config, workers)
+    add_total_variation(grid, gradients, coarser * 60, n_steps, config, workers)
     added = gradients.values.numpy().reshape(*size, 4) - 1.0
     assert raw.grad is not None
     np.testing.assert_allclose(added, raw.grad.numpy(), atol=1e-6)

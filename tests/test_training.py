@@ -9,13 +9,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+import warp as wp
 from test_determinism import small_scene
 from tiny_fields import assert_same_state
 
 from warpnerf import training
+from warpnerf.adjoint import Gradients
 from warpnerf.checkpoint import load_checkpoint, save_checkpoint
 from warpnerf.checks import InputError
 from warpnerf.config import GridConfig, OptimConfig, TrainConfig
+from warpnerf.grid import VoxelGrid
 from warpnerf.scene import Scene
 from warpnerf.state import TrainingState
 from warpnerf.training import Trainer, train
@@ -52,7 +55,7 @@ def tiny_config(**changes: Any) -> TrainConfig:
             background="random",
             threads=1,
             grid=GridConfig(voxels=6000, grow_at=(0.301, 0.601), alpha_init=0.1),
-            optim=OptimConfig(tv_every=3, tv_density=1e-4, tv_rgb=1e-4),
+            optim=OptimConfig(tv_every=3, tv_density=1e-4, tv_rgb=1e-4, accumulate_at=()),
         ),
         **changes,
     )
@@ -101,6 +104,69 @@ def test_interrupted_after_every_step_it_ends_the_same(tmp_path: Path, on_cpu: N
     assert_same_state(without_seconds(state), without_seconds(whole))
 
 
+def accumulating(config: TrainConfig, *shares: float) -> TrainConfig:
+    return replace(config, optim=replace(config.optim, accumulate_at=shares))
+
+
+@pytest.mark.parametrize(
+    ("shares", "updates"),
+    [
+        ((), [1, 2, 3, 4, 5, 6, 7]),
+        ((0.3,), [1, 2, 3, 5, 7]),
+        ((0.4, 0.6), [1, 2, 3, 5, 7]),  # the last update has only two steps left
+        ((0.1, 0.1, 0.1), [1, 7]),
+    ],
+)
+def test_updates_take_more_steps_as_training_goes_on(
+    shares: tuple[float, ...], updates: list[int]
+) -> None:
+    seen: list[int] = []
+    config = accumulating(tiny_config(steps=7, checkpoint_every=1e-9), *shares)
+    train(ball(), config, on_checkpoint=lambda state: seen.append(state.progress.step))
+    assert seen == updates
+
+
+def test_an_update_adds_up_the_gradients_of_its_steps(
+    monkeypatch: pytest.MonkeyPatch, on_cpu: None
+) -> None:
+    taken: list[np.ndarray] = []
+
+    def no_update(grid: VoxelGrid, moments: wp.array, gradients: Gradients, *rest: Any) -> None:
+        taken.append(gradients.values.numpy().copy())
+        gradients.values.zero_()
+
+    monkeypatch.setattr(training, "adam_step", no_update)  # so both see one grid
+    optim = OptimConfig(tv_density=0.0, tv_rgb=0.0, accumulate_at=())
+    config = tiny_config(steps=5, grid=GridConfig(voxels=6000, grow_at=()), optim=optim)
+    train(ball(), config)
+    single = taken[:]
+    taken.clear()
+    train(ball(), accumulating(config, 0.1, 0.2))
+    np.testing.assert_array_equal(taken[0], single[0])
+    largest = np.abs(taken[1]).max()
+    np.testing.assert_allclose(taken[1], np.sum(single[1:], axis=0), atol=1e-5 * largest)
+    assert largest > 0.0 and len(taken) == 2
+
+
+def test_reports_come_as_often_where_an_update_takes_many_steps() -> None:
+    reported: list[int] = []
+    config = accumulating(tiny_config(), 0.1, 0.3)  # updates after 1, 2, 4, 6, 10, 14, ... steps
+    train(ball(), config, on_progress=lambda progress: reported.append(progress.step))
+    assert reported == [4, 6, 10, 14, 18, 20]
+
+
+def test_resumed_between_updates_of_several_steps_it_ends_the_same(
+    tmp_path: Path, on_cpu: None
+) -> None:
+    config = accumulating(tiny_config(), 0.2, 0.5)
+    whole = stopped_at(STEPS, tmp_path / "whole", config, ball())
+    assert whole.updates == 10
+    for step in (4, 6, 10, 14, 18):
+        begun = stopped_at(step, tmp_path / "begun", config, ball())
+        resumed = stopped_at(STEPS, tmp_path / "resumed", config, ball(), begun)
+        assert_same_state(without_seconds(resumed), without_seconds(whole))
+
+
 def test_train_resumes_too_and_leaves_the_state_alone(tmp_path: Path, on_cpu: None) -> None:
     scene = ball()
     whole = train(scene, tiny_config())
@@ -138,7 +204,7 @@ def test_seconds_before_the_resumption_count(tmp_path: Path) -> None:
     spent = replace(state, progress=replace(state.progress, seconds=900.0))
     trainer = Trainer(ball(), config, spent)
     assert trainer.fraction == 0.9
-    trainer.step()
+    trainer.update()
     assert 900.0 <= trainer.report().seconds < 1000.0
 
 
@@ -189,7 +255,7 @@ def test_other_photographs_are_refused(tmp_path: Path) -> None:
 
 def test_the_threads_in_use_are_part_of_the_state() -> None:
     trainer = Trainer(ball(), tiny_config(threads=None))
-    trainer.step()
+    trainer.update()
     assert trainer.state().config.threads == trainer.workers.count
 
 

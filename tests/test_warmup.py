@@ -26,7 +26,7 @@ def test_a_training_loads_no_other_kernels(contraction: Any, scaling: Any, devic
     assert not trainer.workers._loaded  # a scene is described before anything is compiled
     where = trainer.workers.device
     needed = training_kernels(contraction, scaling, "none", where)
-    trainer.step()
+    trainer.update()
     assert trainer.workers._loaded == set(needed)
     trainer.run()
     assert trainer.grid.size != Trainer(small_scene(), config).grid.size

@@ -72,6 +72,7 @@ def tiny_state(step: int, config: TrainConfig | None = None) -> TrainingState:
         content_distance=2.0 / 3.0,
         reach=math.pi,
         grown=2,
+        updates=step,
         progress=progress,
         field=field,
         moments=wp.array(moments, dtype=uint4, device=field.workers.device),
@@ -80,7 +81,15 @@ def tiny_state(step: int, config: TrainConfig | None = None) -> TrainingState:
 
 def assert_same_state(state: TrainingState, expected: TrainingState) -> None:
     """All of it, bit for bit."""
-    for name in ("config", "scene_digest", "content_distance", "reach", "grown", "progress"):
+    for name in (
+        "config",
+        "scene_digest",
+        "content_distance",
+        "reach",
+        "grown",
+        "updates",
+        "progress",
+    ):
         assert getattr(state, name) == getattr(expected, name)
     grid, other = state.field.grid, expected.field.grid
     for name in ("size", "contraction", "border", "density_shift", "density_scale"):

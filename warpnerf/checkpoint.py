@@ -30,7 +30,7 @@ from warpnerf.render import Steps
 from warpnerf.state import Progress, TrainingState
 
 FIELD = "warpnerf-field-1"
-TRAINING = "warpnerf-training-2"
+TRAINING = "warpnerf-training-3"
 """What a file holds, and the version of its format."""
 
 CHUNK = 1 << 24
@@ -70,6 +70,7 @@ def save_checkpoint(path: str | Path, state: TrainingState) -> None:
         "content_distance": state.content_distance,
         "reach": state.reach,
         "grown": state.grown,
+        "updates": state.updates,
         "progress": asdict(state.progress),
     }
     header = {"format": TRAINING, "training": training} | _field_header(state.field)
@@ -111,6 +112,8 @@ def load_checkpoint(path: str | Path) -> TrainingState:
         )
     if not 0 <= training.grown <= len(training.config.grid.grow_at):
         _refuse(path, f"a grid cannot have grown {training.grown} times")
+    if not 0 <= training.updates <= training.progress.step:
+        _refuse(path, f"{training.updates} updates do not fit {training.progress.step} steps")
     workers = Workers("cpu")
     moments = tensors.pop("moments")
     fits = moments.shape == tensors["values"].shape and moments.dtype == np.uint32
@@ -123,6 +126,7 @@ def load_checkpoint(path: str | Path) -> TrainingState:
         content_distance=training.content_distance,
         reach=training.reach,
         grown=training.grown,
+        updates=training.updates,
         progress=training.progress,
         field=_field(header, tensors, path, workers),
         moments=wp.array(moments.reshape(-1, 4), dtype=uint4, device=workers.device),
@@ -137,6 +141,7 @@ class _Training(msgspec.Struct, frozen=True):
     content_distance: float
     reach: float
     grown: int
+    updates: int
     progress: Progress
 
 

@@ -39,6 +39,12 @@ def require_one_of(field: str, value: str, choices: Iterable[str]) -> None:
         raise InputError(f"{field} must be one of {', '.join(choices)}, not {value!r}.")
 
 
+def require_shares(field: str, shares: tuple[float, ...]) -> None:
+    """Raise InputError unless these are shares of the training, one after another."""
+    if list(shares) != sorted(shares) or not all(0 < share < 1 for share in shares):
+        raise InputError(f"{field} must be shares between 0 and 1 in rising order, not {shares}.")
+
+
 def require_rays(origins: np.ndarray, directions: np.ndarray) -> None:
     """Raise InputError unless both are [n_rays, 3], finite, and directions of unit length."""
     for name, array in (("origins", origins), ("directions", directions)):

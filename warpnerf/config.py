@@ -11,6 +11,7 @@ from warpnerf.checks import (
     require_at_least,
     require_one_of,
     require_positive,
+    require_shares,
     require_whole,
 )
 
@@ -54,10 +55,7 @@ class GridConfig:
             raise InputError(f"grid.alpha_init must lie between 0 and 1, not {self.alpha_init}.")
         if not 0 < self.border <= 1:
             raise InputError(f"grid.border must be above 0 and at most 1, not {self.border}.")
-        if list(self.grow_at) != sorted(self.grow_at) or not all(0 < s < 1 for s in self.grow_at):
-            raise InputError(
-                f"grid.grow_at must be shares between 0 and 1 in rising order, not {self.grow_at}."
-            )
+        require_shares("grid.grow_at", self.grow_at)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,7 +118,10 @@ class OptimConfig:
     tv_rgb: float = 3e-10
     """Weight of the total variation of raw colours, likewise."""
     tv_every: int = 8
-    """Steps from one total-variation gradient to the next, which counts that many times."""
+    """Updates from one total-variation gradient to the next, which counts that many times."""
+    accumulate_at: tuple[float, ...] = (0.5, 0.7)
+    """Shares of the training at which the number of steps doubles whose gradients are added up for
+    one update of the grid; before the first share it is one."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot be optimised with."""
@@ -131,6 +132,7 @@ class OptimConfig:
         require_at_least("optim.tv_density", self.tv_density, 0.0)
         require_at_least("optim.tv_rgb", self.tv_rgb, 0.0)
         require_whole("optim.tv_every", self.tv_every, 1)
+        require_shares("optim.accumulate_at", self.accumulate_at)
         for name in ("beta1", "beta2"):
             if not 0 <= getattr(self, name) < 1:
                 raise InputError(f"optim.{name} must lie in [0, 1), not {getattr(self, name)}.")
@@ -141,7 +143,8 @@ class TrainConfig:
     """One training run."""
 
     steps: int = 4000
-    """Optimiser steps."""
+    """Batches of rays to draw. Each adds to the gradient by which the grid is updated, see
+    ``OptimConfig.accumulate_at``."""
     time_limit: float | None = None
     """Seconds after which training ends, its schedule squeezed to fit; compiling does not count.
     None: no limit. What fits depends on the machine, so the result does too."""
@@ -153,12 +156,12 @@ class TrainConfig:
     jacobian: Jacobian = "none"
     """Whether the scaling takes the contraction's change of volume into account."""
     rays_per_step: int = 4096
-    """Rays in a batch."""
+    """Rays in a batch: what one step draws."""
     background: Background | tuple[float, float, float] = "auto"
     """What is seen behind the scene: a colour, rgb in [0, 1], or random colours while training
     (white when rendering); auto: white where photographs have alpha, else black."""
     occupancy_every: int = 100
-    """Steps between two looks for free space."""
+    """Updates of the grid between two looks for free space."""
     alpha_min: float = 1e-2
     """A cell is free where the longest step that there can be would be less opaque than this."""
     seed: int = 0

@@ -46,7 +46,7 @@ def adam_step(
     grid: VoxelGrid,
     moments: wp.array,
     gradients: Gradients,
-    step: int,
+    update: int,
     decay: float,
     config: OptimConfig,
     workers: Workers,
@@ -56,8 +56,8 @@ def adam_step(
     Args:
         grid: Its values are updated; an entry whose gradient is exactly zero is left alone.
         moments: [n_nodes] updated likewise.
-        gradients: Of a batch.
-        step: Counts from 1.
+        gradients: Of one batch or several.
+        update: Counts from 1.
         decay: Factor on the learning rates.
         config: The rest.
         workers: Where to work.
@@ -66,13 +66,13 @@ def adam_step(
     workers.launch(
         adam.adam_step,
         *_shares(grid, workers),
-        step,
+        update,
         vec4(decay * config.learning_rate_density, rgb_rate, rgb_rate, rgb_rate),
         config.beta1,
         config.beta2,
         config.epsilon,
-        1.0 / (1.0 - config.beta1**step),
-        1.0 / (1.0 - config.beta2**step),
+        1.0 / (1.0 - config.beta1**update),
+        1.0 / (1.0 - config.beta2**update),
         gradients.struct(),
         grid.values,
         moments,
@@ -82,21 +82,31 @@ def adam_step(
 
 
 def add_total_variation(
-    grid: VoxelGrid, gradients: Gradients, n_asked: int, config: OptimConfig, workers: Workers
+    grid: VoxelGrid,
+    gradients: Gradients,
+    n_asked: int,
+    n_steps: int,
+    config: OptimConfig,
+    workers: Workers,
 ) -> None:
     """Add the gradient of the grid's total variation at the nodes that have one already.
+
+    Gradients of several steps, added up, are larger, and so is what is added to them: as much as
+    their noise, by which Adam divides both.
 
     Args:
         grid: The grid.
         gradients: Added to.
         n_asked: Nodes of the grid that the weights are meant for: the final one, or about so.
-        config: Holds the weights, and how many steps this one gradient stands for.
+        n_steps: Training steps that the gradients are the sum of.
+        config: Holds the weights, and how many updates this one gradient stands for.
         workers: Where to work.
     """
     if config.tv_density == 0.0 and config.tv_rgb == 0.0:
         return
     face = (n_asked / math.prod(grid.size)) ** (2.0 / 3.0)
-    density, rgb = (face * config.tv_every * w for w in (config.tv_density, config.tv_rgb))
+    factor = face * config.tv_every * math.sqrt(n_steps)
+    density, rgb = factor * config.tv_density, factor * config.tv_rgb
     workers.launch(
         regularize.total_variation_backward,
         *_shares(grid, workers),

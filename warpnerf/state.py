@@ -56,6 +56,8 @@ class TrainingState:
     """From the outermost camera to the farthest corner of the first box, scene units."""
     grown: int
     """How often the grid has grown."""
+    updates: int
+    """How often the optimiser has updated the grid."""
     progress: Progress
     """Where it stands: steps done, seconds, loss."""
     field: Field

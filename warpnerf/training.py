@@ -1,4 +1,4 @@
-"""Training: one step, and the schedule that strings steps together. No files, no terminal."""
+"""Training: one update of the grid, and the schedule of all. No files, no terminal."""
 
 from __future__ import annotations
 
@@ -131,9 +131,11 @@ class Trainer:
             self.workers,
         )
         self._grown = 0
+        self._updates = 0
         self.grid = self._first_grid(scene)
         self.moments = no_moments(self.grid, self.workers)
         self.free = FreeCells.none(self.workers)
+        self._report_due = False
         self._started: float | None = None
         self._seconds = 0.0
         self._progress: Progress | None = None
@@ -155,7 +157,7 @@ class Trainer:
         """
         saved_step, saved_at = self.steps_done, time.monotonic()
         while self.fraction < 1.0 and not stop():
-            self.step()
+            self.update()
             if self.report_due:
                 progress = self.report()
                 if on_progress is not None:
@@ -179,34 +181,47 @@ class Trainer:
     @property
     def report_due(self) -> bool:
         """Whether it is time for a report."""
-        return self.steps_done % REPORT_EVERY == 0 or self.fraction >= 1.0
+        return self._report_due or self.fraction >= 1.0
 
-    def step(self) -> None:
-        """Draw a batch and update the grid; grow the grid and look for free space when due."""
+    def update(self) -> None:
+        """Draw batches, add up their gradients, and update the grid by these.
+
+        When due, the grid grows and free space is looked for before.
+        """
         config = self.config
         if self._started is None:  # compiling is not training
             for kernel in self._kernels():
                 self.workers.load(kernel)
         fraction = self.fraction
         self._grow(fraction)
-        if self.steps_done % config.occupancy_every == 0:
+        if self._updates % config.occupancy_every == 0:
             self._look_for_free_space()
-        batch = self._sampler.draw(self.steps_done)
-        self._pass.run(self.grid, self.free, self.march_steps(), batch)
-        if self.steps_done % config.optim.tv_every == 0:
+        before, march = self.steps_done, self.march_steps()
+        n_steps = min(self._steps_an_update(fraction), config.steps - before)
+        for _ in range(n_steps):
+            batch = self._sampler.draw(self.steps_done)
+            self._pass.run(self.grid, self.free, march, batch)
+            self.steps_done += 1
+        if self._updates % config.optim.tv_every == 0:
             add_total_variation(
-                self.grid, self._pass.gradients, config.grid.voxels, config.optim, self.workers
+                self.grid,
+                self._pass.gradients,
+                config.grid.voxels,
+                n_steps,
+                config.optim,
+                self.workers,
             )
-        self.steps_done += 1
+        self._updates += 1
         adam_step(
             self.grid,
             self.moments,
             self._pass.gradients,
-            self.steps_done,
+            self._updates,
             config.optim.decay**fraction,
             config.optim,
             self.workers,
         )
+        self._report_due = self.steps_done // REPORT_EVERY > before // REPORT_EVERY
         if self._started is None:  # nor is the first step, in which memory is first touched
             self._started = time.perf_counter() - self._seconds
         self._seconds = time.perf_counter() - self._started
@@ -251,6 +266,7 @@ class Trainer:
             content_distance=self.content_distance,
             reach=self._reach,
             grown=self._grown,
+            updates=self._updates,
             progress=progress,
             field=self.field(),
             moments=self.moments,
@@ -273,6 +289,7 @@ class Trainer:
         self.free = replace(field.free, distance=copy(field.free.distance))
         self.moments = copy(state.moments)
         self._grown = state.grown
+        self._updates = state.updates
         self._progress = state.progress
         self.steps_done = state.progress.step
         self._seconds = state.progress.seconds
@@ -332,6 +349,10 @@ class Trainer:
         """Nodes after that many growing steps."""
         left = len(self.config.grid.grow_at) - grown
         return max(8, self.config.grid.voxels >> left)
+
+    def _steps_an_update(self, fraction: float) -> int:
+        """Steps whose gradients are added up for one, after that share of the training."""
+        return 1 << sum(fraction >= at for at in self.config.optim.accumulate_at)
 
     def _training_pass(self) -> TrainingPass:
         return TrainingPass(
