@@ -26,7 +26,8 @@ FAR_OFF = 10.0
 """A camera this many times the median distance away from the median place is likely a mistake."""
 
 SECONDS_PER_RAY, SECONDS_PER_SAMPLE, SECONDS_PER_NODE = 1.2e-6, 22e-9, 16e-9
-"""Of one core in a training step, for what is visited: measured on an AMD EPYC (Zen 5)."""
+"""Of one core, in a step for what is visited and in an update for each node in use: measured on an
+AMD EPYC (Zen 5)."""
 
 SAMPLES_AND_OCCUPIED = {"object": (12, 0.3), "room": (50, 0.8), "unbounded": (190, 0.6)}
 """Samples per ray, and the share of nodes in use: means of lego, builtin:room and fox late in
@@ -273,10 +274,11 @@ def _cost(scene: Scene, config: TrainConfig, threads: int) -> Cost:
     kind = "unbounded" if scene.unbounded else "object" if with_alpha else "room"
     samples, occupied = SAMPLES_AND_OCCUPIED[kind]
     finer = (voxels / PRESETS["fast"].grid.voxels) ** (1.0 / 3.0) / config.march.step_voxels
-    shares = np.diff([0.0, *config.grid.grow_at, 1.0])
-    mean_voxels = voxels * float(shares @ 0.5 ** np.arange(len(shares))[::-1])
+    share = (np.arange(1000) + 0.5)[:, None] / 1000  # of the training, evenly
+    nodes = voxels * 0.5 ** (share < config.grid.grow_at).sum(axis=1)
+    steps_an_update = 2.0 ** (share >= config.optim.accumulate_at).sum(axis=1)
     step = config.rays_per_step * (SECONDS_PER_RAY + finer * samples * SECONDS_PER_SAMPLE)
-    step += mean_voxels * occupied * SECONDS_PER_NODE
+    step += float((nodes / steps_an_update).mean()) * occupied * SECONDS_PER_NODE
     return Cost(memory=memory, seconds=config.steps * step / threads, threads=threads)
 
 

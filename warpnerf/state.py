@@ -1,4 +1,4 @@
-"""A training between two steps, as a value: all that it takes to go on exactly as before."""
+"""A training between two updates, as a value: all that it takes to go on exactly as before."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Progress:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrainingState:
-    """A training between two steps. Batches are functions of seed and step, so no random state."""
+    """A training between two updates. Batches are functions of seed and step: no random state."""
 
     config: TrainConfig
     """How it trains; on the CPU with the number of threads that it used."""
