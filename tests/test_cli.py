@@ -200,7 +200,7 @@ def test_eval_of_a_bad_run(trained: tuple[Path, str], tmp_path: Path, damage: st
 
 
 GROWING = (*TINY, "--steps", "210")
-"""Grows at step 200, and trains on for a few steps."""
+"""Grows before the first update after step 200, and trains on for a few steps."""
 
 
 @pytest.fixture(scope="module")

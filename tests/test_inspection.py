@@ -10,7 +10,10 @@ import numpy as np
 import pytest
 from tiny_scenes import look_at, ring, save, write_blender, write_transforms
 
+from warpnerf import inspection
 from warpnerf.checks import InputError
+from warpnerf.config import GridConfig, OptimConfig, TrainConfig
+from warpnerf.data import load_scene
 from warpnerf.inspection import Inspection, inspect
 
 
@@ -113,6 +116,21 @@ def test_costs_grow_with_what_is_asked(tmp_path: Path) -> None:
     assert one["quality"].memory > 2.0 * one["fast"].memory
     assert four["fast"].memory == one["fast"].memory >= 48 * 160**3
     assert four["fast"].seconds == pytest.approx(one["fast"].seconds / 4)
+
+
+def test_fewer_updates_cost_less_by_their_nodes(tmp_path: Path) -> None:
+    scene = load_scene(scene_with(tmp_path, ring(9)))
+
+    def seconds(voxels: int, *shares: float) -> float:
+        grid = GridConfig(voxels=voxels, grow_at=())
+        config = TrainConfig(grid=grid, optim=OptimConfig(accumulate_at=shares))
+        return inspection._cost(scene, config, 1).seconds
+
+    saved = [seconds(n) - seconds(n, 0.5) for n in (10**6, 2 * 10**6)]
+    assert saved[0] > 0.0
+    assert saved[1] == pytest.approx(2.0 * saved[0])  # half the updates of half the training
+    spared = seconds(10**6) - seconds(10**6, 0.5, 0.75)
+    assert spared == pytest.approx(saved[0] * (0.25 * 0.5 + 0.25 * 0.75) / (0.5 * 0.5))
 
 
 def test_a_scene_that_is_refused_says_how_many_poses_are(tmp_path: Path) -> None:

@@ -35,6 +35,9 @@ def early_growth(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(training, "REPORT_EVERY", 3)
 
 
+NO_GROWTH = GridConfig(voxels=6000, grow_at=(), alpha_init=0.1)
+
+
 def ball() -> Scene:
     """Something round of many colours, with nothing around it."""
     scene = small_scene()
@@ -126,6 +129,46 @@ def test_updates_take_more_steps_as_training_goes_on(
     assert seen == updates
 
 
+@pytest.mark.parametrize("shares", [(0.0,), (0.5, 0.4), (1.0,), (math.nan,)])
+def test_shares_that_are_none_are_refused(shares: tuple[float, ...]) -> None:
+    for make, name in (
+        (lambda: OptimConfig(accumulate_at=shares), r"optim\.accumulate_at"),
+        (lambda: GridConfig(grow_at=shares), r"grid\.grow_at"),
+    ):
+        with pytest.raises(InputError, match=rf"^{name} must be shares between 0 and 1"):
+            make()
+
+
+def test_updates_are_counted_apart_from_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    smoothed: list[tuple[int, int]] = []
+    updates: list[int] = []
+    looked: list[int] = []
+    add, adam = training.add_total_variation, training.adam_step
+    look = Trainer._look_for_free_space
+    trainer = Trainer(ball(), accumulating(tiny_config(grid=NO_GROWTH), 0.2, 0.5))
+
+    def adding(*arguments: Any) -> None:
+        smoothed.append((trainer._updates, arguments[3]))
+        add(*arguments)
+
+    def updating(*arguments: Any) -> None:
+        updates.append(arguments[3])
+        adam(*arguments)
+
+    def looking(trainer: Trainer) -> None:
+        looked.append(trainer.steps_done)
+        look(trainer)
+
+    monkeypatch.setattr(training, "add_total_variation", adding)
+    monkeypatch.setattr(training, "adam_step", updating)
+    monkeypatch.setattr(Trainer, "_look_for_free_space", looking)
+    trainer.run()
+    # Updates end after 1, 2, 3, 4, 6, 8, 10, 14, 18 and 20 steps.
+    assert updates == list(range(1, 11))
+    assert smoothed == [(0, 1), (3, 1), (6, 2), (9, 2)]  # every third
+    assert looked == [0, 6]  # before every fifth
+
+
 def test_an_update_adds_up_the_gradients_of_its_steps(
     monkeypatch: pytest.MonkeyPatch, on_cpu: None
 ) -> None:
@@ -137,7 +180,7 @@ def test_an_update_adds_up_the_gradients_of_its_steps(
 
     monkeypatch.setattr(training, "adam_step", no_update)  # so both see one grid
     optim = OptimConfig(tv_density=0.0, tv_rgb=0.0, accumulate_at=())
-    config = tiny_config(steps=5, grid=GridConfig(voxels=6000, grow_at=()), optim=optim)
+    config = tiny_config(steps=5, grid=NO_GROWTH, optim=optim)
     train(ball(), config)
     single = taken[:]
     taken.clear()
@@ -228,6 +271,7 @@ def test_checkpoints_come_when_due_and_at_the_end() -> None:
         ({"scaling": "none"}, "scaling"),
         ({"grid": GridConfig(voxels=6000, grow_at=(0.301,), alpha_init=0.1)}, "grid.grow_at"),
         ({"optim": OptimConfig(decay=0.5)}, "optim.decay"),
+        ({"optim": replace(tiny_config().optim, accumulate_at=(0.5,))}, "optim.accumulate_at"),
     ],
 )
 def test_another_configuration_is_refused_by_name(

@@ -1,4 +1,4 @@
-"""Fields, and whole trainings between two steps, in files. No pickle.
+"""Fields, and whole trainings between two updates, in files. No pickle.
 
 A file is safetensors, written whole or not at all. Its metadata hold a header in JSON (format
 version, how to render, and for a training its configuration and progress) and the SHA-256 over

@@ -68,7 +68,7 @@ def train_command(
         output: Folder for the configuration, the field, the log, the figures and the pictures.
         resume: Go on with the run in this folder, as it was begun; scene only if it has moved.
         preset: Starting point, by default fast; the options below replace its values.
-        steps: Optimiser steps.
+        steps: Batches of rays to train on.
         time_limit: Seconds of training; the schedule is squeezed to fit.
         scaling: How a sample's gradient depends on its distance from the camera.
         content_distance: Where gradients reach full strength, in the scene's units.

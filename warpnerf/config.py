@@ -101,9 +101,9 @@ class OptimConfig:
     """Adam, its schedule, and regularisation."""
 
     learning_rate_density: float = 0.5
-    """Step size of raw densities at the start."""
+    """How far an update moves raw densities, about, at the start."""
     learning_rate_rgb: float = 0.2
-    """Step size of raw colours at the start."""
+    """How far an update moves raw colours, about, at the start."""
     decay: float = 0.1
     """What is left of the learning rates at the end of training."""
     beta1: float = 0.9
@@ -111,7 +111,8 @@ class OptimConfig:
     beta2: float = 0.99
     """Decay of the second moment."""
     epsilon: float = 1e-8
-    """Added to the root of the second moment; gradients are of the mean over a batch's rays."""
+    """Added to the root of the second moment; gradients are of the mean over a batch's rays,
+    added up over an update's steps."""
     tv_density: float = 3e-9
     """Weight of the total variation of raw densities, per pair of neighbouring nodes of the final
     grid; of coarser ones as much more as the face between two nodes is larger."""
@@ -120,8 +121,8 @@ class OptimConfig:
     tv_every: int = 8
     """Updates from one total-variation gradient to the next, which counts that many times."""
     accumulate_at: tuple[float, ...] = (0.5, 0.7)
-    """Shares of the training at which the number of steps doubles whose gradients are added up for
-    one update of the grid; before the first share it is one."""
+    """Shares of the training. Before the first, an update of the grid follows each step; from each
+    on, twice as many steps, whose gradients are added up."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot be optimised with."""

@@ -15,7 +15,7 @@ from warpnerf.parallel import NODES, Workers
 
 
 def no_moments(grid: VoxelGrid, workers: Workers) -> wp.array:
-    """Adam's running moments of a grid's gradient before the first step.
+    """Adam's running moments of a grid's gradient before the first update.
 
     Returns:
         [n_nodes] of 16 bytes: per channel the mean and the mean square; see warpnerf_kernels.adam.
@@ -91,8 +91,8 @@ def add_total_variation(
 ) -> None:
     """Add the gradient of the grid's total variation at the nodes that have one already.
 
-    Gradients of several steps, added up, are larger, and so is what is added to them: as much as
-    their noise, by which Adam divides both.
+    What is added to the gradients of several steps grows with the root of their number: as their
+    noise does at nodes that every step touches, by which Adam divides both.
 
     Args:
         grid: The grid.

@@ -213,7 +213,7 @@ class TrainingPass:
         self.n_samples = wp.zeros(n_rays, dtype=wp.int32, device=device)
         """[n_rays] visited steps of the last batch."""
         self.gradients = Gradients.zeros(grid.size, workers)
-        """What batches have added up to since the last optimiser step."""
+        """What batches have added up to since the last update."""
 
     def run(self, grid: VoxelGrid, free: FreeCells, steps: Steps, batch: RayBatch) -> None:
         """Add a batch's gradient to ``gradients``."""

@@ -61,7 +61,7 @@ class TrainingState:
     progress: Progress
     """Where it stands: steps done, seconds, loss."""
     field: Field
-    """Grid and free space; live arrays if it comes from a trainer, which its next step changes."""
+    """Grid and free space; live arrays if from a trainer, which its next update changes."""
     moments: wp.array
     """Adam's, [n_nodes] as ``warpnerf_kernels.adam`` packs them; likewise."""
 

@@ -24,7 +24,7 @@ def raise_when_asked() -> None:
 
 
 class StopRequest:
-    """Within it, the first signal is only noted, so that a step can be finished and saved."""
+    """Within it, the first signal is only noted, so that an update can be finished and saved."""
 
     def __enter__(self) -> StopRequest:
         """Take the signals over."""

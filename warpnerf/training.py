@@ -28,7 +28,7 @@ FAR_BOXES = 64.0
 """How far an unbounded scene is sampled, in half edges of its box; beyond lies the background."""
 
 REPORT_EVERY = 25
-"""Steps between two reports."""
+"""Steps between two reports, which come after an update."""
 
 FIRST_LOOK = 200
 """Steps before the first look for free space and the first growth: what is left out then stays out,
@@ -67,7 +67,7 @@ def train(
             the preset "fast".
         on_progress: Called every ``REPORT_EVERY`` steps and at the end.
         on_checkpoint: Called every ``config.checkpoint_every`` seconds and at the end with what
-            ``save_checkpoint`` takes, whose arrays the next step changes.
+            ``save_checkpoint`` takes, whose arrays the next update changes.
         resume: Where to go on, from ``load_checkpoint``. On the CPU and with the same number of
             threads, the result is that of a training that was never interrupted, bit for bit.
 
@@ -89,12 +89,12 @@ def train(
 
 
 class Trainer:
-    """A training run between two steps: the grid, its optimiser, and what comes next."""
+    """A training run between two updates: the grid, its optimiser, and what comes next."""
 
     def __init__(
         self, scene: Scene, config: TrainConfig, resume: TrainingState | None = None
     ) -> None:
-        """Set up the first step, or the next one of a training to be resumed.
+        """Set up the first update, or the next one of a training to be resumed.
 
         Raises:
             InputError: The device is missing, the grid would not fit the memory, or scene or
@@ -150,7 +150,7 @@ class Trainer:
         on_checkpoint: Callable[[TrainingState], None] | None = None,
         stop: Callable[[], bool] = lambda: False,
     ) -> Progress:
-        """Step until the training is done, or ``stop`` says so; callbacks are those of ``train``.
+        """Update until the training is done, or ``stop`` says so; callbacks are those of ``train``.
 
         Raises:
             FloatingPointError: The loss, or a value in the grid, is no longer a finite number.
@@ -198,10 +198,9 @@ class Trainer:
             self._look_for_free_space()
         before, march = self.steps_done, self.march_steps()
         n_steps = min(self._steps_an_update(fraction), config.steps - before)
-        for _ in range(n_steps):
-            batch = self._sampler.draw(self.steps_done)
+        for step in range(before, before + n_steps):
+            batch = self._sampler.draw(step)
             self._pass.run(self.grid, self.free, march, batch)
-            self.steps_done += 1
         if self._updates % config.optim.tv_every == 0:
             add_total_variation(
                 self.grid,
@@ -211,6 +210,7 @@ class Trainer:
                 config.optim,
                 self.workers,
             )
+        self.steps_done += n_steps
         self._updates += 1
         adam_step(
             self.grid,
@@ -222,7 +222,7 @@ class Trainer:
             self.workers,
         )
         self._report_due = self.steps_done // REPORT_EVERY > before // REPORT_EVERY
-        if self._started is None:  # nor is the first step, in which memory is first touched
+        if self._started is None:  # nor is the first update, in which memory is first touched
             self._started = time.perf_counter() - self._seconds
         self._seconds = time.perf_counter() - self._started
 
@@ -250,7 +250,7 @@ class Trainer:
         return self._progress
 
     def state(self) -> TrainingState:
-        """All that it takes to go on. Its arrays are the trainer's own: the next step changes them.
+        """All that it takes to go on, in the trainer's own arrays, which the next update changes.
 
         Raises:
             FloatingPointError: The loss, or a value in the grid, is not finite: nothing to go on
