@@ -94,7 +94,7 @@ class WarpAdjoint:
     def train(self, scaling: Scaling) -> Call:
         """The fused launch."""
         training_pass = self._passes[scaling]
-        return lambda: training_pass.run(self._grid, self._free, self._steps, self._batch)
+        return lambda: training_pass.run(self._free, self._batch)
 
     def backward(self, scaling: Scaling) -> Call:
         """The adjoint launch."""

@@ -1,4 +1,4 @@
-"""The optimiser step against the oracle, and how it keeps moments in 16 bits."""
+"""The update of the grid against the oracle, and how it keeps moments in 16 bits."""
 
 from typing import Any
 

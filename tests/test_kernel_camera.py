@@ -121,6 +121,7 @@ def draw(
         wp.array(np.concatenate(pixels).astype(np.uint8), dtype=wp.vec4ub, device=kernels.device),
         kernels.array([2.0, 3.0, 5.0]),
         seed,
+        0,
         vec3(*background),
         mode,
         jitter,

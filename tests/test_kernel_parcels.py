@@ -17,6 +17,7 @@ from warpnerf_kernels import parcels
 from warpnerf_kernels.tiles import TILE
 
 from warpnerf import adjoint
+from warpnerf.parallel import Packed
 from warpnerf.render import Steps
 
 PLANES = 5
@@ -279,9 +280,9 @@ def test_workers_add_to_no_planes_but_their_own(monkeypatch: pytest.MonkeyPatch)
     def deliver_in_turns(kernels: Kernels) -> None:
         launch = kernels.workers.launch
 
-        def spy(kernel: wp.Kernel, n: int, *arguments: Any) -> None:
+        def spy(kernel: wp.Kernel, n: int, *arguments: Any, packed: Packed) -> None:
             if kernel is not parcels.deliver_parcels:
-                return launch(kernel, n, *arguments)
+                return launch(kernel, n, *arguments, packed=packed)
             size, sent = arguments
             planes = -(-PLANES // n)
             for worker in range(n):
@@ -291,7 +292,7 @@ def test_workers_add_to_no_planes_but_their_own(monkeypatch: pytest.MonkeyPatch)
                 changed = np.flatnonzero(changed.reshape(whole.shape).any((1, 2, 3)))
                 assert len(changed) and (changed // planes == worker).all()
                 seen.append(worker)
-            launch(kernel, n, size, sent)  # there is nothing left
+            launch(kernel, n, size, sent, packed=packed)  # there is nothing left
 
         monkeypatch.setattr(kernels.workers, "launch", spy)
 
@@ -310,9 +311,9 @@ def test_what_a_worker_adds_at_once_is_its_own(monkeypatch: pytest.MonkeyPatch) 
     launch, make_parcels = kernels.workers.launch_owned, adjoint._make_parcels
     planes: list[list[int]] = []
 
-    def by_owner(kernel: wp.Kernel, items: Any, *arguments: Any) -> None:
+    def by_owner(kernel: wp.Kernel, items: Any, *arguments: Any, **packed: Packed) -> None:
         if "backward" not in kernel.key:
-            return launch(kernel, items, *arguments)
+            return launch(kernel, items, *arguments, **packed)
         wp.launch(kernel, items[-1], inputs=[0, len(planes), *arguments], device="cpu")
         found = arguments[-1].gradient.values.numpy().reshape(whole.shape)
         planes.append(np.flatnonzero(found.any((1, 2, 3))).tolist())

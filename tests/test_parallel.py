@@ -9,7 +9,7 @@ import warp as wp
 from drive import Kernels, make_problem
 
 from warpnerf.checks import InputError
-from warpnerf.parallel import NODES, RAYS, Workers
+from warpnerf.parallel import NODES, RAYS, Packed, Workers
 
 
 @wp.kernel(enable_backward=False)
@@ -21,6 +21,18 @@ def count_visits(first: int, visits: wp.array(dtype=wp.int32)):
 @wp.kernel(enable_backward=False)
 def note_worker(first: int, worker: int, workers: wp.array(dtype=wp.int32)):
     workers[first + wp.tid()] = worker
+
+
+@wp.struct
+class Line:
+    slope: float
+    start: wp.array(dtype=float)
+
+
+@wp.kernel(enable_backward=False)
+def draw_line(first: int, line: Line, factor: float, out: wp.array(dtype=float)):
+    i = first + wp.tid()
+    out[i] = factor * (line.start[0] + line.slope * float(i))
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3, 5])
@@ -43,6 +55,46 @@ def test_workers_own_contiguous_shares(on_cpu: None) -> None:
     owner.fill_(7)
     workers.launch_owned(note_worker, [20, 25, 25, 90], owner)
     assert np.array_equal(owner.numpy(), np.repeat([7, 0, 2, 7], [20, 5, 65, 10]))
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_what_is_packed_follows_what_changes(threads: int, device: str) -> None:
+    workers, packed = Workers(device, threads), Packed()
+
+    def array(*values: float) -> wp.array:
+        return wp.array(values, dtype=float, device=workers.device)
+
+    line, out = Line(), array(*[0.0] * 50)
+    line.slope, line.start = 2.0, array(3.0)
+    for n, factor, slope, start, to in (
+        (50, 1.0, 2.0, line.start, out),
+        (50, 1.0, 2.0, line.start, out),
+        (50, 4.0, 2.0, line.start, out),  # another number
+        (7, 4.0, 2.0, line.start, out),  # fewer items
+        (50, 4.0, -1.0, line.start, out),  # a field of the struct
+        (50, 4.0, -1.0, array(5.0), out),  # and one that is an array
+        (20, 4.0, -1.0, line.start, array(*[0.0] * 50)),  # another array
+    ):
+        line.slope, line.start = slope, start
+        to.fill_(-100.0)
+        workers.launch(draw_line, n, line, factor, to, chunk=6, packed=packed)
+        expected = factor * (start.numpy()[0] + slope * np.arange(n))
+        np.testing.assert_array_equal(to.numpy(), [*expected, *[-100.0] * (50 - n)])
+
+
+def test_what_stays_the_same_is_packed_once(monkeypatch: pytest.MonkeyPatch, on_cpu: None) -> None:
+    workers, packed = Workers("cpu", 2), Packed()
+    visits = wp.zeros(10, dtype=wp.int32, device="cpu")
+    owner = wp.zeros(10, dtype=wp.int32, device="cpu")
+    kept = Packed()
+    workers.launch(count_visits, 10, visits, packed=packed)
+    workers.launch_owned(note_worker, 10, owner, packed=kept)
+    monkeypatch.setattr(wp, "launch", None)
+    for _ in range(3):
+        workers.launch(count_visits, 10, visits, packed=packed)
+    workers.launch_owned(note_worker, [0, 2, 10], owner, packed=kept)
+    assert (visits.numpy() == 4).all()
+    assert np.array_equal(owner.numpy(), np.repeat([0, 1], [2, 8]))
 
 
 def test_cuda_gets_one_worker_and_the_cpu_its_cores(device: str) -> None:

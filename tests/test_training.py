@@ -139,6 +139,12 @@ def test_shares_that_are_none_are_refused(shares: tuple[float, ...]) -> None:
             make()
 
 
+def test_updates_of_very_many_steps_are_refused() -> None:
+    OptimConfig(accumulate_at=(0.5,) * 8)
+    with pytest.raises(InputError, match=r"^optim\.accumulate_at must hold at most 8.*, not 9:"):
+        OptimConfig(accumulate_at=(0.5,) * 9)
+
+
 def test_updates_are_counted_apart_from_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     smoothed: list[tuple[int, int]] = []
     updates: list[int] = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ import warp as wp
 from warpnerf_kernels import parcels, render, tiles, types
 from warpnerf_kernels.types import vec4
 
-from warpnerf.parallel import Workers
+from warpnerf.parallel import Packed, Workers
 
 SAMPLES = 1 << 21
 """Samples whose gradients may be in parcels at a time, of all workers together: room for 67 MB with
@@ -90,8 +91,9 @@ class AdjointLaunch:
         """
         self._kernel = kernel
         self._contraction = variant.contraction
-        self._size = size
+        self._size = wp.vec3i(*size)
         self._workers = workers
+        self._packed, self._packed_measure, self._packed_delivery = Packed(), Packed(), Packed()
         self.parcels: parcels.Parcels | None = None
         """What the workers leave for each other; None: kernels are plain."""
         if variant.packed:
@@ -124,16 +126,24 @@ class AdjointLaunch:
         self.parcels.gradient = gradient
         self.parcels.order = self._order
         if self._workers.count == 1:
-            self._workers.launch_owned(self._kernel, n_rays, *arguments, self.parcels)
+            self._workers.launch_owned(
+                self._kernel, n_rays, *arguments, self.parcels, packed=self._packed
+            )
             return
         self._measure(n_rays, arguments)
         for begin, end in self._turns(n_rays):
             bounds = self._share_out(begin, end)
             self.parcels.used.zero_()
             self.parcels.end.zero_()  # in case that the last turn was interrupted
-            self._workers.launch_owned(self._kernel, bounds, *arguments, self.parcels)
-            size = wp.vec3i(*self._size)
-            self._workers.launch(parcels.deliver_parcels, self._workers.count, size, self.parcels)
+            self._workers.launch_owned(
+                self._kernel, bounds, *arguments, self.parcels, packed=self._packed
+            )
+            self._workers.launch(
+                parcels.deliver_parcels,
+                self._workers.count,
+                *(self._size, self.parcels),
+                packed=self._packed_delivery,
+            )
 
     def _measure(self, n_rays: int, arguments: tuple[Any, ...]) -> None:
         """Find how much work each ray is, and where its middle lies."""
@@ -142,6 +152,7 @@ class AdjointLaunch:
             parcels.measure_rays_kernel(self._contraction),
             n_rays,
             *(grid, march, origins, directions, self._work, self._middles),
+            packed=self._packed_measure,
         )
 
     def _turns(self, n_rays: int) -> Iterator[tuple[int, int]]:
@@ -164,13 +175,13 @@ class AdjointLaunch:
         """
         count = self._workers.count
         along_x = np.argsort(self._middles.numpy()[begin:end], kind="stable")
-        until = np.cumsum(self._work.numpy()[begin:end][along_x], dtype=np.int64)
-        before = np.concatenate(([0], until[:-1]))
-        worker = (before * count // until[-1]).astype(np.uint16)
-        of_ray = np.empty_like(worker)
-        of_ray[along_x] = worker
-        self._order.numpy()[begin:end] = begin + np.argsort(of_ray, kind="stable")
-        return (begin + np.searchsorted(worker, np.arange(count + 1))).tolist()
+        work = self._work.numpy()[begin:end][along_x]
+        until = np.cumsum(work, dtype=np.int64)
+        bounds = np.searchsorted(count * (until - work), until[-1] * np.arange(count + 1))
+        order = self._order.numpy()[begin:end]
+        for first, last in itertools.pairwise(bounds):
+            order[first:last] = begin + np.sort(along_x[first:last])
+        return (begin + bounds).tolist()
 
 
 def _make_parcels(n_samples: int, n_workers: int) -> parcels.Parcels:

@@ -111,7 +111,7 @@ class OptimConfig:
     beta2: float = 0.99
     """Decay of the second moment."""
     epsilon: float = 1e-8
-    """Added to the root of the second moment; gradients are of the mean over a batch's rays,
+    """Added to the root of the second moment; gradients are of the mean over a step's rays,
     added up over an update's steps."""
     tv_density: float = 3e-9
     """Weight of the total variation of raw densities, per pair of neighbouring nodes of the final
@@ -122,7 +122,7 @@ class OptimConfig:
     """Updates from one total-variation gradient to the next, which counts that many times."""
     accumulate_at: tuple[float, ...] = (0.5, 0.7)
     """Shares of the training. Before the first, an update of the grid follows each step; from each
-    on, twice as many steps, whose gradients are added up."""
+    on, twice as many steps, whose rays are put through together and whose losses are added up."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot be optimised with."""
@@ -134,6 +134,11 @@ class OptimConfig:
         require_at_least("optim.tv_rgb", self.tv_rgb, 0.0)
         require_whole("optim.tv_every", self.tv_every, 1)
         require_shares("optim.accumulate_at", self.accumulate_at)
+        if len(self.accumulate_at) > 8:
+            raise InputError(
+                f"optim.accumulate_at must hold at most 8 shares, not {len(self.accumulate_at)}: "
+                "with 8, an update takes 256 steps."
+            )
         for name in ("beta1", "beta2"):
             if not 0 <= getattr(self, name) < 1:
                 raise InputError(f"optim.{name} must lie in [0, 1), not {getattr(self, name)}.")

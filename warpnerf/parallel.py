@@ -23,6 +23,35 @@ RAYS = 1 << 13
 signals such as Ctrl-C wait for a launch to end."""
 
 
+class Packed:
+    """What a kernel was launched with, in the form that it takes: kept for its next launch.
+
+    Packing arguments takes several times as long as a launch does, and the threads one after the
+    other. Packed anew is what is another object than last time, so what may change in place are
+    the contents of arrays and the fields of structs.
+    """
+
+    def __init__(self) -> None:
+        """Nothing is kept yet."""
+        self._commands: dict[int, tuple[wp.Launch, list[Any]]] = {}
+
+    def launch(
+        self, worker: int, kernel: wp.Kernel, n: int, arguments: list[Any], device: wp.Device
+    ) -> None:
+        """Launch the kernel, always the same, for one of the workers, on the CPU."""
+        if worker not in self._commands:
+            command = wp.launch(kernel, n, inputs=arguments, device=device, record_cmd=True)
+            self._commands[worker] = command, [*arguments, n]
+        command, last = self._commands[worker]
+        for index, argument in enumerate(arguments):
+            if argument is not last[index]:
+                command.set_param_at_index(index, argument)
+        if n != last[-1]:
+            command.set_dim(n)
+        last[:] = *arguments, n
+        command.launch()
+
+
 class Workers:
     """The threads that launch kernels on one device. A CUDA device needs, and gets, just one."""
 
@@ -53,7 +82,14 @@ class Workers:
         self._pool = ThreadPoolExecutor(self.count - 1) if self.count > 1 else None
         self._loaded: set[Any] = set()
 
-    def launch(self, kernel: wp.Kernel, n: int, *arguments: Any, chunk: int = NODES) -> None:
+    def launch(
+        self,
+        kernel: wp.Kernel,
+        n: int,
+        *arguments: Any,
+        chunk: int = NODES,
+        packed: Packed | None = None,
+    ) -> None:
         """Run kernel(first, *arguments) over items 0..n-1, shared out over the workers.
 
         Args:
@@ -61,10 +97,17 @@ class Workers:
             n: Number of items.
             arguments: The rest of the kernel's arguments.
             chunk: Items per launch, NODES or RAYS.
+            packed: Of this kernel's launches before, and for those to come.
         """
-        self._launch(kernel, self._alike(n), lambda worker: arguments, chunk)
+        self._launch(kernel, self._alike(n), lambda worker: arguments, chunk, packed)
 
-    def launch_owned(self, kernel: wp.Kernel, items: int | Sequence[int], *arguments: Any) -> None:
+    def launch_owned(
+        self,
+        kernel: wp.Kernel,
+        items: int | Sequence[int],
+        *arguments: Any,
+        packed: Packed | None = None,
+    ) -> None:
         """Run kernel(first, worker, *arguments) over items of much work each.
 
         It writes to what a worker owns.
@@ -74,9 +117,10 @@ class Workers:
             items: How many there are, shared out alike; or [workers + 1] where the first worker's
                 begin, the second's, ..., and where the last one's end.
             arguments: The rest of the kernel's arguments.
+            packed: As for ``launch``.
         """
         bounds = items if isinstance(items, Sequence) else self._alike(items)
-        self._launch(kernel, bounds, lambda worker: (worker, *arguments), RAYS)
+        self._launch(kernel, bounds, lambda worker: (worker, *arguments), RAYS, packed)
 
     def load(self, kernel: wp.Kernel) -> None:
         """Compile a kernel, or fetch it from the cache, once: else every thread would."""
@@ -93,6 +137,7 @@ class Workers:
         bounds: Sequence[int],
         arguments: Callable[[int], tuple[Any, ...]],
         chunk: int,
+        packed: Packed | None,
     ) -> None:
         if bounds[0] == bounds[-1]:
             return
@@ -105,8 +150,11 @@ class Workers:
         def share(worker: int) -> None:
             until = bounds[worker + 1]
             for first in range(bounds[worker], until, chunk):
-                inputs = [first, *arguments(worker)]
-                wp.launch(kernel, min(chunk, until - first), inputs=inputs, device=self.device)
+                n, inputs = min(chunk, until - first), [first, *arguments(worker)]
+                if packed is not None:
+                    packed.launch(worker, kernel, n, inputs, self.device)
+                else:
+                    wp.launch(kernel, n, inputs=inputs, device=self.device)
 
         others = [self._pool.submit(share, w) for w in range(1, self.count)] if self._pool else []
         try:

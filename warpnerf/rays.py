@@ -12,7 +12,7 @@ from warpnerf_kernels.types import mat33, real, vec2, vec3
 
 from warpnerf.camera import Camera
 from warpnerf.checks import InputError
-from warpnerf.parallel import Workers
+from warpnerf.parallel import Packed, Workers
 from warpnerf.scene import View
 
 
@@ -85,13 +85,14 @@ class PixelSampler:
             views: What to draw from.
             content_distance: Of every ray, scene units.
             background: rgb in [0, 1]; None: a random colour for each ray.
-            n_rays: Rays in a batch.
+            n_rays: Rays in the batch of one step.
             jitter: Whether samples are shifted by a random part of a step.
-            seed: Of all that is random here.
+            seed: Of all that is random here; what is drawn repeats after 2^32 rays.
             workers: Where to work.
         """
         self._workers = workers
-        self._seed = seed
+        self._n_rays = n_rays
+        self._seed = int(np.random.SeedSequence(seed).generate_state(1)[0] >> 1)
         self._random_background = background is None
         self._background = vec3(*(background or (0.0, 0.0, 0.0)))
         self._jitter = jitter
@@ -114,32 +115,34 @@ class PixelSampler:
             pixels[first:end, :channels] = view.image.reshape(-1, channels)
         self._pixels = wp.array(pixels, dtype=wp.vec4ub, device=workers.device)
 
-        def empty(dtype: type, n: int = n_rays) -> wp.array:
-            return wp.empty(n, dtype=dtype, device=workers.device)
-
         self._content_distances = wp.full(
             len(views), content_distance, dtype=real, device=workers.device
         )
-        self._batch = RayBatch(
-            origins=empty(vec3),
-            directions=empty(vec3),
-            offsets=empty(real),
-            background=empty(vec3),
-            content_distance=empty(real),
-            target_rgb=empty(vec3),
-        )
+        self._batch = _room(n_rays, workers)
+        self._packed = Packed()
 
-    def draw(self, step: int) -> RayBatch:
-        """The batch of a step, a function of it and the seed: the same arrays, filled anew."""
+    def draw(self, step: int, n_steps: int = 1) -> RayBatch:
+        """The batches of some steps as one, each a function of its step and the seed.
+
+        Args:
+            step: The first.
+            n_steps: How many.
+
+        Returns:
+            n_steps times as many rays as a step has, in the same arrays from one call to the next
+            as long as there are as many.
+        """
+        if self._batch.count != n_steps * self._n_rays:
+            self._batch = _room(n_steps * self._n_rays, self._workers)
         batch = self._batch
-        seed = int(np.random.SeedSequence((self._seed, step)).generate_state(1)[0] >> 1)
         self._workers.launch(
             kernels.sample_pixels,
             batch.count,
             self._views,
             self._pixels,
             self._content_distances,
-            seed,
+            self._seed,
+            (step * self._n_rays) % 2**32,
             self._background,
             int(self._random_background),
             int(self._jitter),
@@ -149,5 +152,22 @@ class PixelSampler:
             batch.background,
             batch.content_distance,
             batch.target_rgb,
+            packed=self._packed,
         )
         return batch
+
+
+def _room(n_rays: int, workers: Workers) -> RayBatch:
+    """Arrays for that many rays, not filled yet."""
+
+    def empty(dtype: type) -> wp.array:
+        return wp.empty(n_rays, dtype=dtype, device=workers.device)
+
+    return RayBatch(
+        origins=empty(vec3),
+        directions=empty(vec3),
+        offsets=empty(real),
+        background=empty(vec3),
+        content_distance=empty(real),
+        target_rgb=empty(vec3),
+    )

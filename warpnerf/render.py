@@ -190,7 +190,7 @@ class TrainingPass:
         jacobian: Jacobian,
         workers: Workers,
     ) -> None:
-        """Allocate what batches of n_rays through such a grid need, by such steps."""
+        """Allocate what batches of up to n_rays through a grid need, by such steps."""
         device = workers.device
         variant = kernels.Variant(
             CONTRACTIONS[grid.contraction],
@@ -208,28 +208,43 @@ class TrainingPass:
         )
         """How batches are put through."""
         self._capacity, self._kept = scratch(kernels, variant, KEPT_PACKS, workers)
+        self._grid = grid.struct()
+        self._border = grid.border
+        self._steps = steps.struct()
+        self._free: tuple[FreeCells, Any] | None = None  # of the last batch, with its struct
+        self.n_rays = n_rays
+        """Rays of the last batch."""
         self.error = wp.zeros(n_rays, dtype=real, device=device)
-        """[n_rays] squared error of the last batch."""
+        """Squared error of each of these, then room."""
         self.n_samples = wp.zeros(n_rays, dtype=wp.int32, device=device)
-        """[n_rays] visited steps of the last batch."""
+        """Visited steps of each of these, then room."""
         self.gradients = Gradients.zeros(grid.size, workers)
         """What batches have added up to since the last update."""
 
-    def run(self, grid: VoxelGrid, free: FreeCells, steps: Steps, batch: RayBatch) -> None:
-        """Add a batch's gradient to ``gradients``."""
+    def run(self, free: FreeCells, batch: RayBatch, n_batches: int = 1) -> None:
+        """Add a batch's gradient to ``gradients``, or that of several put together.
+
+        Args:
+            free: What of the grid is skipped.
+            batch: The rays.
+            n_batches: How many batches they are; the losses of these are added up.
+        """
+        self.n_rays = batch.count
+        if self._free is None or self._free[0] is not free:  # filling structs takes a while
+            self._free = free, free.struct(self._border)
         self.launch.run(
             batch.count,
             self.gradients.struct(),
-            grid.struct(),
-            free.struct(grid.border),
-            steps.struct(),
+            self._grid,
+            self._free[1],
+            self._steps,
             batch.origins,
             batch.directions,
             batch.offsets,
             batch.background,
             batch.content_distance,
             batch.target_rgb,
-            1.0 / batch.count,
+            n_batches / batch.count,
             self._capacity,
             self._kept,
             self.error,

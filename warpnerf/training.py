@@ -184,7 +184,7 @@ class Trainer:
         return self._report_due or self.fraction >= 1.0
 
     def update(self) -> None:
-        """Draw batches, add up their gradients, and update the grid by these.
+        """Draw the batches of some steps, and update the grid by the gradients of their losses.
 
         When due, the grid grows and free space is looked for before.
         """
@@ -196,11 +196,10 @@ class Trainer:
         self._grow(fraction)
         if self._updates % config.occupancy_every == 0:
             self._look_for_free_space()
-        before, march = self.steps_done, self.march_steps()
+        before = self.steps_done
         n_steps = min(self._steps_an_update(fraction), config.steps - before)
-        for step in range(before, before + n_steps):
-            batch = self._sampler.draw(step)
-            self._pass.run(self.grid, self.free, march, batch)
+        batch = self._sampler.draw(before, n_steps)
+        self._pass.run(self.free, batch, n_steps)
         if self._updates % config.optim.tv_every == 0:
             add_total_variation(
                 self.grid,
@@ -234,7 +233,8 @@ class Trainer:
         """
         if self._progress is not None and self._progress.step == self.steps_done:
             return self._progress
-        loss = float(self._pass.error.numpy().mean())
+        n_rays = self._pass.n_rays
+        loss = float(self._pass.error.numpy()[:n_rays].mean())
         if not math.isfinite(loss):
             raise self._not_finite("the loss is")
         self._progress = Progress(
@@ -243,7 +243,7 @@ class Trainer:
             seconds=self._seconds,
             loss=loss,
             psnr=-10.0 * math.log10(max(loss / 3.0, 1e-12)),
-            samples_per_ray=float(self._pass.n_samples.numpy().mean()),
+            samples_per_ray=float(self._pass.n_samples.numpy()[:n_rays].mean()),
             size=self.grid.size,
             occupied=self._occupied,
         )
@@ -351,12 +351,12 @@ class Trainer:
         return max(8, self.config.grid.voxels >> left)
 
     def _steps_an_update(self, fraction: float) -> int:
-        """Steps whose gradients are added up for one, after that share of the training."""
+        """Steps whose losses are added up for one, after that share of the training."""
         return 1 << sum(fraction >= at for at in self.config.optim.accumulate_at)
 
     def _training_pass(self) -> TrainingPass:
         return TrainingPass(
-            self.config.rays_per_step,
+            self.config.rays_per_step << len(self.config.optim.accumulate_at),
             self.grid,
             self.march_steps(),
             self.config.scaling,

@@ -58,7 +58,7 @@ class WarpStep:
         n = -(-gradients.values.shape[0] // span)
         self._workers.launch(clear, n, span, gradients.struct())
         gradients.touched.zero_()
-        self._pass.run(self._grid, self._free, self._steps, self._batch)
+        self._pass.run(self._free, self._batch)
 
     def gradient(self) -> np.ndarray:
         """[X, Y, Z, 4]"""

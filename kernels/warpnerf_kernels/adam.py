@@ -1,11 +1,11 @@
-"""The optimiser step. Kingma & Ba 2015, algorithm 1; entries without a gradient are left alone.
+"""The update of the grid. Kingma & Ba 2015, algorithm 1; entries without a gradient are left alone.
 
-The step waits for memory, so both moments of an entry share 32 bits: in the upper 16 the mean as a
+It waits for memory, so both moments of an entry share 32 bits: in the upper 16 the mean as a
 bfloat16 (sign, 8 bits of exponent, 7 of fraction), in the lower 16 the square, which has no sign (8
 and 8). What does not fit is rounded up or down at random, with odds that keep the average right:
 rounded to the nearest, an average that moves by less than half of its last bit would stand still.
 
-On the CPU a node's four channels are worked on at once, in Clang's vector types. float32 only.
+On the CPU all channels of a tile are worked on at once, in Clang's vector types. float32 only.
 """
 
 import warp as wp
@@ -19,17 +19,16 @@ wp.set_module_options({"enable_backward": False})
 uint4 = wp.types.vector(4, wp.uint32)
 """The moments of a node, a channel in each."""
 
+
 WORDS = r"""
 #if defined(__CUDA_ARCH__)
 constexpr int AT_ONCE = 1;
 typedef float number;
 typedef unsigned bits;
-auto root = [](number x) -> number { return sqrtf(x); };
 #else
-constexpr int AT_ONCE = 4;
-typedef float number __attribute__((ext_vector_type(4), aligned(4), may_alias));
-typedef unsigned bits __attribute__((ext_vector_type(4), aligned(4), may_alias));
-auto root = [](number x) -> number { return __builtin_elementwise_sqrt(x); };
+constexpr int AT_ONCE = CHANNELS;
+typedef float number __attribute__((ext_vector_type(AT_ONCE), aligned(4), may_alias));
+typedef unsigned bits __attribute__((ext_vector_type(AT_ONCE), aligned(4), may_alias));
 #endif
 auto as_bits = [](number x) -> bits { bits y; memcpy(&y, &x, sizeof(y)); return y; };
 auto as_number = [](bits x) -> number { number y; memcpy(&y, &x, sizeof(y)); return y; };
@@ -41,34 +40,56 @@ auto join = [&](number mean, number square, bits noise) -> bits {
         ((as_bits(square) + (noise & 0x7fffu)) >> 15);
 };
 """
-"""What the native functions begin with; they work on AT_ONCE channels at once."""
+"""What the native functions begin with; on the CPU they work on so many CHANNELS at once."""
 
 
 @wp.func_native(
-    WORDS
+    f"constexpr int CHANNELS = {4 * TILE};"
+    + WORDS
     + r"""
+#if defined(__CUDA_ARCH__)
+auto root = [](number x) -> number { return sqrtf(x); };
+auto is_zero = [](number x) -> bool { return x == 0.0f; };
+#else
+auto root = [](number x) -> number { return __builtin_elementwise_sqrt(x); };
+auto is_zero = [&](number x) -> bool { return __builtin_reduce_or(as_bits(x)) == 0; };
+#endif
 static_assert(sizeof(values.data->c[0]) == sizeof(float), "moments are cut out of float32");
-for (int c = 0; c < 4; c += AT_ONCE) {
-    number& adj_at = *(number*)&gradient.values.data[node].c[c];
-    number& value_at = *(number*)&values.data[node].c[c];
-    bits& moments_at = *(bits*)&moments.data[node].c[c];
-    const number rate = *(const number*)&learning_rate.c[c];
-    const number g = adj_at, value = value_at;
-    const bits old = moments_at;
+for (int c = 0; c < 4 * count; c += AT_ONCE) {
+    const int n_here = 4 * count - c;  // a tile may be cut short, by the end of the grid
+    auto load = [&](auto* from) {
+        number x{};
+        if (n_here >= AT_ONCE) memcpy(&x, (const float*)(from + node) + c, sizeof(x));
+        else memcpy(&x, (const float*)(from + node) + c, sizeof(float) * n_here);
+        return x;
+    };
+    auto store = [&](auto* to, number x) {
+        if (n_here >= AT_ONCE) memcpy((float*)(to + node) + c, &x, sizeof(x));
+        else memcpy((float*)(to + node) + c, &x, sizeof(float) * n_here);
+    };
+    const number g = load(gradient.values.data);
+    if (is_zero(g)) continue;
+    const number value = load(values.data);
+    const bits old = as_bits(load(moments.data));
+    number rate;
+    for (int n = 0; n < AT_ONCE; ++n) {
+        ((float*)&rate)[n] = learning_rate.c[AT_ONCE == 1 ? c % 4 : n % 4];
+    }
     const number m = beta1 * mean_of(old) + (1.0f - beta1) * g;
     const number v = beta2 * square_of(old) + (1.0f - beta2) * (g * g);
     const number moved = value - rate * (correction1 * m) / (root(correction2 * v) + epsilon);
-    const bits noise = (as_bits(g) + step * 0x9e3779b9u) * 0x9e3779b9u;  // 2^32 / golden ratio
+    const bits noise = (as_bits(g) + update * 0x9e3779b9u) * 0x9e3779b9u;  // 2^32 / golden ratio
     const bits joined = join(m, v, noise);
-    value_at = g != 0.0f ? moved : value;
-    moments_at = g != 0.0f ? joined : old;
-    adj_at = 0.0f;
+    store(values.data, g != 0.0f ? moved : value);
+    store(moments.data, as_number(g != 0.0f ? joined : old));
+    store(gradient.values.data, number{});
 }
 """
 )
-def step_node(
+def update_nodes(
     node: int,
-    step: wp.uint32,
+    count: int,  # up to TILE
+    update: wp.uint32,
     learning_rate: vec4,
     beta1: float,
     beta2: float,
@@ -79,7 +100,10 @@ def step_node(
     values: wp.array(dtype=vec4),
     moments: wp.array(dtype=uint4),
 ):
-    """adam_step for a node. Gradient and step together decide how its moments are rounded."""
+    """adam_step for some nodes, from the given one on.
+
+    Gradient and update together decide how moments are rounded.
+    """
     ...
 
 
@@ -87,18 +111,18 @@ def step_node(
 def adam_step(
     first: int,
     span: int,  # nodes per thread
-    step: wp.uint32,  # counts from 1
+    update: wp.uint32,  # counts from 1
     learning_rate: vec4,  # per channel
     beta1: float,
     beta2: float,
     epsilon: float,
-    correction1: float,  # 1 / (1 - beta1^step)
-    correction2: float,  # 1 / (1 - beta2^step)
+    correction1: float,  # 1 / (1 - beta1^update)
+    correction2: float,  # 1 / (1 - beta2^update)
     gradient: Gradient,  # zeroed
     values: wp.array(dtype=vec4),  # [n_nodes] updated
     moments: wp.array(dtype=uint4),  # [n_nodes] updated
 ):
-    """One step. An entry whose gradient is exactly zero keeps its value and its moments."""
+    """One update. An entry whose gradient is exactly zero keeps its value and its moments."""
     n_nodes = values.shape[0]
     start = (first + wp.tid()) * span
     end = start + wp.min(span, n_nodes - start)  # start + span might be beyond int
@@ -115,26 +139,27 @@ def adam_step(
     tile = next_tile(gradient.touched, tile_of(start), last)
     while tile < last:
         node = tile * wp.static(TILE)
-        for i in range(wp.max(start, node), wp.min(end, node + wp.static(TILE))):
-            if not (gradient.values[i] == vec4()):
-                step_node(
-                    i,
-                    step,
-                    learning_rate,
-                    beta1,
-                    beta2,
-                    epsilon,
-                    correction1,
-                    correction2,
-                    gradient,
-                    values,
-                    moments,
-                )
+        begin = wp.max(start, node)
+        update_nodes(
+            begin,
+            wp.min(end, node + wp.static(TILE)) - begin,
+            update,
+            learning_rate,
+            beta1,
+            beta2,
+            epsilon,
+            correction1,
+            correction2,
+            gradient,
+            values,
+            moments,
+        )
         tile = next_tile(gradient.touched, tile + 1, last)
 
 
 @wp.func_native(
-    WORDS
+    "constexpr int CHANNELS = 4;"
+    + WORDS
     + r"""
 const int stride_y = size.c[2], stride_x = stride_y * size.c[1];
 for (int c = 0; c < 4; c += AT_ONCE) {

@@ -6,11 +6,15 @@
 
 import warp as wp
 
+from .tiles import prefetch
 from .types import mat33, real, vec2, vec3
 
 wp.set_module_options({"enable_backward": False})
 
 RANDOM_BACKGROUND = 1
+
+AHEAD = 8
+"""Rays from the one that a CPU draws to the one whose pixel it asks for."""
 
 
 @wp.struct
@@ -126,10 +130,9 @@ def view_of_pixel(views: wp.array(dtype=View), pixel: int) -> int:
     high = int(views.shape[0])
     while high - low > 1:
         middle = (low + high) // 2
-        if views[middle].first_pixel <= pixel:
-            low = middle
-        else:
-            high = middle
+        before = views[middle].first_pixel <= pixel
+        low = wp.where(before, middle, low)  # a processor cannot foresee which: no branch
+        high = wp.where(before, high, middle)
     return low
 
 
@@ -141,7 +144,8 @@ def sample_pixels(
     pixels: wp.array(dtype=wp.vec4ub),  # all photographs, one after another: rgb, straight alpha
     content_distances: wp.array(dtype=real),  # [n_views] scene units
     # how
-    seed: int,  # of this batch
+    seed: int,  # of the training
+    ray: wp.uint32,  # number of the first ray, counted through the training
     background: vec3,  # rgb in [0, 1]
     background_mode: int,  # RANDOM_BACKGROUND: a colour of its own for each ray
     jitter: int,  # 1: a random offset for each ray, 0: the middle of the step
@@ -155,8 +159,10 @@ def sample_pixels(
 ):
     """A batch of rays through random pixels, all pixels equally likely."""
     i = first + wp.tid()
-    state = wp.rand_init(seed, i)
+    state = wp.rand_init(seed, int(ray + wp.uint32(i)))
     pixel = wp.randi(state, 0, pixels.shape[0])
+    later = wp.rand_init(seed, int(ray + wp.uint32(i + wp.static(AHEAD))))
+    prefetch(pixels, wp.randi(later, 0, pixels.shape[0]))
     v = view_of_pixel(views, pixel)
     view = views[v]
     local = pixel - view.first_pixel

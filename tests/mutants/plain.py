@@ -8,6 +8,7 @@ REGULARIZE = "test_kernel_regularize.py"
 ADAM = "test_kernel_adam.py"
 OCCUPANCY = "test_kernel_occupancy.py"
 CAMERA = "test_kernel_camera.py"
+RAYS = "test_rays.py"
 GRADSCALE = "test_gradscale.py"
 VALUES = "test_kernel_render.py::test_values_and_visited_samples"
 GROWING = f"{VALUES}[linf]"
@@ -225,13 +226,18 @@ MUTANTS = [
            "g != 0.0f ? moved : value", "moved", ADAM),
     Mutant("Adam: zero gradients move moments", "adam.py",
            "g != 0.0f ? joined : old", "joined", ADAM),
-    Mutant("Adam: gradients not zeroed", "adam.py", "    adj_at = 0.0f;\n", "", ADAM),
+    Mutant("Adam: gradients not zeroed", "adam.py",
+           "    store(gradient.values.data, number{});\n", "", ADAM),
+    Mutant("Adam: all channels at the density's rate", "adam.py",
+           "AT_ONCE == 1 ? c % 4 : n % 4", "0", ADAM),
+    Mutant("Adam: a tile cut short is passed over", "adam.py",
+           "else memcpy((float*)(to + node) + c, &x, sizeof(float) * n_here);", "", ADAM),
     Mutant("Adam: rounded to the nearest", "adam.py",
            "join(m, v, noise)", "join(m, v, 0u * noise + 0x80004000u)", ADAM),
     Mutant("Adam: rounded towards zero", "adam.py", "join(m, v, noise)", "join(m, v, 0u * noise)",
            ADAM),
-    Mutant("Adam: each step rounds alike", "adam.py",
-           "(as_bits(g) + step * 0x9e3779b9u)", "as_bits(g)", ADAM),
+    Mutant("Adam: each update rounds alike", "adam.py",
+           "(as_bits(g) + update * 0x9e3779b9u)", "as_bits(g)", ADAM),
     Mutant("Adam: a square rounded up by as much as two", "adam.py",
            "(noise & 0x7fffu)", "(noise & 0xffffu)", ADAM),
     Mutant("Adam: moments resampled towards zero", "adam.py", "0x80004000u", "0u", ADAM),
@@ -275,6 +281,10 @@ MUTANTS = [
     Mutant("camera: no waiting until it is close", "camera.py",
            "< real(1.0e-6)", "< real(1.0e6)", CAMERA),
     Mutant("camera: one step at the end", "camera.py", "left = int(4)", "left = int(1)", CAMERA),
+    Mutant("camera: each step draws the same", "camera.py",
+           "wp.rand_init(seed, int(ray + wp.uint32(i)))", "wp.rand_init(seed, i)", RAYS),
+    Mutant("camera: the view before", "camera.py",
+           "views[middle].first_pixel <= pixel", "views[middle].first_pixel < pixel", CAMERA),
     Mutant("camera: alpha twice", "camera.py",
            "alpha * rgb + (real(1.0) - alpha) * behind",
            "alpha * (alpha * rgb) + (real(1.0) - alpha) * behind", CAMERA),
