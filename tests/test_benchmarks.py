@@ -122,6 +122,17 @@ def test_rendering(tmp_path):
             assert is_interval(row[name][key])
 
 
+def test_training(tmp_path):
+    options = ("builtin:room", "--downscale", "16", "--steps", "30")
+    record, printed = run("training.py", tmp_path / "record.json", *options)
+    row = record["scenes"]["builtin:room"]
+    parts = ["rays", "drawing", "Adam", "smoothing", "free space", "growing", "reports", "rest"]
+    assert all(f"{100 * row[part]:.1f} %" in printed for part in parts)
+    assert abs(sum(row[part] for part in parts) - 1) < 1e-9
+    assert all(row[part] > 0 for part in parts if part != "free space")  # not in so few steps
+    assert row["steps"] == 30 and row["samples_per_ray"] > 1
+
+
 def test_compiled_torch_agrees():
     """Apart from the rest, for it takes long to compile."""
     load = candidates.find("cpu")[0].get("torch.compile")
