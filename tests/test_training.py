@@ -129,6 +129,22 @@ def test_updates_take_more_steps_as_training_goes_on(
     assert seen == updates
 
 
+@pytest.mark.parametrize(
+    ("channels", "late"), [(3, [12, 14, 18, 20]), (4, [14, 20])], ids=["opaque", "with alpha"]
+)
+def test_updates_of_objects_take_more_steps_unless_told(channels: int, late: list[int]) -> None:
+    scene = ball()
+    views = [replace(view, image=view.image[..., :channels]) for view in scene.views]
+    seen: list[int] = []
+    optim = OptimConfig()
+    train(
+        replace(scene, views=views),
+        tiny_config(checkpoint_every=1e-9, optim=optim),
+        on_checkpoint=lambda state: seen.append(state.progress.step),
+    )
+    assert seen == [*range(1, 11), *late]
+
+
 @pytest.mark.parametrize("shares", [(0.0,), (0.5, 0.4), (1.0,), (math.nan,)])
 def test_shares_that_are_none_are_refused(shares: tuple[float, ...]) -> None:
     for make, name in (
@@ -139,10 +155,12 @@ def test_shares_that_are_none_are_refused(shares: tuple[float, ...]) -> None:
             make()
 
 
-def test_updates_of_very_many_steps_are_refused() -> None:
+def test_updates_of_very_many_steps_or_none_are_refused() -> None:
     OptimConfig(accumulate_at=(0.5,) * 8)
     with pytest.raises(InputError, match=r"^optim\.accumulate_at must hold at most 8.*, not 9:"):
         OptimConfig(accumulate_at=(0.5,) * 9)
+    with pytest.raises(InputError, match=r"^optim\.accumulate_at must be auto or shares .*'never'"):
+        OptimConfig(accumulate_at="never")  # type: ignore[arg-type]
 
 
 def test_updates_are_counted_apart_from_steps(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -120,9 +120,10 @@ class OptimConfig:
     """Weight of the total variation of raw colours, likewise."""
     tv_every: int = 8
     """Updates from one total-variation gradient to the next, which counts that many times."""
-    accumulate_at: tuple[float, ...] = (0.5, 0.7)
+    accumulate_at: Literal["auto"] | tuple[float, ...] = "auto"
     """Shares of the training. Before the first, an update of the grid follows each step; from each
-    on, twice as many steps, whose rays are put through together and whose losses are added up."""
+    on, twice as many steps, whose rays are put through together and whose losses are added up.
+    auto: 0.5 and 0.7, each once; twice where photographs have alpha, so that rays meet little."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot be optimised with."""
@@ -133,15 +134,28 @@ class OptimConfig:
         require_at_least("optim.tv_density", self.tv_density, 0.0)
         require_at_least("optim.tv_rgb", self.tv_rgb, 0.0)
         require_whole("optim.tv_every", self.tv_every, 1)
-        require_shares("optim.accumulate_at", self.accumulate_at)
-        if len(self.accumulate_at) > 8:
-            raise InputError(
-                f"optim.accumulate_at must hold at most 8 shares, not {len(self.accumulate_at)}: "
-                "with 8, an update takes 256 steps."
-            )
+        if isinstance(self.accumulate_at, str):
+            if self.accumulate_at != "auto":
+                raise InputError(
+                    "optim.accumulate_at must be auto or shares between 0 and 1, not "
+                    f"{self.accumulate_at!r}."
+                )
+        else:
+            require_shares("optim.accumulate_at", self.accumulate_at)
+            if (n := len(self.accumulate_at)) > 8:
+                raise InputError(
+                    f"optim.accumulate_at must hold at most 8 shares, not {n}: with 8, an update "
+                    "takes 256 steps."
+                )
         for name in ("beta1", "beta2"):
             if not 0 <= getattr(self, name) < 1:
                 raise InputError(f"optim.{name} must lie in [0, 1), not {getattr(self, name)}.")
+
+    def accumulation(self, has_alpha: bool) -> tuple[float, ...]:
+        """``accumulate_at``, decided for photographs with alpha or without."""
+        if not isinstance(self.accumulate_at, str):
+            return self.accumulate_at
+        return (0.5, 0.5, 0.7, 0.7) if has_alpha else (0.5, 0.7)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -130,6 +130,7 @@ class Trainer:
             config.seed,
             self.workers,
         )
+        self._accumulation = config.optim.accumulation(has_alpha)
         self._grown = 0
         self._updates = 0
         self.grid = self._first_grid(scene)
@@ -352,11 +353,11 @@ class Trainer:
 
     def _steps_an_update(self, fraction: float) -> int:
         """Steps whose losses are added up for one, after that share of the training."""
-        return 1 << sum(fraction >= at for at in self.config.optim.accumulate_at)
+        return 1 << sum(fraction >= at for at in self._accumulation)
 
     def _training_pass(self) -> TrainingPass:
         return TrainingPass(
-            self.config.rays_per_step << len(self.config.optim.accumulate_at),
+            self.config.rays_per_step << len(self._accumulation),
             self.grid,
             self.march_steps(),
             self.config.scaling,
