@@ -1,6 +1,6 @@
 """Where the time of a training goes: rays and their gradient, and everything else.
 
-    python benchmarks/training.py fox_q stitch lego_200 builtin:room --time-limit 36
+    python benchmarks/training.py builtin:room path/to/scene --time-limit 36
 
 Scenes are built-in ones, folders, or folders in the one that WARPNERF_DATA names. Prints a table of
 shares of the training's time and writes benchmarks/results/training_<device>.json. What a part
@@ -74,7 +74,7 @@ def main() -> None:
     parser = options(__doc__)
     parser.add_argument("scenes", nargs="*", default=["builtin:room"], help="builtin:room, folders")
     parser.add_argument("--time-limit", type=float, default=36.0, help="seconds each")
-    parser.add_argument("--steps", type=int, default=100_000, help="steps, where fewer")
+    parser.add_argument("--steps", type=int, default=100_000, help="at most so many steps")
     parser.add_argument("--downscale", type=int, default=1)
     arguments = parser.parse_args()
     config = wn.TrainConfig(
@@ -94,6 +94,8 @@ def main() -> None:
     record = {
         "machine": machine(arguments.device, threads),
         "time_limit": arguments.time_limit,
+        "steps": arguments.steps,
+        "downscale": arguments.downscale,
         "scenes": rows,
     }
     print(f"wrote {write_record(record, arguments.output, 'training', arguments.device)}")
@@ -107,7 +109,7 @@ def profile(name: str, downscale: int, config: wn.TrainConfig) -> tuple[dict[str
         last batch; and the number of threads.
     """
     if ":" not in name and not Path(name).exists():
-        name = str(Path(os.environ.get("WARPNERF_DATA", "../shared/data")) / name)
+        name = str(Path(os.environ.get("WARPNERF_DATA", "")) / name)
     trainer = Trainer(wn.load_scene(name, downscale=downscale), config)
     trainer.update()  # compiles
     clock = Clock(trainer.workers.device.is_cuda)

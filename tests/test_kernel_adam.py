@@ -43,6 +43,7 @@ def step(
     span: int = STRETCH,
     flags: Any = None,
     betas: tuple[float, float] = (BETA1, BETA2),
+    n_nodes: int | None = None,
 ) -> tuple[Any, Any, Any]:
     """What is left of the gradient, and the new values and moments, all [n_nodes, 4]."""
     vec4, adam = kernels.types.vec4, kernels.module("adam")
@@ -53,7 +54,7 @@ def step(
     arrays = kernels.array(values, vec4), wp.array(moments, dtype=adam.uint4, device=kernels.device)
     kernels.workers.launch(
         adam.adam_step,
-        -(-len(values) // span),
+        -(-(n_nodes or len(values)) // span),
         span,
         number,
         vec4(*RATE),
@@ -61,7 +62,7 @@ def step(
         EPSILON,
         *(1.0 / (1.0 - beta**number) for beta in betas),
         gradient,
-        *arrays,
+        *(array[:n_nodes] for array in arrays),
     )
     values, moments = (a.numpy() for a in arrays)
     return gradient.values.numpy(), values, moments
@@ -94,6 +95,27 @@ def test_against_the_oracle_skipping_exact_zeros(kernels: Kernels) -> None:
             found = decoded(moments)
             for new, exact, bit in zip(found, (mean, square), (MEAN_BIT, SQUARE_BIT), strict=True):
                 assert (np.abs(new - exact.numpy()) <= bit * np.abs(exact.numpy())).all()
+
+
+def test_nothing_behind_the_last_node_is_touched(kernels: Kernels) -> None:
+    rng = np.random.default_rng(5)
+    for n in (29, 30, 31):  # in tiles of four
+        adj, values = rng.normal(size=(2, 32, 4)).astype(np.float32)
+        moments = encoded(rng.normal(size=(32, 4)), rng.uniform(size=(32, 4)))
+        expected = step(kernels, 1, adj, values, moments)[1:]
+        found = step(kernels, 1, adj, values, moments, n_nodes=n)[1:]
+        for new, exact, old in zip(found, expected, (values, moments), strict=True):
+            assert np.array_equal(new[:n], exact[:n])
+            assert np.array_equal(new[n:], old[n:])
+
+
+def test_gradients_of_minus_zero_move_nothing(kernels: Kernels) -> None:
+    values = np.random.default_rng(6).normal(size=(8, 4)).astype(np.float32)
+    moments = encoded(np.ones((8, 4)), np.ones((8, 4)))
+    after, *found = step(kernels, 1, np.full((8, 4), -0.0, np.float32), values, moments)
+    assert not after.any()
+    for new, old in zip(found, (values, moments), strict=True):
+        assert np.array_equal(new, old)
 
 
 @pytest.mark.parametrize("alike", [False, True])

@@ -9,6 +9,8 @@ import reference
 import warp as wp
 from drive import Kernels, unit
 
+from warpnerf.parallel import NODES
+
 LENSES: list[dict[str, float]] = [
     {},
     {"k1": -0.12, "k2": 0.03},
@@ -94,7 +96,14 @@ def test_float32_rays(kernels32: Kernels) -> None:
 
 
 def draw(
-    kernels: Kernels, n: int, seed: int, background: Any, mode: int, jitter: int
+    kernels: Kernels,
+    n: int,
+    seed: int,
+    background: Any,
+    mode: int,
+    jitter: int,
+    rays_before: int = 0,
+    chunk: int = NODES,
 ) -> dict[str, Any]:
     """Pixels of three views; the red and green of each pixel say which one it is."""
     types, camera = kernels.types, kernels.module("camera")
@@ -121,11 +130,12 @@ def draw(
         wp.array(np.concatenate(pixels).astype(np.uint8), dtype=wp.vec4ub, device=kernels.device),
         kernels.array([2.0, 3.0, 5.0]),
         seed,
-        0,
+        rays_before,
         vec3(*background),
         mode,
         jitter,
         *out.values(),
+        chunk=chunk,
     )
     return {name: value.numpy() for name, value in out.items()}
 
@@ -174,3 +184,14 @@ def test_a_batch_is_a_function_of_its_seed(kernels32: Kernels) -> None:
         assert np.array_equal(one[name], same[name])
     assert not np.array_equal(one["directions"], other["directions"])
     assert np.allclose(unit(one["directions"]), one["directions"], atol=1e-6)
+
+
+def test_rays_are_counted_through_the_training(kernels32: Kernels) -> None:
+    options = (5, (0.0, 0.0, 0.0), 1, 1)
+    whole = draw(kernels32, 300, *options, rays_before=2**32 - 100, chunk=7)
+    parts = [
+        draw(kernels32, n, *options, rays_before=before)
+        for n, before in ((60, 2**32 - 100), (40, 2**32 - 40), (200, 0))
+    ]
+    for name, found in whole.items():
+        assert np.array_equal(found, np.concatenate([part[name] for part in parts]))

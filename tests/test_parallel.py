@@ -97,6 +97,33 @@ def test_what_stays_the_same_is_packed_once(monkeypatch: pytest.MonkeyPatch, on_
     assert np.array_equal(owner.numpy(), np.repeat([0, 1], [2, 8]))
 
 
+def test_what_was_interrupted_is_packed_anew(monkeypatch: pytest.MonkeyPatch, on_cpu: None) -> None:
+    workers, packed = Workers("cpu", 1), Packed()
+    visits, others = (wp.zeros(10, dtype=wp.int32, device="cpu") for _ in range(2))
+    workers.launch(count_visits, 10, visits, packed=packed)
+
+    def interrupted(command: wp.Launch, n: int) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(wp.Launch, "set_dim", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            workers.launch(count_visits, 5, others, packed=packed)
+    workers.launch(count_visits, 10, visits, packed=packed)
+    assert (visits.numpy() == 2).all() and not others.numpy().any()
+
+
+def test_one_keeps_what_several_kernels_take(on_cpu: None) -> None:
+    workers, packed = Workers("cpu", 2), Packed()
+    visits = wp.zeros(10, dtype=wp.int32, device="cpu")
+    owner = wp.zeros(10, dtype=wp.int32, device="cpu")
+    for _ in range(2):
+        workers.launch(count_visits, 10, visits, packed=packed)
+        workers.launch_owned(note_worker, 10, owner, packed=packed)
+    assert (visits.numpy() == 2).all()
+    assert np.array_equal(owner.numpy(), np.repeat([0, 1], 5))
+
+
 def test_cuda_gets_one_worker_and_the_cpu_its_cores(device: str) -> None:
     assert Workers("cpu", 4).count == 4
     assert Workers("cpu").count >= 1

@@ -93,7 +93,7 @@ class AdjointLaunch:
         self._contraction = variant.contraction
         self._size = wp.vec3i(*size)
         self._workers = workers
-        self._packed, self._packed_measure, self._packed_delivery = Packed(), Packed(), Packed()
+        self._packed = Packed()
         self.parcels: parcels.Parcels | None = None
         """What the workers leave for each other; None: kernels are plain."""
         if variant.packed:
@@ -141,8 +141,9 @@ class AdjointLaunch:
             self._workers.launch(
                 parcels.deliver_parcels,
                 self._workers.count,
-                *(self._size, self.parcels),
-                packed=self._packed_delivery,
+                self._size,
+                self.parcels,
+                packed=self._packed,
             )
 
     def _measure(self, n_rays: int, arguments: tuple[Any, ...]) -> None:
@@ -152,7 +153,7 @@ class AdjointLaunch:
             parcels.measure_rays_kernel(self._contraction),
             n_rays,
             *(grid, march, origins, directions, self._work, self._middles),
-            packed=self._packed_measure,
+            packed=self._packed,
         )
 
     def _turns(self, n_rays: int) -> Iterator[tuple[int, int]]:

@@ -123,7 +123,8 @@ class OptimConfig:
     accumulate_at: Literal["auto"] | tuple[float, ...] = "auto"
     """Shares of the training. Before the first, an update of the grid follows each step; from each
     on, twice as many steps, whose rays are put through together and whose losses are added up.
-    auto: 0.5 and 0.7, each once; twice where photographs have alpha, so that rays meet little."""
+    auto: 0.5 and 0.7, each once; twice for objects, bounded scenes of photographs with alpha, where
+    rays meet little."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot be optimised with."""
@@ -142,20 +143,20 @@ class OptimConfig:
                 )
         else:
             require_shares("optim.accumulate_at", self.accumulate_at)
-            if (n := len(self.accumulate_at)) > 8:
+            if (n := len(self.accumulate_at)) > 6:
                 raise InputError(
-                    f"optim.accumulate_at must hold at most 8 shares, not {n}: with 8, an update "
-                    "takes 256 steps."
+                    f"optim.accumulate_at must hold at most 6 shares, not {n}: with 6, an update "
+                    "takes 64 steps."
                 )
         for name in ("beta1", "beta2"):
             if not 0 <= getattr(self, name) < 1:
                 raise InputError(f"optim.{name} must lie in [0, 1), not {getattr(self, name)}.")
 
-    def accumulation(self, has_alpha: bool) -> tuple[float, ...]:
-        """``accumulate_at``, decided for photographs with alpha or without."""
+    def accumulation(self, of_object: bool) -> tuple[float, ...]:
+        """``accumulate_at``, decided for a scene that is an object, or is not."""
         if not isinstance(self.accumulate_at, str):
             return self.accumulate_at
-        return (0.5, 0.5, 0.7, 0.7) if has_alpha else (0.5, 0.7)
+        return (0.5, 0.5, 0.7, 0.7) if of_object else (0.5, 0.7)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,7 +182,7 @@ class TrainConfig:
     """What is seen behind the scene: a colour, rgb in [0, 1], or random colours while training
     (white when rendering); auto: white where photographs have alpha, else black."""
     occupancy_every: int = 100
-    """Updates of the grid between two looks for free space."""
+    """Updates of the grid between two looks for free space, each of one or several steps."""
     alpha_min: float = 1e-2
     """A cell is free where the longest step that there can be would be less opaque than this."""
     seed: int = 0

@@ -56,7 +56,7 @@ def adam_step(
     Args:
         grid: Its values are updated; an entry whose gradient is exactly zero is left alone.
         moments: [n_nodes] updated likewise.
-        gradients: Of one batch or several.
+        gradients: Of the update's steps.
         update: Counts from 1.
         decay: Factor on the learning rates.
         config: The rest.

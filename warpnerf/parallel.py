@@ -24,7 +24,7 @@ signals such as Ctrl-C wait for a launch to end."""
 
 
 class Packed:
-    """What a kernel was launched with, in the form that it takes: kept for its next launch.
+    """What kernels were launched with, in the form that they take: kept for their next launch.
 
     Packing arguments takes several times as long as a launch does, and the threads one after the
     other. Packed anew is what is another object than last time, so what may change in place are
@@ -33,22 +33,23 @@ class Packed:
 
     def __init__(self) -> None:
         """Nothing is kept yet."""
-        self._commands: dict[int, tuple[wp.Launch, list[Any]]] = {}
+        self._commands: dict[tuple[wp.Kernel, int], tuple[wp.Launch, list[Any]]] = {}
 
     def launch(
         self, worker: int, kernel: wp.Kernel, n: int, arguments: list[Any], device: wp.Device
     ) -> None:
-        """Launch the kernel, always the same, for one of the workers, on the CPU."""
-        if worker not in self._commands:
+        """Launch a kernel for one of the workers, on the CPU."""
+        # Taken out while it changes: what is interrupted then is packed anew.
+        command, last = self._commands.pop((kernel, worker), (None, []))
+        if command is None:
             command = wp.launch(kernel, n, inputs=arguments, device=device, record_cmd=True)
-            self._commands[worker] = command, [*arguments, n]
-        command, last = self._commands[worker]
-        for index, argument in enumerate(arguments):
-            if argument is not last[index]:
-                command.set_param_at_index(index, argument)
-        if n != last[-1]:
-            command.set_dim(n)
-        last[:] = *arguments, n
+        else:
+            for index, argument in enumerate(arguments):
+                if argument is not last[index]:
+                    command.set_param_at_index(index, argument)
+            if n != last[-1]:
+                command.set_dim(n)
+        self._commands[kernel, worker] = command, [*arguments, n]
         command.launch()
 
 
@@ -97,7 +98,7 @@ class Workers:
             n: Number of items.
             arguments: The rest of the kernel's arguments.
             chunk: Items per launch, NODES or RAYS.
-            packed: Of this kernel's launches before, and for those to come.
+            packed: From launches before, and for those to come.
         """
         self._launch(kernel, self._alike(n), lambda worker: arguments, chunk, packed)
 

@@ -178,7 +178,8 @@ class TrainingPass:
 
     That is one launch, or as many as AdjointLaunch takes.
 
-    Loss: mean over rays of the squared error, summed over the channels.
+    Loss: sum over batches of the mean over a batch's rays of the squared error, summed over the
+    channels.
     """
 
     def __init__(
@@ -190,7 +191,7 @@ class TrainingPass:
         jacobian: Jacobian,
         workers: Workers,
     ) -> None:
-        """Allocate what batches of up to n_rays through a grid need, by such steps."""
+        """Allocate what up to n_rays at a time through a grid need, by such steps."""
         device = workers.device
         variant = kernels.Variant(
             CONTRACTIONS[grid.contraction],
@@ -213,7 +214,7 @@ class TrainingPass:
         self._steps = steps.struct()
         self._free: tuple[FreeCells, Any] | None = None  # of the last batch, with its struct
         self.n_rays = n_rays
-        """Rays of the last batch."""
+        """Rays of the last run; before the first, those that there is room for."""
         self.error = wp.zeros(n_rays, dtype=real, device=device)
         """Squared error of each of these, then room."""
         self.n_samples = wp.zeros(n_rays, dtype=wp.int32, device=device)
@@ -222,12 +223,12 @@ class TrainingPass:
         """What batches have added up to since the last update."""
 
     def run(self, free: FreeCells, batch: RayBatch, n_batches: int = 1) -> None:
-        """Add a batch's gradient to ``gradients``, or that of several put together.
+        """Add the gradient of a batch to ``gradients``, or of several put together.
 
         Args:
             free: What of the grid is skipped.
             batch: The rays.
-            n_batches: How many batches they are; the losses of these are added up.
+            n_batches: How many batches of as many rays each these are.
         """
         self.n_rays = batch.count
         if self._free is None or self._free[0] is not free:  # filling structs takes a while

@@ -31,11 +31,11 @@ class Progress:
     seconds: float
     """Of training, those before a resumption included; compiling does not count."""
     loss: float
-    """Of the last batch: mean over rays of the squared error, summed over channels."""
+    """Of the last update: mean over its rays of the squared error, summed over channels."""
     psnr: float
-    """Of the last batch, dB."""
+    """Of the last update's rays, dB."""
     samples_per_ray: float
-    """Visited steps per ray of the last batch."""
+    """Visited steps per ray of the last update."""
     size: tuple[int, int, int]
     """Nodes of the grid."""
     occupied: float

@@ -130,7 +130,7 @@ class Trainer:
             config.seed,
             self.workers,
         )
-        self._accumulation = config.optim.accumulation(has_alpha)
+        self._accumulation = config.optim.accumulation(has_alpha and not scene.unbounded)
         self._grown = 0
         self._updates = 0
         self.grid = self._first_grid(scene)

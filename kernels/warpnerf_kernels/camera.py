@@ -145,7 +145,7 @@ def sample_pixels(
     content_distances: wp.array(dtype=real),  # [n_views] scene units
     # how
     seed: int,  # of the training
-    ray: wp.uint32,  # number of the first ray, counted through the training
+    rays_before: wp.uint32,  # in the training, before ray 0 of this batch
     background: vec3,  # rgb in [0, 1]
     background_mode: int,  # RANDOM_BACKGROUND: a colour of its own for each ray
     jitter: int,  # 1: a random offset for each ray, 0: the middle of the step
@@ -159,9 +159,9 @@ def sample_pixels(
 ):
     """A batch of rays through random pixels, all pixels equally likely."""
     i = first + wp.tid()
-    state = wp.rand_init(seed, int(ray + wp.uint32(i)))
+    state = wp.rand_init(seed, int(rays_before + wp.uint32(i)))
     pixel = wp.randi(state, 0, pixels.shape[0])
-    later = wp.rand_init(seed, int(ray + wp.uint32(i + wp.static(AHEAD))))
+    later = wp.rand_init(seed, int(rays_before + wp.uint32(i + wp.static(AHEAD))))
     prefetch(pixels, wp.randi(later, 0, pixels.shape[0]))
     v = view_of_pixel(views, pixel)
     view = views[v]
