@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from test_determinism import small_scene
 
-from warpnerf.config import GridConfig, TrainConfig
+from warpnerf.config import GridConfig, OptimConfig, TrainConfig
 from warpnerf.training import Trainer
 from warpnerf.warmup import rendering_kernels, training_kernels, warm_up
 
@@ -21,6 +21,7 @@ def test_a_training_loads_no_other_kernels(contraction: Any, scaling: Any, devic
         scaling=scaling,
         device=device,
         grid=GridConfig(voxels=600, grow_at=(0.5,), contraction=contraction),
+        optim=OptimConfig(accumulate_at=()),
     )
     trainer = Trainer(small_scene(), config)
     assert not trainer.workers._loaded  # a scene is described before anything is compiled
