@@ -23,6 +23,7 @@ from measuring import machine, options, write_record
 
 import warpnerf as wn
 from warpnerf import training
+from warpnerf.parallel import Workers
 from warpnerf.rays import PixelSampler
 from warpnerf.render import TrainingPass
 from warpnerf.training import Trainer
@@ -83,16 +84,14 @@ def main() -> None:
     names = ["rest", *PARTS]
     print(f"{'scene':14}  steps  samples/ray  {'  '.join(f'{name:>10}' for name in names)}")
     rows: dict[str, dict[str, float]] = {}
-    threads = 0
     for name in arguments.scenes:
-        row, threads = profile(name, arguments.downscale, config)
-        rows[name] = row
+        rows[name] = row = profile(name, arguments.downscale, config)
         shares = "  ".join(f"{100 * row[part]:8.1f} %" for part in names)
         print(
             f"{name:14} {row['steps']:6.0f}  {row['samples_per_ray']:11.1f}  {shares}", flush=True
         )
     record = {
-        "machine": machine(arguments.device, threads),
+        "machine": machine(arguments.device, Workers(arguments.device).count),
         "time_limit": arguments.time_limit,
         "steps": arguments.steps,
         "downscale": arguments.downscale,
@@ -101,12 +100,12 @@ def main() -> None:
     print(f"wrote {write_record(record, arguments.output, 'training', arguments.device)}")
 
 
-def profile(name: str, downscale: int, config: wn.TrainConfig) -> tuple[dict[str, float], int]:
+def profile(name: str, downscale: int, config: wn.TrainConfig) -> dict[str, float]:
     """Train on a scene.
 
     Returns:
         Each part's share of the time, "rest" for what is in none, steps, and samples per ray of the
-        last batch; and the number of threads.
+        last update.
     """
     if ":" not in name and not Path(name).exists():
         name = str(Path(os.environ.get("WARPNERF_DATA", "")) / name)
@@ -131,7 +130,7 @@ def profile(name: str, downscale: int, config: wn.TrainConfig) -> tuple[dict[str
     row["rest"] = 1.0 - sum(row.values())
     row["steps"] = progress.step
     row["samples_per_ray"] = progress.samples_per_ray
-    return row, trainer.workers.count
+    return row
 
 
 if __name__ == "__main__":

@@ -124,7 +124,7 @@ class OptimConfig:
     """Shares of the training. Before the first, an update of the grid follows each step; from each
     on, twice as many steps, whose rays are put through together and whose losses are added up.
     auto: 0.5 and 0.7, each once; twice for objects, bounded scenes of photographs with alpha, where
-    rays meet little."""
+    rays meet little. At most six, as the rays of an update are in memory at a time."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot be optimised with."""

@@ -98,7 +98,7 @@ class Workers:
             n: Number of items.
             arguments: The rest of the kernel's arguments.
             chunk: Items per launch, NODES or RAYS.
-            packed: From launches before, and for those to come.
+            packed: From launches before, and for those to come, on the CPU.
         """
         self._launch(kernel, self._alike(n), lambda worker: arguments, chunk, packed)
 

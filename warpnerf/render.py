@@ -212,7 +212,6 @@ class TrainingPass:
         self._grid = grid.struct()
         self._border = grid.border
         self._steps = steps.struct()
-        self._free: tuple[FreeCells, Any] | None = None  # of the last batch, with its struct
         self.n_rays = n_rays
         """Rays of the last run; before the first, those that there is room for."""
         self.error = wp.zeros(n_rays, dtype=real, device=device)
@@ -231,13 +230,11 @@ class TrainingPass:
             n_batches: How many batches of as many rays each these are.
         """
         self.n_rays = batch.count
-        if self._free is None or self._free[0] is not free:  # filling structs takes a while
-            self._free = free, free.struct(self._border)
         self.launch.run(
             batch.count,
             self.gradients.struct(),
             self._grid,
-            self._free[1],
+            free.struct(self._border),
             self._steps,
             batch.origins,
             batch.directions,

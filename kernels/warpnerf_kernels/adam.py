@@ -72,7 +72,7 @@ for (int c = 0; c < 4 * count; c += AT_ONCE) {
     const number value = load(values.data);
     const bits old = as_bits(load(moments.data));
     number rate;
-    for (int n = 0; n < AT_ONCE; ++n) {
+    for (int n = 0; n < AT_ONCE; ++n) {  // on the CPU c is a node's first, and n enough
         ((float*)&rate)[n] = learning_rate.c[AT_ONCE == 1 ? c % 4 : n % 4];
     }
     const number m = beta1 * mean_of(old) + (1.0f - beta1) * g;
