@@ -107,8 +107,8 @@ class WarpAdjoint:
         kernel = kernels.render_backward_kernel(variant)
         batch, out = self._batch, self._out
         arguments = (
-            self._grid.struct(),
-            self._free.struct(self._grid.border),
+            self._grid.struct,
+            self._free.struct,
             self._steps.struct(),
             batch.origins,
             batch.directions,
@@ -132,7 +132,7 @@ class WarpAdjoint:
             batch.count,
             self._workers,
         )
-        gradient = self.gradients.struct()
+        gradient = self.gradients.struct
         return lambda: launch.run(batch.count, gradient, *arguments)
 
     def gradient_of(self, launch: Call) -> np.ndarray:

@@ -15,6 +15,7 @@ from drive import Kernels, Problem, assert_close, make_problem, unbounded, unit
 from test_kernel_render import early, masked
 from warpnerf_kernels import parcels
 from warpnerf_kernels.tiles import TILE
+from warpnerf_kernels.vectors import LANES
 
 from warpnerf import adjoint
 from warpnerf.parallel import Packed
@@ -29,18 +30,18 @@ def _(on_cpu: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Memory begins with what shows where it is read before it is written."""
     make_parcels = adjoint._make_parcels
 
-    def unwritten(n_samples: int, n_workers: int) -> parcels.Parcels:
-        made = make_parcels(n_samples, n_workers)
+    def unwritten(n_packs: int, n_workers: int) -> parcels.Parcels:
+        made = make_parcels(n_packs, n_workers)
         made.contents.numpy().view(np.uint8).fill(255)  # not a number
-        for blocks in (made.next, made.first_block, made.used):
-            blocks.fill_(1 << 24)  # in no one's memory
+        for numbers in (made.addressed, made.n_contents, made.n_addressed):
+            numbers.fill_(1 << 24)  # in no one's memory
         return made
 
     monkeypatch.setattr(adjoint, "_make_parcels", unwritten)
 
 
 def problem(seed: int) -> Problem:
-    """Rays enough for chains of several blocks."""
+    """Rays enough for many parcels from each worker to each."""
     p = make_problem(seed, n_rays=301, steps=Steps(near=0.0, far=4.0, step=0.04))
     return replace(p, raw=np.random.default_rng(seed).normal(size=(PLANES, 7, 6, 4)))
 
@@ -68,8 +69,8 @@ def one_sample_each(nodes: Any, size: tuple[int, int, int], seed: int = 0) -> Pr
     return replace(p, origins=at - 0.05 * p.directions)
 
 
-@pytest.mark.parametrize("n", [1, parcels.BLOCK - 1, parcels.BLOCK, 2 * parcels.BLOCK + 1])
-def test_chains_of_every_length(n: int) -> None:
+@pytest.mark.parametrize("n", [1, 2, 5, 129])
+def test_any_number_of_parcels(n: int) -> None:
     """Each worker has a parcel of each of its n rays for the other one that owns a plane of it."""
     size = (PLANES, 7, 6)
     for threads, plane in ((2, 2), (3, 1), (3, 3)):
@@ -129,7 +130,7 @@ def test_rays_in_turns(contraction: str, monkeypatch: pytest.MonkeyPatch) -> Non
         p = unbounded(p, contraction, 0.2)
     at_once = of(2).train(p)
     most = most_steps(p)
-    for samples in (20_000, 4 * (most + parcels.RAY), 4 * most, 1):
+    for samples in (20_000, 4 * (most + LANES + parcels.RAY), 4 * most, 1):
         monkeypatch.setattr(adjoint, "SAMPLES", samples)
         in_turns = of(2).train(p)
         assert np.array_equal(in_turns[0], at_once[0])
@@ -197,7 +198,7 @@ def turns_of(launch: Callable[[], Any], monkeypatch: pytest.MonkeyPatch) -> list
 
     def spy(launch: adjoint.AdjointLaunch, begin: int, end: int) -> list[int]:
         bounds = share_out(launch, begin, end)
-        assert (bounds[0], bounds[-1]) == (begin, end)
+        assert bounds[0] == begin < bounds[-1] <= end
         order = launch._order.numpy().copy()
         turns.append([order[i:j] for i, j in itertools.pairwise(bounds)])
         return bounds
@@ -205,6 +206,35 @@ def turns_of(launch: Callable[[], Any], monkeypatch: pytest.MonkeyPatch) -> list
     monkeypatch.setattr(adjoint.AdjointLaunch, "_share_out", spy)
     launch()
     return turns
+
+
+@pytest.mark.parametrize("n_workers", [2, 3, 7])
+@pytest.mark.parametrize("largest", [20, 1 << 30])
+def test_rays_are_shared_out_by_place_and_work(largest: int, n_workers: int) -> None:
+    """Against sorting: rays of more work than there is room for, and many at the same place."""
+    rng = np.random.default_rng(n_workers)
+    n, begin, most_work = 200, 17, 900 * largest // 20
+    work = rng.integers(1, largest, n)
+    work[[begin, 150]] = 2 * most_work if largest == 20 else 2**31 - 1
+    place = rng.integers(0, parcels.PLACES, n)
+    place[::2] = rng.choice([0, 5, parcels.PLACES - 1], n // 2)
+    scratch = [np.zeros(parcels.PLACES, np.int64), np.zeros(n, np.int32)]
+    bounds, order = np.zeros(n_workers + 1, np.int32), np.full(n, -1, np.int32)
+    arrays = [work.astype(np.int32), place.astype(np.int32), *scratch, bounds, order]
+    on_device = [wp.array(array, device="cpu", copy=False) for array in arrays]
+    while begin < n:
+        until = np.cumsum(work[begin:])
+        end = begin + max(1, int((until <= most_work).sum()))
+        wp.launch(parcels.share_out, 1, inputs=[0, begin, n, most_work, *on_device], device="cpu")
+        rays = begin + np.argsort(place[begin:end], kind="stable")
+        until = np.cumsum(work[rays]) - work[rays]
+        owner = until * n_workers // work[rays].sum()
+        expected = [np.sort(rays[owner == worker]) for worker in range(n_workers)]
+        assert (bounds[0], bounds[-1]) == (begin, end)
+        for worker, (first, last) in enumerate(itertools.pairwise(bounds)):
+            assert np.array_equal(order[first:last], expected[worker])
+        assert (order[end:] == -1).all()
+        begin = end
 
 
 @pytest.mark.parametrize("threads", [2, 3, 5])
@@ -245,13 +275,13 @@ def test_there_is_room_for_all_parcels(monkeypatch: pytest.MonkeyPatch) -> None:
     )
     of(3).backward(p)
     work = int(launches[0]._work.numpy().sum())
-    monkeypatch.setattr(adjoint, "SAMPLES", work + 3 * (most_steps(p) + parcels.RAY) + 2)
+    monkeypatch.setattr(adjoint, "SAMPLES", work + 3 * (most_steps(p) + LANES + parcels.RAY) + 2)
     kernels = of(3)
     turns = turns_of(lambda: kernels.backward(p), monkeypatch)
     assert len(turns) == 1
     made = launches[1].parcels
     assert made is not None
-    most, room = made.used.numpy()[:, 0].max(), made.next.shape[1]
+    most, room = made.n_contents.numpy()[:, 0].max(), made.contents.shape[1]
     assert 0.9 * room < most <= room
 
 

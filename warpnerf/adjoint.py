@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from types import ModuleType
 from typing import Any
 
@@ -13,12 +12,13 @@ import numpy as np
 import warp as wp
 from warpnerf_kernels import parcels, render, tiles, types
 from warpnerf_kernels.types import vec4
+from warpnerf_kernels.vectors import LANES
 
 from warpnerf.parallel import Packed, Workers
 
 SAMPLES = 1 << 21
-"""Samples whose gradients may be in parcels at a time, of all workers together: room for 67 MB with
-two workers and for 134 MB with more, of which what is used takes memory. Rays that might have more
+"""Samples whose gradients may be in parcels at a time, of all workers together: room for 68 MB, and
+half a megabyte more for each worker, of which what is used takes memory. Rays that might have more
 samples take turns, so parcels grow with neither rays nor samples."""
 
 
@@ -45,6 +45,7 @@ class Gradients:
             touched=wp.zeros(n_tiles(size), dtype=wp.uint8, device=workers.device),
         )
 
+    @cached_property
     def struct(self) -> types.Gradient:
         """The gradient as kernels take it."""
         return gradient_struct(types, self.values, self.touched)
@@ -97,17 +98,21 @@ class AdjointLaunch:
         self.parcels: parcels.Parcels | None = None
         """What the workers leave for each other; None: kernels are plain."""
         if variant.packed:
-            most_work = most_steps + parcels.RAY
+            most_work = most_steps + LANES + parcels.RAY
             # Where rays are so long that two for each worker would not fit, fewer work.
             count = min(workers.count, max(1, SAMPLES // (2 * most_work)))
             if count < workers.count:
                 self._workers = Workers("cpu", count)
             room = SAMPLES // count if count > 1 else 0
             self._work_a_turn = count * (room - most_work)  # a worker may get a ray more than it
-            self.parcels = _make_parcels(room, count)
+            self.parcels = _make_parcels(room // LANES, count)
             self._order = wp.array(np.arange(n_rays), dtype=wp.int32, device="cpu")
-            self._work = wp.empty(n_rays, dtype=wp.int32, device="cpu")
-            self._middles = wp.empty(n_rays, dtype=wp.uint16, device="cpu")
+            # What share_out takes from measure_rays, its scratch, and what it gives.
+            self._work, self._place, self._owner = (
+                wp.empty(n_rays, dtype=wp.int32, device="cpu") for _ in range(3)
+            )
+            self._until = wp.empty(parcels.PLACES, dtype=wp.int64, device="cpu")
+            self._bounds = wp.empty(count + 1, dtype=wp.int32, device="cpu")
         elif not workers.device.is_cuda:
             self._workers = Workers("cpu", 1)
 
@@ -131,10 +136,11 @@ class AdjointLaunch:
             )
             return
         self._measure(n_rays, arguments)
-        for begin, end in self._turns(n_rays):
-            bounds = self._share_out(begin, end)
-            self.parcels.used.zero_()
-            self.parcels.end.zero_()  # in case that the last turn was interrupted
+        begin = 0
+        while begin < n_rays:
+            bounds = self._share_out(begin, n_rays)
+            self.parcels.n_contents.zero_()
+            self.parcels.n_addressed.zero_()  # in case that the last turn was interrupted
             self._workers.launch_owned(
                 self._kernel, bounds, *arguments, self.parcels, packed=self._packed
             )
@@ -145,6 +151,7 @@ class AdjointLaunch:
                 self.parcels,
                 packed=self._packed,
             )
+            begin = bounds[-1]
 
     def _measure(self, n_rays: int, arguments: tuple[Any, ...]) -> None:
         """Find how much work each ray is, and where its middle lies."""
@@ -152,53 +159,44 @@ class AdjointLaunch:
         self._workers.launch(
             parcels.measure_rays_kernel(self._contraction),
             n_rays,
-            *(grid, march, origins, directions, self._work, self._middles),
+            *(grid, march, origins, directions, self._work, self._place),
             packed=self._packed,
         )
 
-    def _turns(self, n_rays: int) -> Iterator[tuple[int, int]]:
-        """Where turns begin and end: of as many rays as there is room for what they might send."""
-        until = np.cumsum(self._work.numpy()[:n_rays], dtype=np.int64)
-        begin = 0
-        while begin < n_rays:
-            before = until[begin - 1] if begin else 0
-            fitting = int(np.searchsorted(until, before + self._work_a_turn, side="right"))
-            end = max(begin + 1, fitting)
-            yield begin, end
-            begin = end
-
     def _share_out(self, begin: int, end: int) -> list[int]:
-        """Give the workers rays begin..end-1 by where their middles lie, each as much work.
+        """Give the workers rays from begin on, as many as there is room for, to end at most.
 
         Returns:
             [workers + 1] where in the order each worker's rays begin, and where the last one's
-            end. Among a worker's rays their order stays.
+            end.
         """
-        count = self._workers.count
-        along_x = np.argsort(self._middles.numpy()[begin:end], kind="stable")
-        work = self._work.numpy()[begin:end][along_x]
-        until = np.cumsum(work, dtype=np.int64)
-        bounds = np.searchsorted(count * (until - work), until[-1] * np.arange(count + 1))
-        order = self._order.numpy()[begin:end]
-        for first, last in itertools.pairwise(bounds):
-            order[first:last] = begin + np.sort(along_x[first:last])
-        return (begin + bounds).tolist()
+        self._workers.launch_alone(
+            parcels.share_out,
+            begin,
+            end,
+            self._work_a_turn,
+            self._work,
+            self._place,
+            self._until,
+            self._owner,
+            self._bounds,
+            self._order,
+            packed=self._packed,
+        )
+        return self._bounds.numpy().tolist()
 
 
-def _make_parcels(n_samples: int, n_workers: int) -> parcels.Parcels:
-    """No parcels, with room for those of so many samples of each worker."""
-    row = -(-n_workers // 16) * 16  # whole cache lines, which no two workers share
-    # A sample goes to two others at most, and each of these may have begun a block.
-    n_blocks = n_workers + -(-min(2, n_workers - 1) * n_samples // parcels.BLOCK)
+def _make_parcels(n_packs: int, n_workers: int) -> parcels.Parcels:
+    """No parcels, with room for those of so many packs of each worker."""
+    row = -(-n_workers // 16) * 16  # whole cache lines
 
-    def room(n: int, dtype: Any = wp.int32) -> wp.array:
-        return wp.empty((n_workers, n), dtype=dtype, device="cpu")
+    def room(*shape: int, dtype: Any = wp.int32) -> wp.array:
+        return wp.empty(shape, dtype=dtype, device="cpu")  # no memory until it is used
 
     made = parcels.Parcels()
-    made.contents = room(n_blocks * parcels.BLOCK, parcels.Parcel)  # no memory until it is used
-    made.next = room(n_blocks)
-    made.first_block = room(row)
-    made.end = room(row)
-    made.end.zero_()
-    made.used = room(row)
+    made.contents = room(n_workers, n_packs, dtype=parcels.Parcel)
+    made.n_contents = room(n_workers, row)
+    made.addressed = room(n_workers, n_workers, n_packs)
+    made.n_addressed = room(n_workers, row)
+    made.n_addressed.zero_()
     return made

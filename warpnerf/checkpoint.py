@@ -217,6 +217,7 @@ def _field(header: _Header, tensors: dict[str, np.ndarray], path: Path, workers:
         free=FreeCells(
             distance=wp.array(free.reshape(-1), dtype=wp.uint8, device=workers.device),
             size=(free.shape[0], free.shape[1], free.shape[2]),
+            border=header.border,
         ),
         steps=steps,
         background=header.background,

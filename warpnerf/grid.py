@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from types import ModuleType
 from typing import Any
 
@@ -52,6 +53,7 @@ class VoxelGrid:
         """Of the box, scene units."""
         return float(np.linalg.norm(self.box_max - self.box_min))
 
+    @cached_property
     def struct(self) -> Grid:
         """The grid as kernels take it."""
         return grid_struct(
@@ -181,6 +183,8 @@ class FreeCells:
     """[MX * MY * MZ] uint8, cells to the nearest occupied one; 0 there."""
     size: tuple[int, int, int]
     """MX, MY, MZ."""
+    border: float = 0.0
+    """That of the grid."""
 
     @staticmethod
     def none(workers: Workers) -> FreeCells:
@@ -206,11 +210,11 @@ class FreeCells:
         cells = wp.vec3i(*size)
         n_stretches = grid.size[0] * grid.size[1] * size[2]
         highest = wp.empty(n_stretches, dtype=real, device=workers.device)
-        workers.launch(occupancy.find_highest, n_stretches, grid.struct(), size[2], highest)
+        workers.launch(occupancy.find_highest, n_stretches, grid.struct, size[2], highest)
         workers.launch(
             occupancy.mark_occupied,
             n,
-            grid.struct(),
+            grid.struct,
             highest,
             cells,
             march,
@@ -221,11 +225,12 @@ class FreeCells:
         for axis in range(3):
             workers.launch(occupancy.spread_distance, n, cells, axis, distance, spread)
             distance, spread = spread, distance
-        return FreeCells(distance=distance, size=(size[0], size[1], size[2]))
+        return FreeCells(distance=distance, size=(size[0], size[1], size[2]), border=grid.border)
 
-    def struct(self, border: float) -> FreeSpace:
-        """Free space as kernels take it, for a grid with this border."""
-        return free_struct(types, self.distance, self.size, border)
+    @cached_property
+    def struct(self) -> FreeSpace:
+        """Free space as kernels take it."""
+        return free_struct(types, self.distance, self.size, self.border)
 
     def share(self) -> float:
         """The share of cells that are occupied, [0, 1]."""

@@ -73,7 +73,7 @@ def adam_step(
         config.epsilon,
         1.0 / (1.0 - config.beta1**update),
         1.0 / (1.0 - config.beta2**update),
-        gradients.struct(),
+        gradients.struct,
         grid.values,
         moments,
         chunk=NODES // tiles.STRETCH,
@@ -113,7 +113,7 @@ def add_total_variation(
         grid.values,
         wp.vec3i(*grid.size),
         vec4(density, rgb, rgb, rgb),
-        gradients.struct(),
+        gradients.struct,
         chunk=NODES // tiles.STRETCH,
     )
 

@@ -123,6 +123,11 @@ class Workers:
         bounds = items if isinstance(items, Sequence) else self._alike(items)
         self._launch(kernel, bounds, lambda worker: (worker, *arguments), RAYS, packed)
 
+    def launch_alone(self, kernel: wp.Kernel, *arguments: Any, packed: Packed) -> None:
+        """Run kernel(0, *arguments) once on the CPU, while the other workers wait."""
+        self.load(kernel)
+        packed.launch(0, kernel, 1, [0, *arguments], self.device)
+
     def load(self, kernel: wp.Kernel) -> None:
         """Compile a kernel, or fetch it from the cache, once: else every thread would."""
         if kernel not in self._loaded:

@@ -134,8 +134,8 @@ def render_rays(
     workers.launch_owned(
         kernels.render_forward_kernel(variant),
         n,
-        grid.struct(),
-        free.struct(grid.border),
+        grid.struct,
+        free.struct,
         steps.struct(),
         origins,
         directions,
@@ -209,8 +209,7 @@ class TrainingPass:
         )
         """How batches are put through."""
         self._capacity, self._kept = scratch(kernels, variant, KEPT_PACKS, workers)
-        self._grid = grid.struct()
-        self._border = grid.border
+        self._grid = grid.struct
         self._steps = steps.struct()
         self.n_rays = n_rays
         """Rays of the last run; before the first, those that there is room for."""
@@ -232,9 +231,9 @@ class TrainingPass:
         self.n_rays = batch.count
         self.launch.run(
             batch.count,
-            self.gradients.struct(),
+            self.gradients.struct,
             self._grid,
-            free.struct(self._border),
+            free.struct,
             self._steps,
             batch.origins,
             batch.directions,

@@ -37,7 +37,11 @@ def training_kernels(
     Kernels that share a module with one of these are compiled along with it.
     """
     variant = _variant(contraction, scaling, jacobian, device)
-    sharing = [parcels.measure_rays_kernel(variant.contraction), parcels.deliver_parcels]
+    sharing = [
+        parcels.measure_rays_kernel(variant.contraction),
+        parcels.share_out,
+        parcels.deliver_parcels,
+    ]
     return [
         camera.sample_pixels,
         *(sharing if variant.packed else []),

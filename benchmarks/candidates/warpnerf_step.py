@@ -8,11 +8,17 @@ from warpnerf_kernels.tiles import STRETCH, TILE, next_tile, tile_of
 from warpnerf_kernels.types import Gradient, vec4
 from workload import Workload
 
-from warpnerf.parallel import Workers
+from warpnerf.parallel import Packed, Workers
 from warpnerf.render import TrainingPass, render_rays
 
 
-@wp.func_native("memset(values.data + node, 0, sizeof(*values.data) * count);")
+@wp.func_native(
+    """
+const size_t n = sizeof(*values.data);
+if (count == TILE) memset(values.data + node, 0, TILE * n);  // as long as the compiler knows
+else memset(values.data + node, 0, count * n);
+""".replace("TILE", str(TILE))
+)
 def clear_nodes(values: wp.array(dtype=vec4), node: int, count: int):
     """Zero some nodes."""
     ...
@@ -25,8 +31,9 @@ def clear(
     gradient: Gradient,  # zeroed
 ):
     """What adam_step has to do with gradients: zero what was touched."""
+    n_nodes = gradient.values.shape[0]
     start = (first + wp.tid()) * span
-    end = wp.min(start + span, gradient.values.shape[0])
+    end = wp.min(start + span, n_nodes)
     last = tile_of(end - 1) + 1
     tile = next_tile(gradient.touched, tile_of(start), last)
     while tile < last:
@@ -46,6 +53,7 @@ class WarpStep:
         self._free = work.free_cells(workers)
         self._steps = work.steps()
         self._batch = work.batch(workers)
+        self._packed = Packed()
         scaling = "clamped" if work.scaled else "none"
         self._pass = TrainingPass(
             self._batch.count, self._grid, self._steps, scaling, "none", workers
@@ -56,7 +64,7 @@ class WarpStep:
         gradients = self._pass.gradients
         span = 1 if self._workers.device.is_cuda else STRETCH
         n = -(-gradients.values.shape[0] // span)
-        self._workers.launch(clear, n, span, gradients.struct())
+        self._workers.launch(clear, n, span, gradients.struct, packed=self._packed)
         gradients.touched.zero_()
         self._pass.run(self._free, self._batch)
 
@@ -89,11 +97,14 @@ class WarpStep:
         parcels = self._pass.launch.parcels
         if parcels is None:
             return used, used
-        room = used + parcels.contents.capacity + parcels.next.capacity
+        room = used + parcels.contents.capacity + parcels.addressed.capacity
         contents = parcels.contents.numpy().view(np.uint8).reshape(parcels.contents.size, -1)
         contents.fill(255)
+        parcels.addressed.fill_(-1)
         self.step()
-        return used + int((contents != 255).any(axis=1).sum()) * contents.shape[1], room
+        used += int((contents != 255).any(axis=1).sum()) * contents.shape[1]
+        used += 4 * int((parcels.addressed.numpy() != -1).sum())
+        return used, room
 
 
 def obstacle(device: str) -> str | None:

@@ -14,7 +14,7 @@ import warp as wp
 
 from .contraction import L2, NONE
 from .types import FreeSpace, Grid, March, Ray
-from .vectors import VECTORS, float3, float4, lanes, lanes_int
+from .vectors import VECTORS, by_column, float3, float4, lanes, lanes_int
 
 wp.set_module_options({"enable_backward": False})
 
@@ -32,12 +32,8 @@ class Pack:
     t: lanes  # distance from the ray's origin
     dt: lanes  # step length
     det_jacobian: lanes  # |det J| of the contraction, 1 without
-    i: lanes_int  # index along x of the lowest of the eight nodes around
-    base: lanes_int  # its flat index
-    share_00: lanes  # of the four columns of nodes around, by x and y; together 1
-    share_01: lanes
-    share_10: lanes
-    share_11: lanes
+    base: lanes_int  # flat index of the lowest of the eight nodes around
+    shares: by_column  # of the four columns of nodes around, by x and y; together 1
     fraction_x: lanes  # position between the nodes, [0, 1]
     fraction_y: lanes
     fraction_z: lanes
@@ -110,20 +106,16 @@ auto index = [&](ivec i, ivec j, ivec l) -> ivec {
 ivec i = clamp(truncate(ux), grid.size.c[0] - 1);
 ivec j = clamp(truncate(uy), grid.size.c[1] - 1);
 ivec l = clamp(truncate(uz), grid.size.c[2] - 1);
-vec fx = visited ? ux - to_float(i) : all(0.0f), gx = 1.0f - fx;
-vec fy = visited ? uy - to_float(j) : all(0.0f), gy = 1.0f - fy;
 store_int(pack.visited, visited);
 store(pack.t, visited ? t : all(0.0f));
 store(pack.dt, dt);
 store(pack.det_jacobian, det_jacobian);
-store_int(pack.i, i);
 store_int(pack.base, index(i, j, l));
-store(pack.share_00, gx * gy);
-store(pack.share_01, gx * fy);
-store(pack.share_10, fx * gy);
-store(pack.share_11, fx * fy);
-store(pack.fraction_x, fx);
-store(pack.fraction_y, fy);
+const vec fraction_x = visited ? ux - to_float(i) : all(0.0f);
+const vec fraction_y = visited ? uy - to_float(j) : all(0.0f);
+split(fraction_x, fraction_y, pack.shares.data);
+store(pack.fraction_x, fraction_x);
+store(pack.fraction_y, fraction_y);
 store(pack.fraction_z, visited ? uz - to_float(l) : all(0.0f));
 pack.step = step;
 // Memory is slower than all of this: fetch what the next pack will read, going straight on.
@@ -162,16 +154,17 @@ def place(
 auto& pack = packs.data[slot];
 const float* values = (const float*)grid.values.data;
 const size_t stride_y = 4 * (size_t)grid.size.c[2], stride_x = stride_y * grid.size.c[1];
+const auto& shares = pack.shares.data;
 quad raw[LANES];
 #pragma clang loop unroll(full)
 for (int n = 0; n < LANES; ++n) {
     // A column's two nodes lie side by side: one vector holds both.
     auto column = [&](const float* node) -> octet { return *(const octet_at*)node; };
     const float* node = values + 4 * (size_t)pack.base.c[n];
-    octet both = pack.share_00.c[n] * column(node);
-    both = fma(octet(pack.share_01.c[n]), column(node + stride_y), both);
-    both = fma(octet(pack.share_10.c[n]), column(node + stride_x), both);
-    both = fma(octet(pack.share_11.c[n]), column(node + stride_x + stride_y), both);
+    octet both = shares[0][n] * column(node);
+    both = fma(octet(shares[1][n]), column(node + stride_y), both);
+    both = fma(octet(shares[2][n]), column(node + stride_x), both);
+    both = fma(octet(shares[3][n]), column(node + stride_x + stride_y), both);
     raw[n] = fma(quad(pack.fraction_z.c[n]), both.hi - both.lo, both.lo);
 }
 vec density, red, green, blue;

@@ -2,9 +2,9 @@
 
 Rays cross the grid in every direction; adding as they go, threads would race for its nodes. So each
 worker owns a part of the grid, some planes of nodes along x, and is the only one to add to it. What
-its rays have for its own part it adds at once; what they have for another's it leaves in parcels, a
-sample in each. Once all rays are through, each worker adds what the others have left for it. That
-is the less, the more of a ray goes through the part of the worker that has it: rays are shared out
+its rays have for its own part it adds at once; a pack of samples that has something for others goes
+into a parcel. Once all rays are through, each worker adds what the others have left for it. That is
+the less, the more of a ray goes through the part of the worker that has it: rays are shared out
 along x by where their middles lie, to each worker as much work. What is added to a node, and in
 which order, depends on nothing but the rays and the number of workers.
 
@@ -19,54 +19,94 @@ from .contraction import contract
 from .march import prepare_ray, step_edge
 from .packs import Pack
 from .types import Gradient, Grid, March, real, vec3
-from .vectors import VECTORS, float3, float4
+from .vectors import LANES, VECTORS, lanes, lanes_int
 
 wp.set_module_options({"enable_backward": False})
-
-BLOCK = 64
-"""Parcels from one worker to another that lie side by side in memory."""
 
 
 @wp.struct
 class Parcel:
-    """What a sample has for the nodes around it, of which some belong to another worker."""
+    """What a pack of samples has for the nodes around them, not all of which are the sender's."""
 
-    adj: float4  # of the grid's raw values at the sample
-    fraction: float3  # position between the nodes, [0, 1]
-    base: int  # flat index of the lowest of the eight nodes
+    visited: wp.uint32  # bit n: lane n is a sample
+    base: lanes_int  # flat index of the lowest of the eight nodes around
+    fraction_x: lanes  # position between the nodes, [0, 1]
+    fraction_y: lanes
+    fraction_z: lanes
+    adj_density: lanes  # of the raw values at the samples
+    adj_red: lanes
+    adj_green: lanes
+    adj_blue: lanes
 
 
 @wp.struct
 class Parcels:
-    """Parcels on their way between workers: chains of blocks from each to each."""
+    """Parcels on their way between workers."""
 
-    contents: wp.array2d(dtype=Parcel)  # [n_workers, BLOCK * n_blocks] by sender
-    next: wp.array2d(dtype=wp.int32)  # [n_workers, n_blocks] the block that follows in the chain
-    # By sender, in rows of whole cache lines, and by receiver:
-    first_block: wp.array2d(dtype=wp.int32)  # of the chain
-    end: wp.array2d(dtype=wp.int32)  # one past its last parcel; 0 if there is none
-    used: wp.array2d(dtype=wp.int32)  # by sender alone: blocks that are in use
+    contents: wp.array2d(dtype=Parcel)  # [n_workers, n_packs] by sender
+    addressed: wp.array3d(dtype=wp.int32)  # [n_workers, n_workers, n_packs] by sender and receiver:
+    # which of the contents are for whom
+    # How many there are of both, by sender, in rows of whole cache lines, which no two workers
+    # share:
+    n_contents: wp.array2d(dtype=wp.int32)  # [n_workers, row] in the first column
+    n_addressed: wp.array2d(dtype=wp.int32)  # [n_workers, row] by receiver
     gradient: Gradient  # where it all goes
     order: wp.array(dtype=wp.int32)  # [n_rays] all of the first worker's, of the second's, ...
 
 
 WORDS = (
     VECTORS
-    + f"constexpr int BLOCK = {BLOCK}, AHEAD = 16;"
     + r"""
-const int n_workers = parcels.end.shape[0];
-const int row = parcels.end.shape[1];  // numbers in a sender's row
+const int n_workers = parcels.contents.shape[0], n_packs = parcels.contents.shape[1];
+const int row = parcels.n_addressed.shape[1];  // numbers in a sender's row
 const int n_planes = (size.c[0] + n_workers - 1) / n_workers;  // of nodes, for each worker
-const int own_first = worker * n_planes, own_end = own_first + n_planes;
 const int stride_y = size.c[2], stride_x = stride_y * size.c[1];
 auto* values = parcels.gradient.values.data;
 auto* flags = parcels.gradient.touched.data;
-// Give a column's two nodes their shares of what a sample has, split by its position along z.
-auto add_column = [&](int node, float share, quad low, quad high) {
-    quad_at* pair = (quad_at*)(values + node);
-    pair[0] = fma(quad(share), low, quad(pair[0]));
-    pair[1] = fma(quad(share), high, quad(pair[1]));
+auto first_node = [&](int owner) -> int { return least(owner * n_planes, size.c[0]) * stride_x; };
+auto owned = [&](int owner, ivec node) -> unsigned {
+    return bits((first_node(owner) <= node) & (node < first_node(owner + 1)));
+};
+auto fetch_own = [&](const auto& samples) {
+    each(owned(worker, load_int(samples.base)), [&](int n) {
+        fetch(values + samples.base.c[n], size);
+    });
+};
+// Give a column's two nodes their shares of what a sample has for both.
+auto add_column = [&](int node, float share, octet both) {
+    octet_at* pair = (octet_at*)(values + node);
+    *pair = fma(octet(share), both, octet(*pair));
     flags[(unsigned)node / TILE] = 1;  // on the border of two parts by either, with the same 1
+};
+// Add what samples have for the worker's own planes. Returns whether that is all of it.
+auto add_own = [&](const auto& samples, unsigned visited, const auto& shares, vec adj_density,
+                   vec adj_red, vec adj_green, vec adj_blue) -> bool {
+    quad adj[LANES];
+    to_quads(adj_density, adj_red, adj_green, adj_blue, adj);
+    auto add_plane = [&](int n, int node, const auto* share) {
+        octet both;
+        both.hi = samples.fraction_z.c[n] * adj[n];
+        both.lo = adj[n] - both.hi;
+        add_column(node, share[0][n], both);
+        add_column(node + stride_y, share[1][n], both);
+    };
+    auto add_lower = [&](int n) { add_plane(n, samples.base.c[n], shares); };
+    auto add_upper = [&](int n) { add_plane(n, samples.base.c[n] + stride_x, shares + 2); };
+    const ivec base = load_int(samples.base);
+    const unsigned lower = visited & owned(worker, base);
+    const unsigned upper = visited & owned(worker, base + stride_x);
+    if ((lower & upper) == visited) {
+        #pragma clang loop unroll(full)
+        for (int n = 0; n < LANES; ++n) {
+            if (!(visited >> n & 1)) continue;
+            add_lower(n);
+            add_upper(n);
+        }
+        return true;
+    }
+    each(lower, add_lower);
+    each(upper, add_upper);
+    return false;
 };
 """
 )
@@ -76,66 +116,32 @@ auto add_column = [&](int node, float share, quad low, quad high) {
 @wp.func_native(
     WORDS
     + r"""
-auto& pack = packs.data[slot];
-auto own = [&](ivec i) -> unsigned { return bits((own_first <= i) & (i < own_end)); };
-each(own(load_int(packs.data[later].i)), [&](int n) {
-    fetch(values + packs.data[later].base.c[n], size);
-});
-vec red = load(pack.red), green = load(pack.green), blue = load(pack.blue);
-quad adj[LANES];
-to_quads(
-    load(pack.sigma_slope) * load(pack.adj_sigma),
-    red * (1.0f - red) * load(pack.adj_red),
-    green * (1.0f - green) * load(pack.adj_green),
-    blue * (1.0f - blue) * load(pack.adj_blue),
-    adj);
-auto send = [&](int n, int receiver) {
-    auto* contents = parcels.contents.data + (size_t)worker * parcels.contents.shape[1];
-    int* next = parcels.next.data + (size_t)worker * parcels.next.shape[1];
-    int& used = parcels.used.data[worker * row];
-    int& first = parcels.first_block.data[worker * row + receiver];
-    int& end = parcels.end.data[worker * row + receiver];
-    if (end % BLOCK == 0) {
-        if (end == 0) first = used;
-        else next[end / BLOCK - 1] = used;
-        end = BLOCK * used++;
-    }
-    auto& parcel = contents[end++];
-    *(quad_at*)&parcel.adj = adj[n];
-    parcel.fraction.c[0] = pack.fraction_x.c[n];
-    parcel.fraction.c[1] = pack.fraction_y.c[n];
-    parcel.fraction.c[2] = pack.fraction_z.c[n];
-    parcel.base = pack.base.c[n];
-};
-auto add_plane = [&](int n, int base, float share, float share_y) {
-    quad high = pack.fraction_z.c[n] * adj[n], low = adj[n] - high;
-    add_column(base, share, low, high);
-    add_column(base + stride_y, share_y, low, high);
-};
-auto add_lower = [&](int n) {
-    add_plane(n, pack.base.c[n], pack.share_00.c[n], pack.share_01.c[n]);
-};
-auto add_upper = [&](int n) {
-    add_plane(n, pack.base.c[n] + stride_x, pack.share_10.c[n], pack.share_11.c[n]);
-};
-const ivec i = load_int(pack.i);
+const auto& pack = packs.data[slot];
+fetch_own(packs.data[later]);
 const unsigned visited = bits(load_int(pack.visited));
-const unsigned lower = own(i), upper = own(i + 1);
-if ((lower & upper & visited) == visited) {
-    #pragma clang loop unroll(full)
-    for (int n = 0; n < LANES; ++n) {
-        if (!(visited >> n & 1)) continue;
-        add_lower(n);
-        add_upper(n);
-    }
-} else {
-    each(visited, [&](int n) {
-        const bool own_lower = lower >> n & 1, own_upper = upper >> n & 1;
-        if (own_lower) add_lower(n);
-        else send(n, i[n] / n_planes);
-        if (own_upper) add_upper(n);
-        else if (own_lower || (i[n] + 1) % n_planes == 0) send(n, (i[n] + 1) / n_planes);
-    });
+const vec red = load(pack.red), green = load(pack.green), blue = load(pack.blue);
+const vec adj_density = load(pack.sigma_slope) * load(pack.adj_sigma);
+const vec adj_red = red * (1.0f - red) * load(pack.adj_red);
+const vec adj_green = green * (1.0f - green) * load(pack.adj_green);
+const vec adj_blue = blue * (1.0f - blue) * load(pack.adj_blue);
+if (add_own(pack, visited, pack.shares.data, adj_density, adj_red, adj_green, adj_blue)) return;
+const int sent = parcels.n_contents.data[worker * row]++;
+auto& parcel = parcels.contents.data[(size_t)worker * n_packs + sent];
+const ivec base = load_int(pack.base);
+parcel.visited = visited;
+store_int(parcel.base, base);
+store(parcel.fraction_x, load(pack.fraction_x));
+store(parcel.fraction_y, load(pack.fraction_y));
+store(parcel.fraction_z, load(pack.fraction_z));
+store(parcel.adj_density, adj_density);
+store(parcel.adj_red, adj_red);
+store(parcel.adj_green, adj_green);
+store(parcel.adj_blue, adj_blue);
+for (int receiver = 0; receiver < n_workers; ++receiver) {
+    const unsigned theirs = owned(receiver, base) | owned(receiver, base + stride_x);
+    if (receiver == worker || !(theirs & visited)) continue;
+    int& n = parcels.n_addressed.data[worker * row + receiver];
+    parcels.addressed.data[((size_t)worker * n_workers + receiver) * n_packs + n++] = sent;
 }
 """
 )
@@ -147,44 +153,37 @@ def hand_out(
     worker: int,
     parcels: Parcels,
 ):
-    """integral.adj_shade, down to interp.adj_gather, for a pack; or as far as parcels."""
+    """integral.adj_shade, down to interp.adj_gather, for a pack; or as far as a parcel."""
     ...
 
 
 @wp.func_native(
     WORDS
     + r"""
-auto add = [&](const auto& parcel) {
-    const quad adj = *(const quad_at*)&parcel.adj;
-    const float fx = parcel.fraction.c[0], fy = parcel.fraction.c[1], fz = parcel.fraction.c[2];
-    const quad high = fz * adj, low = adj - high;
-    const int base = parcel.base;
-    if (base >= (long long)own_first * stride_x) {
-        add_column(base, (1.0f - fx) * (1.0f - fy), low, high);
-        add_column(base + stride_y, (1.0f - fx) * fy, low, high);
-    }
-    if (base + stride_x < (long long)own_end * stride_x) {
-        add_column(base + stride_x, fx * (1.0f - fy), low, high);
-        add_column(base + stride_x + stride_y, fx * fy, low, high);
-    }
+constexpr int SOON = 4;  // parcels from the one that is added to the one that is asked for
+auto fetch_whole = [&](const auto& x) {
+    for (size_t at = 0; at < sizeof(x); at += 64) __builtin_prefetch((const char*)&x + at);
 };
 for (int sender = 0; sender < n_workers; ++sender) {
-    const auto* contents = parcels.contents.data + (size_t)sender * parcels.contents.shape[1];
-    const int* next = parcels.next.data + (size_t)sender * parcels.next.shape[1];
-    int block = parcels.first_block.data[sender * row + worker];
-    int& end = parcels.end.data[sender * row + worker];
-    while (end) {
-        const auto* parcel = contents + (size_t)BLOCK * block;
-        const bool is_last = block == (end - 1) / BLOCK;
-        const int n_here = is_last ? end - BLOCK * block : BLOCK;
-        for (int n = 0; n < AHEAD && n < n_here; ++n) fetch(values + parcel[n].base, size);
-        for (int n = 0; n < n_here; ++n) {
-            if (n + AHEAD < n_here) fetch(values + parcel[n + AHEAD].base, size);
-            add(parcel[n]);
-        }
-        if (is_last) end = 0;
-        else block = next[block];
+    const auto* contents = parcels.contents.data + (size_t)sender * n_packs;
+    const int* which = parcels.addressed.data + ((size_t)sender * n_workers + worker) * n_packs;
+    int& n = parcels.n_addressed.data[sender * row + worker];
+    for (int k = 0; k < n; ++k) {
+        if (k + SOON < n) fetch_whole(contents[which[k + SOON]]);
+        if (k + 1 < n) fetch_own(contents[which[k + 1]]);
+        const auto& parcel = contents[which[k]];
+        float shares[4][LANES];
+        split(load(parcel.fraction_x), load(parcel.fraction_y), shares);
+        add_own(
+            parcel,
+            parcel.visited,
+            shares,
+            load(parcel.adj_density),
+            load(parcel.adj_red),
+            load(parcel.adj_green),
+            load(parcel.adj_blue));
     }
+    n = 0;
 }
 """
 )
@@ -200,7 +199,10 @@ def deliver_parcels(first: int, size: wp.vec3i, parcels: Parcels):
 
 
 RAY = 4
-"""What a ray takes besides its steps, in steps."""
+"""What a ray takes besides its packs, in steps."""
+
+PLACES = 1024
+"""How finely the middles of rays are told apart along x."""
 
 
 @cache
@@ -214,15 +216,67 @@ def measure_rays_kernel(contraction: int) -> wp.Kernel:
         march: March,
         origins: wp.array(dtype=vec3),  # [n_rays] scene units
         directions: wp.array(dtype=vec3),  # [n_rays] unit vectors
-        out_work: wp.array(dtype=wp.int32),  # [n_rays] steps in the grid, and RAY
-        out_middle: wp.array(dtype=wp.uint16),  # [n_rays] 0: first plane of nodes; 65535: last
+        out_work: wp.array(dtype=wp.int32),  # [n_rays] steps in the grid in whole packs, and RAY
+        out_place: wp.array(dtype=wp.int32),  # [n_rays] 0: first plane of nodes; PLACES - 1: last
     ):
         i = first + wp.tid()
         ray = prepare_ray(grid, march, origins[i], directions[i], real(0.0), contraction)
         t = wp.min(step_edge(march, (ray.begin + ray.end) // 2), march.far)
         q = contract(ray.q_origin + t * ray.q_direction, grid.border, contraction)
         x = (q[0] * grid.to_nodes[0] + grid.middle[0]) / (real(2.0) * grid.middle[0])
-        out_work[i] = ray.end - ray.begin + wp.static(RAY)
-        out_middle[i] = wp.uint16(wp.clamp(x, real(0.0), real(1.0)) * real(65535.0))
+        n_packs = (ray.end - ray.begin + wp.static(LANES - 1)) // wp.static(LANES)
+        out_work[i] = n_packs * wp.static(LANES) + wp.static(RAY)
+        out_place[i] = int(wp.clamp(x, real(0.0), real(1.0)) * real(wp.static(PLACES - 1)))
 
     return measure_rays
+
+
+@wp.kernel
+def share_out(
+    first: int,  # a launch is one thread
+    begin: int,  # ray to begin with
+    end: int,  # after the last one, at most
+    most_work: wp.int64,  # that there is room for
+    work: wp.array(dtype=wp.int32),  # [n_rays] by measure_rays
+    place: wp.array(dtype=wp.int32),  # [n_rays] by measure_rays
+    until: wp.array(dtype=wp.int64),  # [PLACES] scratch
+    owner: wp.array(dtype=wp.int32),  # [n_rays] scratch
+    out_bounds: wp.array(dtype=wp.int32),  # [n_workers + 1] where in order each worker's begin
+    out_order: wp.array(dtype=wp.int32),  # [n_rays] all of the first worker's, of the second's, ...
+):
+    """Give the workers the next rays by where their middles lie, each as much work.
+
+    These are as many as there is room for, but one at least. A worker's rays keep their order.
+    """
+    n_workers = out_bounds.shape[0] - 1
+    for p in range(wp.static(PLACES)):
+        until[p] = wp.int64(0)
+    total = wp.int64(0)
+    i = int(begin)
+    while i < end and (i == begin or total + wp.int64(work[i]) <= most_work):
+        total += wp.int64(work[i])
+        until[place[i]] += wp.int64(work[i])
+        i += 1
+    last = i
+    before = wp.int64(0)
+    for p in range(wp.static(PLACES)):  # work of all rays at places before this one
+        here = until[p]
+        until[p] = before
+        before += here
+    out_bounds[0] = begin
+    for w in range(n_workers):
+        out_bounds[w + 1] = 0
+    for i in range(begin, last):
+        before = until[place[i]]
+        until[place[i]] = before + wp.int64(work[i])
+        owner[i] = int(before * wp.int64(n_workers) // total)
+        out_bounds[owner[i] + 1] += 1  # counts a worker's rays
+    at = int(begin)
+    for w in range(n_workers):
+        n = out_bounds[w + 1]
+        out_bounds[w + 1] = at  # where its next ray goes
+        at += n
+    for i in range(begin, last):
+        at = out_bounds[owner[i] + 1]
+        out_bounds[owner[i] + 1] = at + 1
+        out_order[at] = i

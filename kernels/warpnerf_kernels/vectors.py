@@ -10,6 +10,7 @@ others a vector is two or four of theirs, which do not wait for each other."""
 
 lanes = wp.types.vector(LANES, wp.float32)
 lanes_int = wp.types.vector(LANES, wp.int32)
+by_column = wp.types.matrix((4, LANES), wp.float32)
 float3 = wp.types.vector(3, wp.float32)
 float4 = wp.types.vector(4, wp.float32)
 
@@ -157,6 +158,14 @@ auto to_lanes = [&](const quad* q, vec& a, vec& b, vec& c, vec& d) {
 auto to_quads = [&](vec a, vec b, vec c, vec d, quad* q) {
     octets_to_quads(a.lo, b.lo, c.lo, d.lo, q);
     octets_to_quads(a.hi, b.hi, c.hi, d.hi, q + 8);
+};
+// Shares of the four columns of nodes around samples, by x and y; together 1.
+auto split = [&](vec fraction_x, vec fraction_y, auto& shares) {
+    vec rest_x = 1.0f - fraction_x, rest_y = 1.0f - fraction_y;
+    store(shares[0], rest_x * rest_y);
+    store(shares[1], rest_x * fraction_y);
+    store(shares[2], fraction_x * rest_y);
+    store(shares[3], fraction_x * fraction_y);
 };
 // Bring the four columns of nodes around a sample into the cache, ahead of their use.
 auto fetch = [&](const auto* node, const auto& size) {
