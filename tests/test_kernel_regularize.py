@@ -13,7 +13,7 @@ from warpnerf_kernels.tiles import STRETCH, TILE
 def problem(seed: int) -> tuple[Any, Any]:
     """A grid with differences on both sides of 1, and weights that differ by channel."""
     rng = np.random.default_rng(seed)
-    size = rng.integers(2, 6, size=3)
+    size = rng.integers(2, (6, 6, 15), size=3)
     return rng.normal(size=(*size, 4)), rng.uniform(0.5, 2.0, size=4)
 
 
@@ -99,6 +99,14 @@ def test_only_nodes_with_a_gradient_are_touched(kernels64: Kernels) -> None:
         after = adj_variation(kernels64, values, weight, already)
         assert not after[~touched].any()
         assert_close((after - already)[touched], full[touched], 1e-12)
+
+
+def test_float32_against_float64(kernels64: Kernels, device: str) -> None:
+    for seed in range(N_SEEDS):
+        values, weight = problem(seed)
+        ones = np.ones((values[..., 0].size, 4))
+        in_float32 = adj_variation(Kernels("float32", device), values, weight, ones)
+        assert_close(in_float32, adj_variation(kernels64, values, weight, ones), 1e-6)
 
 
 def test_tiles_that_are_not_flagged_are_passed_over(kernels64: Kernels) -> None:

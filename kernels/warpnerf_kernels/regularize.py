@@ -80,6 +80,52 @@ def adj_node_variation(
     return wp.cw_mul(weight, total)
 
 
+@wp.func_native(
+    f"constexpr int CHANNELS = {4 * TILE};"
+    + r"""
+#if defined(__CUDA_ARCH__)
+return false;
+#else
+typedef __typeof__(values.data->c[0] + 0) scalar;
+typedef scalar numbers __attribute__((ext_vector_type(CHANNELS)));
+auto load = [&](const auto* from) -> numbers {
+    numbers x;
+    memcpy(&x, from, sizeof(x));
+    return x;
+};
+const int stride_y = size.c[2], stride_x = size.c[1] * size.c[2];
+const auto* here = values.data + node;
+const numbers value = load(here), one = 1;
+auto pull = [&](const auto* other) -> numbers {
+    return __builtin_elementwise_max(__builtin_elementwise_min(value - load(other), one), -one);
+};
+numbers total = pull(here - stride_x) + pull(here + stride_x);
+total = total + pull(here - stride_y) + pull(here + stride_y);
+total = total + pull(here - 1) + pull(here + 1);
+numbers weights;
+for (int n = 0; n < CHANNELS; ++n) weights[n] = weight.c[n % 4];
+auto* adj = gradient.values.data + node;
+const numbers before = load(adj);
+auto seen = before != 0;  // and then a node's other channels, too
+seen |= __builtin_shufflevector(seen, seen, 1, 0, 3, 2, 5, 4, 7, 6, 9, 8, 11, 10, 13, 12, 15, 14);
+seen |= __builtin_shufflevector(seen, seen, 2, 3, 0, 1, 6, 7, 4, 5, 10, 11, 8, 9, 14, 15, 12, 13);
+const numbers after = seen ? before + weights * total : before;
+memcpy(adj, &after, sizeof(after));
+return true;
+#endif
+"""
+)
+def add_tile_variation(
+    values: wp.array(dtype=vec4), size: wp.vec3i, weight: vec4, node: int, gradient: Gradient
+) -> bool:
+    """Add adj_node_variation to a tile, from its first node, where gradient is not 0.
+
+    All nodes around must be in the grid. Only a CPU does so, in Clang's vector types; returns
+    whether it is done.
+    """
+    ...
+
+
 @wp.kernel
 def total_variation_forward(
     first: int,
@@ -103,8 +149,9 @@ def total_variation_backward(
     gradient: Gradient,  # added to where not 0
 ):
     """d TV / d x at the nodes that already have a gradient; unseen ones stay as they are."""
+    n_nodes = values.shape[0]
     start = (first + wp.tid()) * span
-    end = start + wp.min(span, values.shape[0] - start)
+    end = start + wp.min(span, n_nodes - start)
     last = tile_of(end - 1) + 1
     stride_y = size[2]
     stride_x = size[1] * size[2]
@@ -122,9 +169,15 @@ def total_variation_backward(
     while tile < last:
         node = tile * wp.static(TILE)
         first_node = wp.max(start, node)
+        end_node = wp.min(end, node + wp.static(TILE))
         j = (first_node // size[2]) % size[1]
         k = first_node % size[2]
-        for n in range(first_node, wp.min(end, node + wp.static(TILE))):
+        inside = end_node - first_node == wp.static(TILE)
+        inside = inside and node >= stride_x and node < n_nodes - stride_x
+        inside = inside and j > 0 and j + 1 < size[1] and k > 0 and k + wp.static(TILE) < size[2]
+        if inside and add_tile_variation(values, size, weight, node, gradient):
+            end_node = first_node
+        for n in range(first_node, end_node):
             adj = gradient.values[n]
             if not (adj == vec4()):
                 gradient.values[n] = adj + adj_node_variation(values, size, weight, n, j, k)
