@@ -84,6 +84,7 @@ class Workload:
         return FreeCells(
             distance=wp.array(self.free.ravel(), dtype=wp.uint8, device=workers.device),
             size=(size[0], size[1], size[2]),
+            border=0.0,
         )
 
     def steps(self) -> Steps:

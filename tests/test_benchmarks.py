@@ -109,6 +109,12 @@ def test_throughput(tmp_path):
     assert plot.exists() or "no plot: matplotlib is not installed" in printed
 
 
+def test_one_thread_uses_all_that_it_has_room_for(on_cpu):
+    work = workload.make_workload("random", 8, 64, 16)
+    used, room = WarpStep(work, 1, "cpu").scratch_bytes()
+    assert 0 < used == room
+
+
 def test_rendering(tmp_path):
     options = ("--grid", "24", "--pixels", "16", "--rounds", "2", "--threads", "2")
     record, _ = run("rendering.py", tmp_path / "record.json", *options)

@@ -69,15 +69,41 @@ def one_sample_each(nodes: Any, size: tuple[int, int, int], seed: int = 0) -> Pr
     return replace(p, origins=at - 0.05 * p.directions)
 
 
-@pytest.mark.parametrize("n", [1, 2, 5, 129])
+@pytest.mark.parametrize("n", [1, 2, 5, 130])
 def test_any_number_of_parcels(n: int) -> None:
-    """Each worker has a parcel of each of its n rays for the other one that owns a plane of it."""
+    """Each worker has a parcel of each of its n rays for those others that own a plane of it."""
     size = (PLANES, 7, 6)
     for threads, plane in ((2, 2), (3, 1), (3, 3)):
         nodes = np.random.default_rng(n).uniform(size=(threads * n, 3)) * (1, 6, 5) + (plane, 0, 0)
         p = one_sample_each(nodes, size)
         assert (of(1).forward(p).n_samples == 1).all()
         assert_close(of(threads).backward(p), of(1).backward(p), 3e-6)
+
+
+def test_nothing_is_sent_of_what_is_all_one_s_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rays in the first worker's part, half of them the second's, each a sample."""
+    n = 20
+    nodes = np.random.default_rng(8).uniform(size=(n, 3)) * (1.9, 6, 5)
+    p = one_sample_each(nodes, (PLANES, 7, 6))
+    launches = launches_of(monkeypatch)
+    gradient = of(2).backward(p)
+    made = launches[0].parcels
+    assert made is not None
+    assert made.n_contents.numpy()[:, 0].tolist() == [0, n // 2]
+    assert made.n_addressed.numpy()[:, :2].tolist() == [[0, 0], [n // 2, 0]]
+    assert_close(gradient, of(1).backward(p), 3e-6)
+
+
+def launches_of(monkeypatch: pytest.MonkeyPatch) -> list[adjoint.AdjointLaunch]:
+    """Where what is run from now on is listed."""
+    launches: list[adjoint.AdjointLaunch] = []
+    run = adjoint.AdjointLaunch.run
+    monkeypatch.setattr(
+        adjoint.AdjointLaunch,
+        "run",
+        lambda launch, *given: launches.append(launch) or run(launch, *given),
+    )
+    return launches
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3])
@@ -208,25 +234,36 @@ def turns_of(launch: Callable[[], Any], monkeypatch: pytest.MonkeyPatch) -> list
     return turns
 
 
+@pytest.mark.parametrize("contraction", ["none", "linf"])
+def test_rays_that_are_not_finite_are_someone_s(contraction: str) -> None:
+    p = problem(9)
+    if contraction != "none":
+        p = unbounded(p, contraction, 0.2)
+    p.directions[:30] = np.nan
+    p.directions[30:60, 0] = np.inf
+    p.origins[60:90, 0] = -np.inf
+    assert_close(of(2).backward(p), of(1).backward(p), 3e-6)
+
+
 @pytest.mark.parametrize("n_workers", [2, 3, 7])
 @pytest.mark.parametrize("largest", [20, 1 << 30])
-def test_rays_are_shared_out_by_place_and_work(largest: int, n_workers: int) -> None:
-    """Against sorting: rays of more work than there is room for, and many at the same place."""
+def test_rays_are_shared_out_by_middle_and_work(largest: int, n_workers: int) -> None:
+    """Against sorting: rays of more work than there is room for, and many with the same middle."""
     rng = np.random.default_rng(n_workers)
     n, begin, most_work = 200, 17, 900 * largest // 20
     work = rng.integers(1, largest, n)
     work[[begin, 150]] = 2 * most_work if largest == 20 else 2**31 - 1
-    place = rng.integers(0, parcels.PLACES, n)
-    place[::2] = rng.choice([0, 5, parcels.PLACES - 1], n // 2)
-    scratch = [np.zeros(parcels.PLACES, np.int64), np.zeros(n, np.int32)]
+    middle = rng.integers(0, parcels.MIDDLES, n)
+    middle[::2] = rng.choice([0, 5, parcels.MIDDLES - 1], n // 2)
+    scratch = [np.zeros(parcels.MIDDLES, np.int64), np.zeros(n, np.int32)]
     bounds, order = np.zeros(n_workers + 1, np.int32), np.full(n, -1, np.int32)
-    arrays = [work.astype(np.int32), place.astype(np.int32), *scratch, bounds, order]
+    arrays = [work.astype(np.int32), middle.astype(np.int32), *scratch, bounds, order]
     on_device = [wp.array(array, device="cpu", copy=False) for array in arrays]
     while begin < n:
         until = np.cumsum(work[begin:])
         end = begin + max(1, int((until <= most_work).sum()))
-        wp.launch(parcels.share_out, 1, inputs=[0, begin, n, most_work, *on_device], device="cpu")
-        rays = begin + np.argsort(place[begin:end], kind="stable")
+        wp.launch(parcels.share_out, 1, inputs=[begin, n, most_work, *on_device], device="cpu")
+        rays = begin + np.argsort(middle[begin:end], kind="stable")
         until = np.cumsum(work[rays]) - work[rays]
         owner = until * n_workers // work[rays].sum()
         expected = [np.sort(rays[owner == worker]) for worker in range(n_workers)]
@@ -266,13 +303,7 @@ def test_there_is_room_for_all_parcels(monkeypatch: pytest.MonkeyPatch) -> None:
     p.origins[:] = p.box_min + nodes * voxel
     p.directions[:] = (0, 1, 0)
     p = replace(p, steps=Steps(near=0.0, far=4.0, step=0.004))
-    launches: list[adjoint.AdjointLaunch] = []
-    run = adjoint.AdjointLaunch.run
-    monkeypatch.setattr(
-        adjoint.AdjointLaunch,
-        "run",
-        lambda launch, *given: launches.append(launch) or run(launch, *given),
-    )
+    launches = launches_of(monkeypatch)
     of(3).backward(p)
     work = int(launches[0]._work.numpy().sum())
     monkeypatch.setattr(adjoint, "SAMPLES", work + 3 * (most_steps(p) + LANES + parcels.RAY) + 2)
@@ -322,7 +353,6 @@ def test_workers_add_to_no_planes_but_their_own(monkeypatch: pytest.MonkeyPatch)
                 changed = np.flatnonzero(changed.reshape(whole.shape).any((1, 2, 3)))
                 assert len(changed) and (changed // planes == worker).all()
                 seen.append(worker)
-            launch(kernel, n, size, sent, packed=packed)  # there is nothing left
 
         monkeypatch.setattr(kernels.workers, "launch", spy)
 

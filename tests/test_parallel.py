@@ -113,6 +113,14 @@ def test_what_was_interrupted_is_packed_anew(monkeypatch: pytest.MonkeyPatch, on
     assert (visits.numpy() == 2).all() and not others.numpy().any()
 
 
+def test_a_thread_alone(on_cpu: None) -> None:
+    workers, packed = Workers("cpu", 2), Packed()
+    visits = wp.zeros(10, dtype=wp.int32, device="cpu")
+    for first in (3, 3, 7):
+        workers.launch_alone(count_visits, first, visits, packed=packed)
+    assert visits.numpy().tolist() == [0, 0, 0, 2, 0, 0, 0, 1, 0, 0]
+
+
 def test_one_keeps_what_several_kernels_take(on_cpu: None) -> None:
     workers, packed = Workers("cpu", 2), Packed()
     visits = wp.zeros(10, dtype=wp.int32, device="cpu")

@@ -17,9 +17,9 @@ from warpnerf_kernels.vectors import LANES
 from warpnerf.parallel import Packed, Workers
 
 SAMPLES = 1 << 21
-"""Samples whose gradients may be in parcels at a time, of all workers together: room for 68 MB, and
-half a megabyte more for each worker, of which what is used takes memory. Rays that might have more
-samples take turns, so parcels grow with neither rays nor samples."""
+"""Steps, in whole packs, whose gradients may be in parcels at a time, of all workers together: room
+for 68 MB, and half a megabyte more for each worker, of which what is used takes memory. Rays that
+might have more take turns, so parcels grow with neither rays nor samples."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -108,10 +108,10 @@ class AdjointLaunch:
             self.parcels = _make_parcels(room // LANES, count)
             self._order = wp.array(np.arange(n_rays), dtype=wp.int32, device="cpu")
             # What share_out takes from measure_rays, its scratch, and what it gives.
-            self._work, self._place, self._owner = (
+            self._work, self._middles, self._owners = (
                 wp.empty(n_rays, dtype=wp.int32, device="cpu") for _ in range(3)
             )
-            self._until = wp.empty(parcels.PLACES, dtype=wp.int64, device="cpu")
+            self._work_before = wp.empty(parcels.MIDDLES, dtype=wp.int64, device="cpu")
             self._bounds = wp.empty(count + 1, dtype=wp.int32, device="cpu")
         elif not workers.device.is_cuda:
             self._workers = Workers("cpu", 1)
@@ -140,7 +140,7 @@ class AdjointLaunch:
         while begin < n_rays:
             bounds = self._share_out(begin, n_rays)
             self.parcels.n_contents.zero_()
-            self.parcels.n_addressed.zero_()  # in case that the last turn was interrupted
+            self.parcels.n_addressed.zero_()
             self._workers.launch_owned(
                 self._kernel, bounds, *arguments, self.parcels, packed=self._packed
             )
@@ -159,7 +159,7 @@ class AdjointLaunch:
         self._workers.launch(
             parcels.measure_rays_kernel(self._contraction),
             n_rays,
-            *(grid, march, origins, directions, self._work, self._place),
+            *(grid, march, origins, directions, self._work, self._middles),
             packed=self._packed,
         )
 
@@ -176,9 +176,9 @@ class AdjointLaunch:
             end,
             self._work_a_turn,
             self._work,
-            self._place,
-            self._until,
-            self._owner,
+            self._middles,
+            self._work_before,
+            self._owners,
             self._bounds,
             self._order,
             packed=self._packed,
@@ -198,5 +198,4 @@ def _make_parcels(n_packs: int, n_workers: int) -> parcels.Parcels:
     made.n_contents = room(n_workers, row)
     made.addressed = room(n_workers, n_workers, n_packs)
     made.n_addressed = room(n_workers, row)
-    made.n_addressed.zero_()
     return made

@@ -183,14 +183,16 @@ class FreeCells:
     """[MX * MY * MZ] uint8, cells to the nearest occupied one; 0 there."""
     size: tuple[int, int, int]
     """MX, MY, MZ."""
-    border: float = 0.0
-    """That of the grid."""
+    border: float
+    """That of the grid; with a single cell of no matter."""
 
     @staticmethod
     def none(workers: Workers) -> FreeCells:
         """All space is occupied."""
         return FreeCells(
-            distance=wp.zeros(1, dtype=wp.uint8, device=workers.device), size=(1, 1, 1)
+            distance=wp.zeros(1, dtype=wp.uint8, device=workers.device),
+            size=(1, 1, 1),
+            border=0.0,
         )
 
     @staticmethod

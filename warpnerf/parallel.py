@@ -124,9 +124,9 @@ class Workers:
         self._launch(kernel, bounds, lambda worker: (worker, *arguments), RAYS, packed)
 
     def launch_alone(self, kernel: wp.Kernel, *arguments: Any, packed: Packed) -> None:
-        """Run kernel(0, *arguments) once on the CPU, while the other workers wait."""
+        """Run kernel(*arguments) once on the CPU, in this thread."""
         self.load(kernel)
-        packed.launch(0, kernel, 1, [0, *arguments], self.device)
+        packed.launch(0, kernel, 1, list(arguments), self.device)
 
     def load(self, kernel: wp.Kernel) -> None:
         """Compile a kernel, or fetch it from the cache, once: else every thread would."""

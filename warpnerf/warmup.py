@@ -32,7 +32,7 @@ class Warmed:
 def training_kernels(
     contraction: Contraction, scaling: Scaling, jacobian: Jacobian, device: wp.Device
 ) -> list[wp.Kernel]:
-    """The kernels of a training from its first step to its last; one for each module.
+    """The kernels of a training from its first step to its last; at least one for each module.
 
     Kernels that share a module with one of these are compiled along with it.
     """

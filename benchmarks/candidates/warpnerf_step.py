@@ -98,7 +98,8 @@ class WarpStep:
         if parcels is None:
             return used, used
         room = used + parcels.contents.capacity + parcels.addressed.capacity
-        contents = parcels.contents.numpy().view(np.uint8).reshape(parcels.contents.size, -1)
+        contents = parcels.contents.numpy()
+        contents = contents.view(np.uint8).reshape(-1, contents.dtype.itemsize)
         contents.fill(255)
         parcels.addressed.fill_(-1)
         self.step()

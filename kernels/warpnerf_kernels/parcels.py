@@ -63,6 +63,7 @@ const int n_planes = (size.c[0] + n_workers - 1) / n_workers;  // of nodes, for 
 const int stride_y = size.c[2], stride_x = stride_y * size.c[1];
 auto* values = parcels.gradient.values.data;
 auto* flags = parcels.gradient.touched.data;
+// No more than there are, which int holds.
 auto first_node = [&](int owner) -> int { return least(owner * n_planes, size.c[0]) * stride_x; };
 auto owned = [&](int owner, ivec node) -> unsigned {
     return bits((first_node(owner) <= node) & (node < first_node(owner + 1)));
@@ -167,7 +168,7 @@ auto fetch_whole = [&](const auto& x) {
 for (int sender = 0; sender < n_workers; ++sender) {
     const auto* contents = parcels.contents.data + (size_t)sender * n_packs;
     const int* which = parcels.addressed.data + ((size_t)sender * n_workers + worker) * n_packs;
-    int& n = parcels.n_addressed.data[sender * row + worker];
+    const int n = parcels.n_addressed.data[sender * row + worker];
     for (int k = 0; k < n; ++k) {
         if (k + SOON < n) fetch_whole(contents[which[k + SOON]]);
         if (k + 1 < n) fetch_own(contents[which[k + 1]]);
@@ -183,7 +184,6 @@ for (int sender = 0; sender < n_workers; ++sender) {
             load(parcel.adj_green),
             load(parcel.adj_blue));
     }
-    n = 0;
 }
 """
 )
@@ -201,8 +201,8 @@ def deliver_parcels(first: int, size: wp.vec3i, parcels: Parcels):
 RAY = 4
 """What a ray takes besides its packs, in steps."""
 
-PLACES = 1024
-"""How finely the middles of rays are told apart along x."""
+MIDDLES = 1024
+"""How many middles of rays are told apart along x."""
 
 
 @cache
@@ -217,30 +217,31 @@ def measure_rays_kernel(contraction: int) -> wp.Kernel:
         origins: wp.array(dtype=vec3),  # [n_rays] scene units
         directions: wp.array(dtype=vec3),  # [n_rays] unit vectors
         out_work: wp.array(dtype=wp.int32),  # [n_rays] steps in the grid in whole packs, and RAY
-        out_place: wp.array(dtype=wp.int32),  # [n_rays] 0: first plane of nodes; PLACES - 1: last
+        out_middle: wp.array(dtype=wp.int32),  # [n_rays] 0: first plane; MIDDLES - 1: last
     ):
         i = first + wp.tid()
         ray = prepare_ray(grid, march, origins[i], directions[i], real(0.0), contraction)
         t = wp.min(step_edge(march, (ray.begin + ray.end) // 2), march.far)
         q = contract(ray.q_origin + t * ray.q_direction, grid.border, contraction)
         x = (q[0] * grid.to_nodes[0] + grid.middle[0]) / (real(2.0) * grid.middle[0])
-        n_packs = (ray.end - ray.begin + wp.static(LANES - 1)) // wp.static(LANES)
+        # A pack more where the last one is full: a step more or less is a matter of rounding.
+        n_packs = (ray.end - ray.begin) // wp.static(LANES) + 1
         out_work[i] = n_packs * wp.static(LANES) + wp.static(RAY)
-        out_place[i] = int(wp.clamp(x, real(0.0), real(1.0)) * real(wp.static(PLACES - 1)))
+        middle = int(wp.clamp(x, real(0.0), real(1.0)) * real(wp.static(MIDDLES - 1)))
+        out_middle[i] = wp.clamp(middle, 0, wp.static(MIDDLES - 1))  # x may be no number
 
     return measure_rays
 
 
 @wp.kernel
 def share_out(
-    first: int,  # a launch is one thread
     begin: int,  # ray to begin with
     end: int,  # after the last one, at most
     most_work: wp.int64,  # that there is room for
     work: wp.array(dtype=wp.int32),  # [n_rays] by measure_rays
-    place: wp.array(dtype=wp.int32),  # [n_rays] by measure_rays
-    until: wp.array(dtype=wp.int64),  # [PLACES] scratch
-    owner: wp.array(dtype=wp.int32),  # [n_rays] scratch
+    middles: wp.array(dtype=wp.int32),  # [n_rays] by measure_rays
+    work_before: wp.array(dtype=wp.int64),  # [MIDDLES] scratch
+    owners: wp.array(dtype=wp.int32),  # [n_rays] scratch
     out_bounds: wp.array(dtype=wp.int32),  # [n_workers + 1] where in order each worker's begin
     out_order: wp.array(dtype=wp.int32),  # [n_rays] all of the first worker's, of the second's, ...
 ):
@@ -249,34 +250,33 @@ def share_out(
     These are as many as there is room for, but one at least. A worker's rays keep their order.
     """
     n_workers = out_bounds.shape[0] - 1
-    for p in range(wp.static(PLACES)):
-        until[p] = wp.int64(0)
+    for m in range(wp.static(MIDDLES)):
+        work_before[m] = wp.int64(0)
     total = wp.int64(0)
-    i = int(begin)
-    while i < end and (i == begin or total + wp.int64(work[i]) <= most_work):
-        total += wp.int64(work[i])
-        until[place[i]] += wp.int64(work[i])
-        i += 1
-    last = i
+    last = int(begin)
+    while last < end and (last == begin or total + wp.int64(work[last]) <= most_work):
+        total += wp.int64(work[last])
+        work_before[middles[last]] += wp.int64(work[last])
+        last += 1
     before = wp.int64(0)
-    for p in range(wp.static(PLACES)):  # work of all rays at places before this one
-        here = until[p]
-        until[p] = before
+    for m in range(wp.static(MIDDLES)):  # from the work at a middle to that at lower ones
+        here = work_before[m]
+        work_before[m] = before
         before += here
     out_bounds[0] = begin
     for w in range(n_workers):
         out_bounds[w + 1] = 0
     for i in range(begin, last):
-        before = until[place[i]]
-        until[place[i]] = before + wp.int64(work[i])
-        owner[i] = int(before * wp.int64(n_workers) // total)
-        out_bounds[owner[i] + 1] += 1  # counts a worker's rays
+        before = work_before[middles[i]]
+        work_before[middles[i]] = before + wp.int64(work[i])
+        owners[i] = int(before * wp.int64(n_workers) // total)
+        out_bounds[owners[i] + 1] += 1  # counts a worker's rays
     at = int(begin)
     for w in range(n_workers):
         n = out_bounds[w + 1]
         out_bounds[w + 1] = at  # where its next ray goes
         at += n
     for i in range(begin, last):
-        at = out_bounds[owner[i] + 1]
-        out_bounds[owner[i] + 1] = at + 1
+        at = out_bounds[owners[i] + 1]
+        out_bounds[owners[i] + 1] = at + 1
         out_order[at] = i

@@ -8,10 +8,10 @@ SEVERAL = "test_kernel_parcels.py::test_one_thread_against_more"
 TWO = f"{SEVERAL}[none-2]"
 THREE = f"{SEVERAL}[none-3]"
 AT_ONCE = "test_kernel_parcels.py::test_what_a_worker_adds_at_once_is_its_own"
-DELIVERED = "test_kernel_parcels.py::test_workers_add_to_no_planes_but_their_own"
+NOTHING = "test_kernel_parcels.py::test_nothing_is_sent_of_what_is_all_one_s_own"
 NUMBERS = "test_kernel_parcels.py::test_any_number_of_parcels"
 ROOM = "test_kernel_parcels.py::test_there_is_room_for_all_parcels"
-SHARED_OUT = "test_kernel_parcels.py::test_rays_are_shared_out_by_place_and_work"
+SHARED_OUT = "test_kernel_parcels.py::test_rays_are_shared_out_by_middle_and_work"
 WORK = "test_kernel_parcels.py::test_each_worker_has_as_much_work"
 NEAREST = "test_kernel_parcels.py::test_each_worker_has_the_rays_nearest_its_part"
 
@@ -50,8 +50,8 @@ MUTANTS = [
     # what a worker owns
     Mutant("planes rounded down", "parcels.py",
            "(size.c[0] + n_workers - 1) / n_workers", "size.c[0] / n_workers", TWO),
-    Mutant("planes beyond the last", "parcels.py",
-           "least(owner * n_planes, size.c[0]) * stride_x", "owner * n_planes * stride_y", TWO),
+    Mutant("planes as large as rows", "parcels.py",
+           "size.c[0]) * stride_x", "size.c[0]) * stride_y", TWO),
     Mutant("own planes begin one late", "parcels.py",
            "first_node(owner) <= node", "first_node(owner) + stride_x <= node", TWO),
     Mutant("own planes begin one early", "parcels.py",
@@ -73,6 +73,7 @@ MUTANTS = [
     Mutant("add_own: all where the upper plane is one's own", "parcels.py",
            "(lower & upper) == visited", "upper == visited", AT_ONCE),
     Mutant("add_own: all", "parcels.py", "(lower & upper) == visited", "true", AT_ONCE),
+    Mutant("add_own: never all", "parcels.py", "return true;", "return false;", NOTHING),
     Mutant("hand_out: nothing sent", "parcels.py",
            "    const unsigned theirs = owned(receiver, base) | owned(receiver, base + stride_x);",
            "    const unsigned theirs = 0;", TWO),
@@ -117,6 +118,8 @@ MUTANTS = [
            "store(parcel.fraction_z, load(pack.fraction_y))", TWO),
     Mutant("hand_out: density's for red's", "parcels.py",
            "store(parcel.adj_red, adj_red)", "store(parcel.adj_red, adj_density)", TWO),
+    Mutant("hand_out: red's for density's", "parcels.py",
+           "store(parcel.adj_density, adj_density)", "store(parcel.adj_density, adj_red)", TWO),
     # take_in
     Mutant("take_in: shares swapped", "parcels.py",
            "split(load(parcel.fraction_x), load(parcel.fraction_y), shares)",
@@ -139,7 +142,6 @@ MUTANTS = [
            "parcel = contents[which[k]]", "parcel = contents[k]", THREE),
     Mutant("take_in: the first one is late", "parcels.py", "k = 0;", "k = 1;", NUMBERS),
     Mutant("take_in: one parcel too few", "parcels.py", "k < n;", "k < n - 1;", NUMBERS),
-    Mutant("take_in: not emptied", "parcels.py", "    n = 0;\n", "", DELIVERED),
     Mutant("deliver: to one worker again and again", "parcels.py",
            "take_in(size, first + wp.tid(), parcels)", "take_in(size, wp.tid(), parcels)", TWO),
     # which rays are whose
@@ -159,22 +161,23 @@ MUTANTS = [
     Mutant("measure_rays: all alike", "parcels.py",
            "out_work[i] = n_packs * wp.static(LANES) +", "out_work[i] =", WORK),
     Mutant("measure_rays: where rays end", "parcels.py",
-           "(ray.end - ray.begin + wp", "(ray.end + wp", WORK),
+           "(ray.end - ray.begin) //", "ray.end //", WORK),
     Mutant("measure_rays: packs rounded down", "parcels.py",
-           "ray.begin + wp.static(LANES - 1))", "ray.begin)", ROOM),
+           "(ray.end - ray.begin) // wp.static(LANES) + 1",
+           "(ray.end - ray.begin) // wp.static(LANES)", ROOM),
     Mutant("share_out: more than there is room for", "parcels.py",
            "<= most_work", "<= wp.int64(2) * most_work", SHARED_OUT),
-    Mutant("share_out: not one ray at least", "parcels.py", "i == begin or ", "", SHARED_OUT),
+    Mutant("share_out: not one ray at least", "parcels.py", "last == begin or ", "", SHARED_OUT),
     Mutant("share_out: the last turn's work", "parcels.py",
-           "        until[p] = wp.int64(0)\n", "        pass\n", SHARED_OUT),
-    Mutant("share_out: places after one's own", "parcels.py",
-           "        until[p] = before\n        before += here\n",
-           "        before += here\n        until[p] = before\n", SHARED_OUT),
-    Mutant("share_out: rays at a place all alike", "parcels.py",
-           "        until[place[i]] = before + wp.int64(work[i])\n", "", SHARED_OUT),
+           "        work_before[m] = wp.int64(0)\n", "        pass\n", SHARED_OUT),
+    Mutant("share_out: middles after one's own", "parcels.py",
+           "        work_before[m] = before\n        before += here\n",
+           "        before += here\n        work_before[m] = before\n", SHARED_OUT),
+    Mutant("share_out: rays with one middle all alike", "parcels.py",
+           "        work_before[middles[i]] = before + wp.int64(work[i])\n", "", SHARED_OUT),
     Mutant("share_out: work beyond int", "parcels.py",
            "before * wp.int64(n_workers) // total",
            "wp.int64(int(before)) * wp.int64(n_workers) // total", SHARED_OUT),
     Mutant("share_out: cursors one late", "parcels.py",
-           "out_bounds[owner[i] + 1] = at + 1", "out_bounds[owner[i] + 1] = at", SHARED_OUT),
+           "out_bounds[owners[i] + 1] = at + 1", "out_bounds[owners[i] + 1] = at", SHARED_OUT),
 ]  # fmt: skip
