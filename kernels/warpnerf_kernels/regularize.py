@@ -2,6 +2,9 @@
 
 TV(x) = sum_c weight_c sum_{neighbouring nodes a, b} huber(x_a,c - x_b,c),
 huber(d) = d^2 / 2 for |d| <= 1, |d| - 1/2 beyond: an edge costs its height, not its square.
+
+On the CPU the adjoint is worked out for all channels of a tile at once, in Clang's vector types;
+on CUDA, and at the grid's faces, node by node.
 """
 
 import warp as wp
@@ -80,6 +83,11 @@ def adj_node_variation(
     return wp.cw_mul(weight, total)
 
 
+def _exchanged(distance: int) -> str:
+    """The channels of a tile, each in the place of the one 1 or 2 away within its node."""
+    return ", ".join(str(channel ^ distance) for channel in range(4 * TILE))
+
+
 @wp.func_native(
     f"constexpr int CHANNELS = {4 * TILE};"
     + r"""
@@ -107,13 +115,13 @@ for (int n = 0; n < CHANNELS; ++n) weights[n] = weight.c[n % 4];
 auto* adj = gradient.values.data + node;
 const numbers before = load(adj);
 auto seen = before != 0;  // and then a node's other channels, too
-seen |= __builtin_shufflevector(seen, seen, 1, 0, 3, 2, 5, 4, 7, 6, 9, 8, 11, 10, 13, 12, 15, 14);
-seen |= __builtin_shufflevector(seen, seen, 2, 3, 0, 1, 6, 7, 4, 5, 10, 11, 8, 9, 14, 15, 12, 13);
+seen |= __builtin_shufflevector(seen, seen, OTHER_OF_PAIR);
+seen |= __builtin_shufflevector(seen, seen, OTHER_PAIR);
 const numbers after = seen ? before + weights * total : before;
 memcpy(adj, &after, sizeof(after));
 return true;
 #endif
-"""
+""".replace("OTHER_OF_PAIR", _exchanged(1)).replace("OTHER_PAIR", _exchanged(2))
 )
 def add_tile_variation(
     values: wp.array(dtype=vec4), size: wp.vec3i, weight: vec4, node: int, gradient: Gradient
