@@ -4,7 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import warp as wp
-from warpnerf_kernels.tiles import STRETCH, TILE, next_tile, tile_of
+from warpnerf_kernels.tiles import (
+    GROUP,
+    STRETCH,
+    TILE,
+    but_first,
+    first_of,
+    tile_of,
+    touched_tiles,
+)
 from warpnerf_kernels.types import Gradient, vec4
 from workload import Workload
 
@@ -35,11 +43,13 @@ def clear(
     start = (first + wp.tid()) * span
     end = wp.min(start + span, n_nodes)
     last = tile_of(end - 1) + 1
-    tile = next_tile(gradient.touched, tile_of(start), last)
-    while tile < last:
-        node = wp.max(start, tile * wp.static(TILE))
-        clear_nodes(gradient.values, node, wp.min(end, (tile + 1) * wp.static(TILE)) - node)
-        tile = next_tile(gradient.touched, tile + 1, last)
+    for group in range(tile_of(start), last, wp.static(GROUP)):
+        tiles = touched_tiles(gradient.touched, group, last)
+        while tiles != wp.uint64(0):
+            tile = group + first_of(tiles)
+            node = wp.max(start, tile * wp.static(TILE))
+            clear_nodes(gradient.values, node, wp.min(end, (tile + 1) * wp.static(TILE)) - node)
+            tiles = but_first(tiles)
 
 
 class WarpStep:

@@ -11,7 +11,7 @@ On the CPU all channels of a tile are worked on at once, in Clang's vector types
 import warp as wp
 
 from .interp import place_in
-from .tiles import TILE, next_tile, prefetch, tile_of
+from .tiles import AHEAD, GROUP, TILE, but_first, first_of, prefetch, tile_of, touched_tiles
 from .types import Gradient, vec3, vec4
 
 wp.set_module_options({"enable_backward": False})
@@ -55,7 +55,7 @@ auto root = [](number x) -> number { return __builtin_elementwise_sqrt(x); };
 auto is_zero = [&](number x) -> bool { return __builtin_reduce_or(as_bits(x)) == 0; };
 #endif
 static_assert(sizeof(values.data->c[0]) == sizeof(float), "moments are cut out of float32");
-for (int c = 0; c < 4 * count; c += AT_ONCE) {
+for (int c = 0; c < CHANNELS && c < 4 * count; c += AT_ONCE) {
     const int n_here = 4 * count - c;  // a tile may be cut short, by the end of the grid
     auto load = [&](auto* from) {
         number x{};
@@ -124,37 +124,38 @@ def adam_step(
 ):
     """One update. An entry whose gradient is exactly zero keeps its value and its moments."""
     n_nodes = values.shape[0]
+    n_tiles = tile_of(n_nodes - 1) + 1
     start = (first + wp.tid()) * span
     end = start + wp.min(span, n_nodes - start)  # start + span might be beyond int
-    later_end = end + wp.min(span, n_nodes - end)
     last = tile_of(end - 1) + 1
-    later_last = tile_of(later_end - 1) + 1
-    tile = next_tile(gradient.touched, last, later_last)
-    while tile < later_last:  # what the next thread will need: a CPU runs them one by one
-        node = tile * wp.static(TILE)
-        prefetch(gradient.values, node)
-        prefetch(values, node)
-        prefetch(moments, node)
-        tile = next_tile(gradient.touched, tile + 1, later_last)
-    tile = next_tile(gradient.touched, tile_of(start), last)
-    while tile < last:
-        node = tile * wp.static(TILE)
-        begin = wp.max(start, node)
-        update_nodes(
-            begin,
-            wp.min(end, node + wp.static(TILE)) - begin,
-            update,
-            learning_rate,
-            beta1,
-            beta2,
-            epsilon,
-            correction1,
-            correction2,
-            gradient,
-            values,
-            moments,
-        )
-        tile = next_tile(gradient.touched, tile + 1, last)
+    for group in range(tile_of(start), last, wp.static(GROUP)):
+        later = group + wp.static(AHEAD)
+        tiles = touched_tiles(gradient.touched, later, wp.min(last + wp.static(AHEAD), n_tiles))
+        while tiles != wp.uint64(0):
+            node = (later + first_of(tiles)) * wp.static(TILE)
+            prefetch(gradient.values, node)
+            prefetch(values, node)
+            prefetch(moments, node)
+            tiles = but_first(tiles)
+        tiles = touched_tiles(gradient.touched, group, last)
+        while tiles != wp.uint64(0):
+            node = (group + first_of(tiles)) * wp.static(TILE)
+            begin = wp.max(start, node)
+            update_nodes(
+                begin,
+                wp.min(end, node + wp.static(TILE)) - begin,
+                update,
+                learning_rate,
+                beta1,
+                beta2,
+                epsilon,
+                correction1,
+                correction2,
+                gradient,
+                values,
+                moments,
+            )
+            tiles = but_first(tiles)
 
 
 @wp.func_native(

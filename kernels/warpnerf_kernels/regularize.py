@@ -10,7 +10,7 @@ on CUDA, and at the grid's faces, node by node.
 import warp as wp
 
 from .interp import flat_index
-from .tiles import TILE, next_tile, prefetch, tile_of
+from .tiles import AHEAD, GROUP, TILE, but_first, first_of, prefetch, tile_of, touched_tiles
 from .types import Gradient, real, vec4
 
 wp.set_module_options({"enable_backward": False})
@@ -160,39 +160,43 @@ def total_variation_backward(
     n_nodes = values.shape[0]
     start = (first + wp.tid()) * span
     end = start + wp.min(span, n_nodes - start)
+    n_tiles = tile_of(n_nodes - 1) + 1
     last = tile_of(end - 1) + 1
     stride_y = size[2]
     stride_x = size[1] * size[2]
-    tile = next_tile(gradient.touched, tile_of(start), last)
-    while tile < last:
-        node = tile * wp.static(TILE)
-        prefetch(gradient.values, node)
-        prefetch(values, node)
-        prefetch(values, node - stride_y)
-        prefetch(values, node + stride_y)
-        prefetch(values, node - stride_x)
-        prefetch(values, node + stride_x)
-        tile = next_tile(gradient.touched, tile + 1, last)
-    tile = next_tile(gradient.touched, tile_of(start), last)
-    while tile < last:
-        node = tile * wp.static(TILE)
-        first_node = wp.max(start, node)
-        end_node = wp.min(end, node + wp.static(TILE))
-        j = (first_node // size[2]) % size[1]
-        k = first_node % size[2]
-        inside = end_node - first_node == wp.static(TILE)
-        inside = inside and node >= stride_x and node < n_nodes - stride_x
-        inside = inside and j > 0 and j + 1 < size[1] and k > 0 and k + wp.static(TILE) < size[2]
-        if inside and add_tile_variation(values, size, weight, node, gradient):
-            end_node = first_node
-        for n in range(first_node, end_node):
-            adj = gradient.values[n]
-            if not (adj == vec4()):
-                gradient.values[n] = adj + adj_node_variation(values, size, weight, n, j, k)
-            k += 1  # on to the next node, without dividing for each
-            if k == size[2]:
-                k = 0
-                j += 1
-                if j == size[1]:
-                    j = 0
-        tile = next_tile(gradient.touched, tile + 1, last)
+    for group in range(tile_of(start), last, wp.static(GROUP)):
+        later = group + wp.static(AHEAD)
+        tiles = touched_tiles(gradient.touched, later, wp.min(last + wp.static(AHEAD), n_tiles))
+        while tiles != wp.uint64(0):
+            node = (later + first_of(tiles)) * wp.static(TILE)
+            prefetch(gradient.values, node)
+            prefetch(values, node)
+            prefetch(values, node - stride_y)
+            prefetch(values, node + stride_y)
+            prefetch(values, node - stride_x)
+            prefetch(values, node + stride_x)
+            tiles = but_first(tiles)
+        tiles = touched_tiles(gradient.touched, group, last)
+        while tiles != wp.uint64(0):
+            node = (group + first_of(tiles)) * wp.static(TILE)
+            first_node = wp.max(start, node)
+            end_node = wp.min(end, node + wp.static(TILE))
+            j = (first_node // size[2]) % size[1]
+            k = first_node % size[2]
+            inside = end_node - first_node == wp.static(TILE)
+            inside = inside and node >= stride_x and node < n_nodes - stride_x
+            inside = inside and j > 0 and j + 1 < size[1]
+            inside = inside and k > 0 and k + wp.static(TILE) < size[2]
+            if inside and add_tile_variation(values, size, weight, node, gradient):
+                end_node = first_node
+            for n in range(first_node, end_node):
+                adj = gradient.values[n]
+                if not (adj == vec4()):
+                    gradient.values[n] = adj + adj_node_variation(values, size, weight, n, j, k)
+                k += 1  # on to the next node, without dividing for each
+                if k == size[2]:
+                    k = 0
+                    j += 1
+                    if j == size[1]:
+                        j = 0
+            tiles = but_first(tiles)

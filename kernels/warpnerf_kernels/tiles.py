@@ -12,7 +12,13 @@ TILE = 4
 """Nodes in a tile: in float32, a cache line."""
 
 STRETCH = 256
-"""Nodes that a thread on the CPU works on: their memory is fetched together, ahead of use."""
+"""Nodes that a thread on the CPU works on."""
+
+GROUP = 8
+"""Tiles whose flags are looked at together."""
+
+AHEAD = 8 * GROUP
+"""Tiles from those that are worked on to those whose memory is fetched meanwhile, on the CPU."""
 
 
 @wp.func
@@ -21,23 +27,48 @@ def tile_of(node: int) -> int:
     return node // wp.static(TILE)
 
 
-@wp.func_native("""
-const wp::uint8* flags = touched.data;
-int t = tile;
-if (t < end && t > 0 && flags[t - 1]) return t;
-#if !defined(__CUDA_ARCH__)  // eight at a time
-for (; t + 8 <= end; t += 8) {
-    wp::uint64 eight;
-    memcpy(&eight, flags + t, 8);
-    if (eight) return t + __builtin_ctzll(eight) / 8;  // the lowest byte is the first
+@wp.func_native(
+    """
+const wp::uint8* flags = touched.data + first;
+wp::uint64 tiles = 0;
+if (first + GROUP <= last) {
+    memcpy(&tiles, flags, GROUP);  // the lowest byte is the first
+    tiles |= tiles << 8;  // a flag stands for the next one, too
+    if (first > 0) tiles |= flags[-1];
+} else {
+    for (int t = 0; first + t < last; ++t) {
+        const wp::uint64 flag = flags[t] | (first + t > 0 ? flags[t - 1] : 0);
+        tiles |= flag << 8 * t;
+    }
 }
-#endif
-while (t < end && !flags[t]) ++t;
-return t;
-""")
-def next_tile(touched: wp.array(dtype=wp.uint8), tile: int, end: int) -> int:
-    """The first tile at or after `tile` that may hold gradient; `end` if there is none before."""
+return tiles;
+""".replace("GROUP", str(GROUP))
+)
+def touched_tiles(touched: wp.array(dtype=wp.uint8), first: int, last: int) -> wp.uint64:
+    """Which tiles of a group, from `first` on and before `last`, may hold gradient.
+
+    Returns:
+        A byte for each, the lowest for the first: 1, or 0 if there is none.
+    """
     ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+return (__ffsll(tiles) - 1) / 8;
+#else
+return __builtin_ctzll(tiles) / 8;
+#endif
+""")
+def first_of(tiles: wp.uint64) -> int:
+    """Which is the first of some tiles of a group, from `touched_tiles`."""
+    ...
+
+
+@wp.func
+def but_first(tiles: wp.uint64) -> wp.uint64:
+    """The same tiles without the first."""
+    return tiles & (tiles - wp.uint64(1))
 
 
 @wp.func_native("""
