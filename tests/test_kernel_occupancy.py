@@ -34,7 +34,7 @@ def chessboard(occupied: Any) -> Any:
     return np.minimum(distance, FAR + 1).reshape(occupied.shape).astype(np.uint8)
 
 
-def spread(kernels: Kernels, occupied: Any) -> Any:
+def spread(kernels: Kernels, occupied: Any, span: int = 1) -> Any:
     distance = wp.array(
         np.where(occupied, 0, FAR + 1).astype(np.uint8).ravel(),
         dtype=wp.uint8,
@@ -44,7 +44,8 @@ def spread(kernels: Kernels, occupied: Any) -> Any:
         out = wp.empty_like(distance)
         kernels.workers.launch(
             kernels.module("occupancy").spread_distance,
-            occupied.size,
+            occupied.size // span,
+            span,
             wp.vec3i(*occupied.shape),
             axis,
             distance,
@@ -67,7 +68,8 @@ def test_distance_is_the_chessboard_distance(kernels64: Kernels) -> None:
         occupied = random_mask(seed, 20)
         expected = chessboard(occupied)
         largest = max(largest, int(expected[expected <= FAR].max(initial=0)))
-        assert np.array_equal(spread(kernels64, occupied), expected)
+        for span in (1, occupied.shape[2]):
+            assert np.array_equal(spread(kernels64, occupied, span), expected)
     assert largest == FAR  # far ones occurred
 
 
@@ -126,18 +128,41 @@ def test_skipping_in_float32_changes_no_bit(contraction: str, kernels32: Kernels
 
 
 def mark(kernels: Kernels, p: Problem, cells: Any, steps: Steps, alpha_min: float) -> Any:
-    n = int(np.prod(cells))
-    n_stretches = int(np.prod(p.raw.shape[:2])) * int(cells[2])
-    highest = kernels.zeros(n_stretches)
-    out = wp.zeros(n, dtype=wp.uint8, device=kernels.device)
-    occupancy = kernels.module("occupancy")
-    kernels.workers.launch(
-        occupancy.find_highest, n_stretches, kernels.grid(p), int(cells[2]), highest
+    """By threads for a cell each, and for a row each."""
+    by_cell, by_row = (
+        marked_by(kernels, p, tuple(map(int, cells)), steps, alpha_min, span)
+        for span in (1, int(cells[2]))
     )
+    assert np.array_equal(by_cell, by_row)
+    return by_row
+
+
+def marked_by(
+    kernels: Kernels,
+    p: Problem,
+    cells: tuple[int, int, int],
+    steps: Steps,
+    alpha_min: float,
+    span: int,
+) -> Any:
+    occupancy, grid = kernels.module("occupancy"), kernels.grid(p)
+
+    def launch(kernel: wp.Kernel, shape: tuple[int, ...], *arguments: Any) -> Any:
+        out = kernels.zeros(int(np.prod(shape)))
+        kernels.workers.launch(kernel, out.size // span, span, *arguments, out)
+        return out
+
+    x, y, _ = p.raw.shape[:3]
+    highest = launch(occupancy.find_highest, (x, y, cells[2]), grid, cells[2])
+    join = occupancy.join_highest
+    highest = launch(join, (x, *cells[1:]), y, cells[1], cells[2], highest)
+    highest = launch(join, cells, x, cells[0], cells[1] * cells[2], highest)
+    out = wp.zeros(highest.size, dtype=wp.uint8, device=kernels.device)
     kernels.workers.launch(
         occupancy.mark_occupied,
-        n,
-        kernels.grid(p),
+        highest.size // span,
+        span,
+        grid,
         highest,
         wp.vec3i(*cells),
         steps.struct(kernels.types),

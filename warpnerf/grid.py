@@ -16,7 +16,7 @@ from warpnerf_kernels.types import FreeSpace, Grid, March, real, vec3, vec4
 from warpnerf.checks import InputError
 from warpnerf.config import MAX_VOXELS, TRAINING_BYTES, Contraction
 from warpnerf.memory import usable_memory
-from warpnerf.parallel import Workers
+from warpnerf.parallel import NODES, Workers
 
 CONTRACTIONS = {"none": contraction.NONE, "linf": contraction.LINF, "l2": contraction.L2}
 
@@ -205,15 +205,32 @@ class FreeCells:
             march: How rays are stepped: opacity is judged over the longest step there can be.
             alpha_min: The least opacity that counts as visible.
         """
-        size = tuple(max(1, (n - 1) // 2) for n in grid.size)
-        n = math.prod(size)
-        distance = wp.empty(n, dtype=wp.uint8, device=workers.device)
+        nodes, device = grid.size, workers.device
+        size = tuple(max(1, (n - 1) // 2) for n in nodes)
+        span = 1 if device.is_cuda else size[2]  # a core takes a row
+
+        def launch(kernel: wp.Kernel, n: int, *arguments: Any) -> None:
+            workers.launch(kernel, n // span, span, *arguments, chunk=NODES // span)
+
+        in_columns = wp.empty(nodes[0] * nodes[1] * size[2], dtype=real, device=device)
+        in_planes = wp.empty(nodes[0] * size[1] * size[2], dtype=real, device=device)
+        highest = wp.empty(math.prod(size), dtype=real, device=device)
+        launch(occupancy.find_highest, in_columns.size, grid.struct, size[2], in_columns)
+        for axis, source, joined in ((1, in_columns, in_planes), (0, in_planes, highest)):
+            stride = math.prod(size[axis + 1 :])
+            launch(
+                occupancy.join_highest,
+                joined.size,
+                nodes[axis],
+                size[axis],
+                stride,
+                source,
+                joined,
+            )
+        n, cells = math.prod(size), wp.vec3i(*size)
+        distance = wp.empty(n, dtype=wp.uint8, device=device)
         spread = wp.empty_like(distance)
-        cells = wp.vec3i(*size)
-        n_stretches = grid.size[0] * grid.size[1] * size[2]
-        highest = wp.empty(n_stretches, dtype=real, device=workers.device)
-        workers.launch(occupancy.find_highest, n_stretches, grid.struct, size[2], highest)
-        workers.launch(
+        launch(
             occupancy.mark_occupied,
             n,
             grid.struct,
@@ -225,7 +242,7 @@ class FreeCells:
             distance,
         )
         for axis in range(3):
-            workers.launch(occupancy.spread_distance, n, cells, axis, distance, spread)
+            launch(occupancy.spread_distance, n, cells, axis, distance, spread)
             distance, spread = spread, distance
         return FreeCells(distance=distance, size=(size[0], size[1], size[2]), border=grid.border)
 

@@ -44,6 +44,7 @@ def longest_step(grid: Grid, march: March, c: vec3, contraction: int) -> real:
 @wp.kernel
 def find_highest(
     first: int,
+    span: int,  # cells per thread, in one column
     grid: Grid,
     n_cells: int,  # MZ, along z
     out_highest: wp.array(dtype=real),  # [X * Y * MZ]
@@ -52,21 +53,49 @@ def find_highest(
 
     What is not a number counts as dense: it must be seen to be noticed.
     """
-    n = first + wp.tid()
-    ck = n % n_cells
-    column = (n // n_cells) * grid.size[2]
-    highest = real(-1.0e30)
-    for k in range(first_node(ck, n_cells, grid.size[2]), last_node(ck, n_cells, grid.size[2]) + 1):
-        raw = grid.values[column + k]
-        highest = wp.max(highest, wp.where(wp.isnan(raw[0]), real(1.0e30), raw[0]))
-    out_highest[n] = highest
+    start = (first + wp.tid()) * span
+    column = (start // n_cells) * grid.size[2]
+    cell = start % n_cells
+    for n in range(start, start + span):
+        highest = real(-1.0e30)
+        for k in range(
+            first_node(cell, n_cells, grid.size[2]), last_node(cell, n_cells, grid.size[2]) + 1
+        ):
+            raw = grid.values[column + k][0]
+            highest = wp.max(highest, wp.where(raw == raw, raw, real(1.0e30)))
+        out_highest[n] = highest
+        cell += 1
+
+
+@wp.kernel
+def join_highest(
+    first: int,
+    span: int,  # cells per thread, in one row
+    n_nodes: int,  # along the axis
+    n_cells: int,  # along the axis
+    stride: int,  # along the axis, a multiple of span
+    highest: wp.array(dtype=real),  # [... * n_nodes * stride]
+    out_highest: wp.array(dtype=real),  # [... * n_cells * stride]
+):
+    """One axis more: the highest of the columns in and next to a cell."""
+    start = (first + wp.tid()) * span
+    cell = (start // stride) % n_cells
+    low = first_node(cell, n_cells, n_nodes)
+    high = last_node(cell, n_cells, n_nodes)
+    row = (start // (n_cells * stride) * n_nodes + low) * stride + start % stride
+    for n in range(span):
+        raw = real(-1.0e30)
+        for column in range(high + 1 - low):
+            raw = wp.max(raw, highest[row + column * stride + n])
+        out_highest[start + n] = raw
 
 
 @wp.kernel
 def mark_occupied(
     first: int,
+    span: int,  # cells per thread, in one row
     grid: Grid,
-    highest: wp.array(dtype=real),  # [X * Y * MZ] by find_highest
+    highest: wp.array(dtype=real),  # [MX * MY * MZ] by find_highest, and join_highest twice
     size: wp.vec3i,  # cells
     march: March,
     contraction: int,
@@ -74,34 +103,30 @@ def mark_occupied(
     out_distance: wp.array(dtype=wp.uint8),  # [MX * MY * MZ] 0 where occupied, else FAR + 1
 ):
     """A cell is occupied if any node in it or next to it would give a step this much alpha."""
-    n = first + wp.tid()
-    ck = n % size[2]
-    cj = (n // size[2]) % size[1]
-    ci = n // (size[2] * size[1])
-    raw = real(-1.0e30)
-    for i in range(first_node(ci, size[0], grid.size[0]), last_node(ci, size[0], grid.size[0]) + 1):
-        for j in range(
-            first_node(cj, size[1], grid.size[1]), last_node(cj, size[1], grid.size[1]) + 1
-        ):
-            raw = wp.max(raw, highest[(i * grid.size[1] + j) * size[2] + ck])
+    start = (first + wp.tid()) * span
+    row = start // size[2]
     half = vec3(real(size[0]), real(size[1]), real(size[2])) / real(2.0)
-    middle = vec3(real(ci), real(cj), real(ck)) + vec3(real(0.5)) - half
-    outermost = vec3(
-        (wp.abs(middle[0]) + real(0.5)) / half[0],
-        (wp.abs(middle[1]) + real(0.5)) / half[1],
-        (wp.abs(middle[2]) + real(0.5)) / half[2],
-    )
-    step = longest_step(grid, march, (real(1.0) + grid.border) * outermost, contraction)
-    alpha = real(1.0) - wp.exp(-step * grid.density_scale * softplus(raw + grid.density_shift))
-    if alpha <= alpha_min:
-        out_distance[n] = wp.uint8(FAR + 1)
-    else:
-        out_distance[n] = wp.uint8(0)
+    cell = vec3(real(row // size[1]), real(row % size[1]), real(start % size[2]))
+    for n in range(start, start + span):
+        middle = cell + vec3(real(0.5)) - half
+        outermost = vec3(
+            (wp.abs(middle[0]) + real(0.5)) / half[0],
+            (wp.abs(middle[1]) + real(0.5)) / half[1],
+            (wp.abs(middle[2]) + real(0.5)) / half[2],
+        )
+        step = longest_step(grid, march, (real(1.0) + grid.border) * outermost, contraction)
+        sigma = grid.density_scale * softplus(highest[n] + grid.density_shift)
+        if real(1.0) - wp.exp(-step * sigma) <= alpha_min:
+            out_distance[n] = wp.uint8(FAR + 1)
+        else:
+            out_distance[n] = wp.uint8(0)
+        cell[2] += real(1.0)
 
 
 @wp.kernel
 def spread_distance(
     first: int,
+    span: int,  # cells per thread, in one row
     size: wp.vec3i,  # cells
     axis: int,
     distance: wp.array(dtype=wp.uint8),  # [MX * MY * MZ]
@@ -111,18 +136,22 @@ def spread_distance(
 
     max(|dx|, |dy|, |dz|) separates: d'(p) = min over s of max(|s|, d(p + s along the axis)).
     """
-    n = first + wp.tid()
+    start = (first + wp.tid()) * span
     stride = int(1)
     if axis == 0:
         stride = size[1] * size[2]
     if axis == 1:
         stride = size[2]
-    position = (n // stride) % size[axis]
-    best = int(distance[n])
-    for s in range(1, FAR + 1):
-        if s < best:
+    position = (start // stride) % size[axis]
+    for n in range(start, start + span):
+        best = int(distance[n])
+        s = int(1)
+        while s < best and s <= FAR:
             if position >= s:
                 best = wp.min(best, wp.max(s, int(distance[n - s * stride])))
             if position + s < size[axis]:
                 best = wp.min(best, wp.max(s, int(distance[n + s * stride])))
-    out_distance[n] = wp.uint8(best)
+            s += 1
+        out_distance[n] = wp.uint8(best)
+        if axis == 2:
+            position += 1
