@@ -205,28 +205,29 @@ class FreeCells:
             march: How rays are stepped: opacity is judged over the longest step there can be.
             alpha_min: The least opacity that counts as visible.
         """
-        nodes, device = grid.size, workers.device
-        size = tuple(max(1, (n - 1) // 2) for n in nodes)
+        device = workers.device
+        size = tuple(max(1, (n - 1) // 2) for n in grid.size)
         span = 1 if device.is_cuda else size[2]  # a core takes a row
 
         def launch(kernel: wp.Kernel, n: int, *arguments: Any) -> None:
-            workers.launch(kernel, n // span, span, *arguments, chunk=NODES // span)
+            workers.launch(kernel, n // span, span, *arguments, chunk=max(1, NODES // span))
 
-        in_columns = wp.empty(nodes[0] * nodes[1] * size[2], dtype=real, device=device)
-        in_planes = wp.empty(nodes[0] * size[1] * size[2], dtype=real, device=device)
-        highest = wp.empty(math.prod(size), dtype=real, device=device)
-        launch(occupancy.find_highest, in_columns.size, grid.struct, size[2], in_columns)
-        for axis, source, joined in ((1, in_columns, in_planes), (0, in_planes, highest)):
-            stride = math.prod(size[axis + 1 :])
+        shape = [*grid.size[:2], size[2]]
+        highest = wp.empty(math.prod(shape), dtype=real, device=device)
+        launch(occupancy.find_highest, highest.size, grid.struct, size[2], highest)
+        for axis in (1, 0):  # from nodes to cells
+            shape[axis] = size[axis]
+            joined = wp.empty(math.prod(shape), dtype=real, device=device)
             launch(
                 occupancy.join_highest,
                 joined.size,
-                nodes[axis],
+                grid.size[axis],
                 size[axis],
-                stride,
-                source,
+                math.prod(shape[axis + 1 :]),
+                highest,
                 joined,
             )
+            highest = joined
         n, cells = math.prod(size), wp.vec3i(*size)
         distance = wp.empty(n, dtype=wp.uint8, device=device)
         spread = wp.empty_like(distance)

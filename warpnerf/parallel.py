@@ -97,7 +97,7 @@ class Workers:
             kernel: Its thread index counts from the `first` that it is given.
             n: Number of items.
             arguments: The rest of the kernel's arguments.
-            chunk: Items per launch, NODES or RAYS.
+            chunk: Items per launch: NODES, RAYS, or as many fewer as an item has nodes.
             packed: From launches before, and for those to come, on the CPU.
         """
         self._launch(kernel, self._alike(n), lambda worker: arguments, chunk, packed)

@@ -11,7 +11,17 @@ On the CPU all channels of a tile are worked on at once, in Clang's vector types
 import warp as wp
 
 from .interp import place_in
-from .tiles import AHEAD, GROUP, TILE, but_first, first_of, prefetch, tile_of, touched_tiles
+from .tiles import (
+    AHEAD,
+    GROUP,
+    TILE,
+    but_first,
+    first_of,
+    prefetch,
+    tile_of,
+    tiles_ahead,
+    touched_tiles,
+)
 from .types import Gradient, vec3, vec4
 
 wp.set_module_options({"enable_backward": False})
@@ -124,15 +134,13 @@ def adam_step(
 ):
     """One update. An entry whose gradient is exactly zero keeps its value and its moments."""
     n_nodes = values.shape[0]
-    n_tiles = tile_of(n_nodes - 1) + 1
     start = (first + wp.tid()) * span
     end = start + wp.min(span, n_nodes - start)  # start + span might be beyond int
     last = tile_of(end - 1) + 1
     for group in range(tile_of(start), last, wp.static(GROUP)):
-        later = group + wp.static(AHEAD)
-        tiles = touched_tiles(gradient.touched, later, wp.min(last + wp.static(AHEAD), n_tiles))
+        tiles = tiles_ahead(gradient.touched, group, last)
         while tiles != wp.uint64(0):
-            node = (later + first_of(tiles)) * wp.static(TILE)
+            node = (group + wp.static(AHEAD) + first_of(tiles)) * wp.static(TILE)
             prefetch(gradient.values, node)
             prefetch(values, node)
             prefetch(moments, node)

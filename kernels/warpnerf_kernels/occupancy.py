@@ -44,7 +44,7 @@ def longest_step(grid: Grid, march: March, c: vec3, contraction: int) -> real:
 @wp.kernel
 def find_highest(
     first: int,
-    span: int,  # cells per thread, in one column
+    span: int,  # cells per thread, in one row along z
     grid: Grid,
     n_cells: int,  # MZ, along z
     out_highest: wp.array(dtype=real),  # [X * Y * MZ]
@@ -61,7 +61,7 @@ def find_highest(
         for k in range(
             first_node(cell, n_cells, grid.size[2]), last_node(cell, n_cells, grid.size[2]) + 1
         ):
-            raw = grid.values[column + k][0]
+            raw = grid.values[column + k][0]  # compared with itself, as isnan is a slow call
             highest = wp.max(highest, wp.where(raw == raw, raw, real(1.0e30)))
         out_highest[n] = highest
         cell += 1
@@ -70,30 +70,30 @@ def find_highest(
 @wp.kernel
 def join_highest(
     first: int,
-    span: int,  # cells per thread, in one row
+    span: int,  # cells per thread, in one row along z
     n_nodes: int,  # along the axis
     n_cells: int,  # along the axis
     stride: int,  # along the axis, a multiple of span
     highest: wp.array(dtype=real),  # [... * n_nodes * stride]
     out_highest: wp.array(dtype=real),  # [... * n_cells * stride]
 ):
-    """One axis more: the highest of the columns in and next to a cell."""
+    """Of what was found for nodes along one axis, the highest in and next to a cell."""
     start = (first + wp.tid()) * span
     cell = (start // stride) % n_cells
     low = first_node(cell, n_cells, n_nodes)
     high = last_node(cell, n_cells, n_nodes)
-    row = (start // (n_cells * stride) * n_nodes + low) * stride + start % stride
+    begin = start // (n_cells * stride) * n_nodes * stride + start % stride
     for n in range(span):
         raw = real(-1.0e30)
-        for column in range(high + 1 - low):
-            raw = wp.max(raw, highest[row + column * stride + n])
+        for node in range(low, high + 1):
+            raw = wp.max(raw, highest[begin + node * stride + n])
         out_highest[start + n] = raw
 
 
 @wp.kernel
 def mark_occupied(
     first: int,
-    span: int,  # cells per thread, in one row
+    span: int,  # cells per thread, in one row along z
     grid: Grid,
     highest: wp.array(dtype=real),  # [MX * MY * MZ] by find_highest, and join_highest twice
     size: wp.vec3i,  # cells
@@ -126,7 +126,7 @@ def mark_occupied(
 @wp.kernel
 def spread_distance(
     first: int,
-    span: int,  # cells per thread, in one row
+    span: int,  # cells per thread, in one row along z
     size: wp.vec3i,  # cells
     axis: int,
     distance: wp.array(dtype=wp.uint8),  # [MX * MY * MZ]

@@ -10,7 +10,17 @@ on CUDA, and at the grid's faces, node by node.
 import warp as wp
 
 from .interp import flat_index
-from .tiles import AHEAD, GROUP, TILE, but_first, first_of, prefetch, tile_of, touched_tiles
+from .tiles import (
+    AHEAD,
+    GROUP,
+    TILE,
+    but_first,
+    first_of,
+    prefetch,
+    tile_of,
+    tiles_ahead,
+    touched_tiles,
+)
 from .types import Gradient, real, vec4
 
 wp.set_module_options({"enable_backward": False})
@@ -160,15 +170,13 @@ def total_variation_backward(
     n_nodes = values.shape[0]
     start = (first + wp.tid()) * span
     end = start + wp.min(span, n_nodes - start)
-    n_tiles = tile_of(n_nodes - 1) + 1
     last = tile_of(end - 1) + 1
     stride_y = size[2]
     stride_x = size[1] * size[2]
     for group in range(tile_of(start), last, wp.static(GROUP)):
-        later = group + wp.static(AHEAD)
-        tiles = touched_tiles(gradient.touched, later, wp.min(last + wp.static(AHEAD), n_tiles))
+        tiles = tiles_ahead(gradient.touched, group, last)
         while tiles != wp.uint64(0):
-            node = (later + first_of(tiles)) * wp.static(TILE)
+            node = (group + wp.static(AHEAD) + first_of(tiles)) * wp.static(TILE)
             prefetch(gradient.values, node)
             prefetch(values, node)
             prefetch(values, node - stride_y)

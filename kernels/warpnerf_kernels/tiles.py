@@ -27,29 +27,49 @@ def tile_of(node: int) -> int:
     return node // wp.static(TILE)
 
 
-@wp.func_native(
-    """
-const wp::uint8* flags = touched.data + first;
-wp::uint64 tiles = 0;
-if (first + GROUP <= last) {
-    memcpy(&tiles, flags, GROUP);  // the lowest byte is the first
-    tiles |= tiles << 8;  // a flag stands for the next one, too
-    if (first > 0) tiles |= flags[-1];
-} else {
-    for (int t = 0; first + t < last; ++t) {
-        const wp::uint64 flag = flags[t] | (first + t > 0 ? flags[t - 1] : 0);
-        tiles |= flag << 8 * t;
+FIND = """
+auto find = [&](int begin, int end) -> wp::uint64 {
+    const wp::uint8* flags = touched.data + begin;
+    wp::uint64 tiles = 0;
+    if (begin + GROUP <= end) {
+        memcpy(&tiles, flags, GROUP);  // the lowest byte is the first
+        tiles |= tiles << 8;  // a flag stands for the next tile, too
+        if (begin > 0) tiles |= flags[-1];
+    } else {
+        for (int t = 0; begin + t < end; ++t) {
+            const wp::uint64 flag = flags[t] | (begin + t > 0 ? flags[t - 1] : 0);
+            tiles |= flag << 8 * t;
+        }
     }
-}
-return tiles;
+    return tiles;
+};
 """.replace("GROUP", str(GROUP))
-)
-def touched_tiles(touched: wp.array(dtype=wp.uint8), first: int, last: int) -> wp.uint64:
-    """Which tiles of a group, from `first` on and before `last`, may hold gradient.
+"""What touched_tiles and tiles_ahead begin with."""
+
+
+@wp.func_native(FIND + "return find(group, end);")
+def touched_tiles(touched: wp.array(dtype=wp.uint8), group: int, end: int) -> wp.uint64:
+    """Which tiles of a group, given by its first one, may hold gradient; none from `end` on.
 
     Returns:
-        A byte for each, the lowest for the first: 1, or 0 if there is none.
+        A byte for each of the GROUP tiles, the lowest for the first: 1 if it may, else 0.
     """
+    ...
+
+
+@wp.func_native(
+    """
+#if defined(__CUDA_ARCH__)  // has other ways to wait
+return 0;
+#else
+FIND
+const int ahead = end + AHEAD, n_tiles = touched.shape[0];
+return find(group + AHEAD, ahead < n_tiles ? ahead : n_tiles);
+#endif
+""".replace("FIND", FIND).replace("AHEAD", str(AHEAD))
+)
+def tiles_ahead(touched: wp.array(dtype=wp.uint8), group: int, end: int) -> wp.uint64:
+    """touched_tiles for the group and the end that lie AHEAD of the given ones; none on CUDA."""
     ...
 
 
@@ -61,7 +81,7 @@ return __builtin_ctzll(tiles) / 8;
 #endif
 """)
 def first_of(tiles: wp.uint64) -> int:
-    """Which is the first of some tiles of a group, from `touched_tiles`."""
+    """The place in its group of the first of some tiles, of which there is one at least."""
     ...
 
 

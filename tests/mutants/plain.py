@@ -6,6 +6,7 @@ INTERP = "test_kernel_interp.py"
 LOST = "test_kernel_render.py::test_rays_that_are_not_finite_see_the_background"
 REGULARIZE = "test_kernel_regularize.py"
 ADAM = "test_kernel_adam.py"
+TILES = "test_kernel_tiles.py"
 OCCUPANCY = "test_kernel_occupancy.py"
 CAMERA = "test_kernel_camera.py"
 RAYS = "test_rays.py"
@@ -117,16 +118,22 @@ MUTANTS = [
            "gradient.touched[tile_of(n01)]", "gradient.touched[tile_of(n00)]", INTERP),
     # tiles.py
     Mutant("touched_tiles: not the tile after", "tiles.py",
-           "    tiles |= tiles << 8;", "    //", ADAM),
+           "    tiles |= tiles << 8;", "    //", TILES),
     Mutant("touched_tiles: group before forgotten", "tiles.py",
-           "if (first > 0)", "if (false)", ADAM),
+           "if (begin > 0)", "if (false)", TILES),
+    Mutant("touched_tiles: of few, group before forgotten", "tiles.py",
+           "begin + t > 0 ?", "t > 0 ?", TILES),
     Mutant("touched_tiles: of few, not the tile after", "tiles.py",
-           "first + t > 0 ?", "false ?", ADAM),
-    Mutant("touched_tiles: of few, all as the first", "tiles.py", "flags[t] |", "flags[0] |", ADAM),
-    Mutant("touched_tiles: of few, the tile before", "tiles.py",
-           "flags[t - 1]", "flags[t]", ADAM),
+           "flags[t - 1]", "flags[t]", TILES),
+    Mutant("touched_tiles: of few, all as the first", "tiles.py",
+           "flags[t] |", "flags[0] |", TILES),
+    Mutant("tiles_ahead: not ahead", "tiles.py", "find(group + AHEAD,", "find(group,", TILES),
+    Mutant("tiles_ahead: ends as early", "tiles.py", "end + AHEAD,", "end,", TILES),
+    Mutant("tiles_ahead: beyond the grid", "tiles.py", "ahead < n_tiles", "true", TILES),
+    Mutant("first_of: the last", "tiles.py",
+           "__builtin_ctzll(tiles)", "(63 - __builtin_clzll(tiles))", TILES),
     Mutant("but_first: the last", "tiles.py",
-           "tiles & (tiles - wp.uint64(1))", "tiles & (tiles >> wp.uint64(1))", ADAM),
+           "tiles & (tiles - wp.uint64(1))", "tiles & (tiles >> wp.uint64(1))", TILES),
     Mutant("a group of nine", "adam.py", "last, wp.static(GROUP)", "last, wp.static(GROUP + 1)",
            ADAM),
     Mutant("variation: a group of nine", "regularize.py",
@@ -308,11 +315,11 @@ MUTANTS = [
            "raw = wp.max(raw, highest[", "raw = wp.max(real(-1.0e30), highest[",
            OCCUPANCY),
     Mutant("occupancy: a column less", "occupancy.py",
-           "range(high + 1 - low)", "range(high - low)", OCCUPANCY),
+           "for node in range(low, high + 1)", "for node in range(low, high)", OCCUPANCY),
     Mutant("occupancy: all rows begin alike", "occupancy.py", " + start % stride", "", OCCUPANCY),
     Mutant("occupancy: planes swapped", "occupancy.py",
-           "(start // (n_cells * stride) * n_nodes + low)",
-           "(start // (n_cells * stride) * n_cells + low)", OCCUPANCY),
+           "start // (n_cells * stride) * n_nodes * stride",
+           "start // (n_cells * stride) * n_cells * stride", OCCUPANCY),
     Mutant("occupancy: density scale", "occupancy.py",
            "sigma = grid.density_scale * softplus", "sigma = softplus", OCCUPANCY),
     Mutant("occupancy: a row's steps are alike", "occupancy.py",
