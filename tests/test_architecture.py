@@ -124,7 +124,7 @@ FLOORS = [
     {"tiles"},
     {"interp", "activation", "contraction", "march", "gradscale", "loss"},
     {"integral", "vectors"},
-    {"packs"},
+    {"packs", "order"},
     {"parcels"},
     {"integral_packed"},
     {"render", "regularize", "adam", "occupancy", "camera", "precision", "probe"},

@@ -1,19 +1,15 @@
 """Several workers, one gradient: who adds where, and that nothing is lost on the way."""
 
-import itertools
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-import reference
-import torch
 import warp as wp
-from drive import Kernels, Problem, assert_close, make_problem, unbounded, unit
+from drive import Kernels, Problem, assert_close, make_problem, unbounded
 from test_kernel_render import early, masked
-from warpnerf_kernels import parcels
+from warpnerf_kernels import order, parcels
 from warpnerf_kernels.tiles import TILE
 from warpnerf_kernels.vectors import LANES
 
@@ -156,143 +152,12 @@ def test_rays_in_turns(contraction: str, monkeypatch: pytest.MonkeyPatch) -> Non
         p = unbounded(p, contraction, 0.2)
     at_once = of(2).train(p)
     most = most_steps(p)
-    for samples in (20_000, 4 * (most + LANES + parcels.RAY), 4 * most, 1):
+    for samples in (20_000, 4 * (most + LANES + order.RAY), 4 * most, 1):
         monkeypatch.setattr(adjoint, "SAMPLES", samples)
         in_turns = of(2).train(p)
         assert np.array_equal(in_turns[0], at_once[0])
         assert_close(in_turns[1], at_once[1], 3e-6)
         assert_close(of(2).backward(p), of(1).backward(p), 3e-6)
-
-
-def middles(p: Problem) -> np.ndarray:
-    """Where along x rays have half of their steps behind them, in shares of the grid."""
-    at = reference.sample_distances(
-        p.steps.near, p.steps.far, p.steps.step, p.steps.growth, p.steps.n_linear, most_steps(p)
-    )
-    points = p.origins[:, None] + at.t.numpy()[:, None] * p.directions[:, None]
-    box_min, box_max = torch.tensor(p.box_min), torch.tensor(p.box_max)
-    u = reference.grid_coordinates(
-        torch.tensor(points), box_min, box_max, p.raw.shape, p.contraction, p.border
-    ).numpy() / (np.array(p.raw.shape[:3]) - 1)
-    inside = ((u >= 0) & (u <= 1)).all(axis=2) & at.before_far.numpy()
-    return np.array(
-        [x[found][found.sum() // 2] for x, found in zip(u[..., 0], inside, strict=True)]
-    )
-
-
-@pytest.mark.parametrize("contraction", ["none", "linf", "l2"])
-@pytest.mark.parametrize("threads", [2, 3])
-def test_each_worker_has_the_rays_nearest_its_part(
-    contraction: str, threads: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    p = problem(4)
-    if contraction != "none":
-        steps = Steps(near=0.07, far=40.0, step=0.03, n_linear=60, growth=0.02)
-        p = replace(unbounded(p, contraction, 0.2), steps=steps)
-    met = of(1).forward(p).n_samples > 3
-    p = replace(p, origins=p.origins[met], directions=p.directions[met])
-    p = replace(
-        p,
-        background=p.background[:1],
-        **{
-            name: getattr(p, name)[met]
-            for name in ("target", "adj_rgb", "adj_opacity", "adj_depth")
-        },
-    )
-    monkeypatch.setattr(adjoint, "SAMPLES", p.n_rays * most_steps(p) // 2)
-    middle = middles(p)
-    turns = turns_of(lambda: of(threads).backward(p), monkeypatch)
-    assert len(turns) >= 2
-    first = 0
-    for turn in turns:
-        assert len(turn) == threads
-        rays = np.concatenate(turn)
-        assert sorted(rays) == list(range(first, first + len(rays)))
-        first += len(rays)
-        for share, following in itertools.pairwise(turn):
-            # Which of two steps is the middle one is no matter.
-            assert middle[share].max() <= middle[following].min() + 0.06
-        for share in turn:
-            assert (np.diff(share) > 0).all()  # neighbours stay neighbours
-    assert first == p.n_rays
-
-
-def turns_of(launch: Callable[[], Any], monkeypatch: pytest.MonkeyPatch) -> list[list[np.ndarray]]:
-    """The rays of each worker in each turn of what is launched."""
-    turns = []
-    share_out = adjoint.AdjointLaunch._share_out
-
-    def spy(launch: adjoint.AdjointLaunch, begin: int, end: int) -> list[int]:
-        bounds = share_out(launch, begin, end)
-        assert bounds[0] == begin < bounds[-1] <= end
-        order = launch._order.numpy().copy()
-        turns.append([order[i:j] for i, j in itertools.pairwise(bounds)])
-        return bounds
-
-    monkeypatch.setattr(adjoint.AdjointLaunch, "_share_out", spy)
-    launch()
-    return turns
-
-
-@pytest.mark.parametrize("contraction", ["none", "linf"])
-def test_rays_that_are_not_finite_are_someone_s(contraction: str) -> None:
-    p = problem(9)
-    if contraction != "none":
-        p = unbounded(p, contraction, 0.2)
-    p.directions[:30] = np.nan
-    p.directions[30:60, 0] = np.inf
-    p.origins[60:90, 0] = -np.inf
-    assert_close(of(2).backward(p), of(1).backward(p), 3e-6)
-
-
-@pytest.mark.parametrize("n_workers", [2, 3, 7])
-@pytest.mark.parametrize("largest", [20, 1 << 30])
-def test_rays_are_shared_out_by_middle_and_work(largest: int, n_workers: int) -> None:
-    """Against sorting: rays of more work than there is room for, and many with the same middle."""
-    rng = np.random.default_rng(n_workers)
-    n, begin, most_work = 200, 17, 900 * largest // 20
-    work = rng.integers(1, largest, n)
-    work[[begin, 150]] = 2 * most_work if largest == 20 else 2**31 - 1
-    middle = rng.integers(0, parcels.MIDDLES, n)
-    middle[::2] = rng.choice([0, 5, parcels.MIDDLES - 1], n // 2)
-    scratch = [np.zeros(parcels.MIDDLES, np.int64), np.zeros(n, np.int32)]
-    bounds, order = np.zeros(n_workers + 1, np.int32), np.full(n, -1, np.int32)
-    arrays = [work.astype(np.int32), middle.astype(np.int32), *scratch, bounds, order]
-    on_device = [wp.array(array, device="cpu", copy=False) for array in arrays]
-    while begin < n:
-        until = np.cumsum(work[begin:])
-        end = begin + max(1, int((until <= most_work).sum()))
-        wp.launch(parcels.share_out, 1, inputs=[begin, n, most_work, *on_device], device="cpu")
-        rays = begin + np.argsort(middle[begin:end], kind="stable")
-        until = np.cumsum(work[rays]) - work[rays]
-        owner = until * n_workers // work[rays].sum()
-        expected = [np.sort(rays[owner == worker]) for worker in range(n_workers)]
-        assert (bounds[0], bounds[-1]) == (begin, end)
-        for worker, (first, last) in enumerate(itertools.pairwise(bounds)):
-            assert np.array_equal(order[first:last], expected[worker])
-        assert (order[end:] == -1).all()
-        begin = end
-
-
-@pytest.mark.parametrize("threads", [2, 3, 5])
-@pytest.mark.parametrize("distance", [0.1, 9.0])
-def test_each_worker_has_as_much_work(
-    distance: float, threads: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Cameras at one end of the box, whose rays often miss it, and one on the other side of it."""
-    p = replace(problem(6), steps=Steps(near=0.0, far=20.0, step=0.04))
-    rng = np.random.default_rng(6)
-    middle = 0.5 * (p.box_min + p.box_max)
-    p.origins[:] = p.box_max + 0.1
-    p.directions[:] = unit(rng.normal(size=p.directions.shape))
-    p.directions[::3] = unit(middle - p.origins[::3])
-    p.origins[1::3] = middle - (distance, 0.5, 0.5)
-    p.directions[1::3] = unit(middle - (0.3, 0, 0) - p.origins[1::3])
-    steps = of(1).forward(p).n_samples
-    assert 0.5 < (steps > 0).mean() < 0.9
-    (turn,) = turns_of(lambda: of(threads).backward(p), monkeypatch)
-    work = np.array([steps[share].sum() for share in turn])
-    assert work.max() < 1.2 * work.mean()
 
 
 def test_there_is_room_for_all_parcels(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -306,10 +171,9 @@ def test_there_is_room_for_all_parcels(monkeypatch: pytest.MonkeyPatch) -> None:
     launches = launches_of(monkeypatch)
     of(3).backward(p)
     work = int(launches[0]._work.numpy().sum())
-    monkeypatch.setattr(adjoint, "SAMPLES", work + 3 * (most_steps(p) + LANES + parcels.RAY) + 2)
+    monkeypatch.setattr(adjoint, "SAMPLES", work + 3 * (most_steps(p) + LANES + order.RAY) + 2)
     kernels = of(3)
-    turns = turns_of(lambda: kernels.backward(p), monkeypatch)
-    assert len(turns) == 1
+    kernels.backward(p)
     made = launches[1].parcels
     assert made is not None
     most, room = made.n_contents.numpy()[:, 0].max(), made.contents.shape[1]

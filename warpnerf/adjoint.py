@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from warpnerf_kernels import parcels, render, tiles, types
+from warpnerf_kernels import order, parcels, render, tiles, types
 from warpnerf_kernels.types import vec4
 from warpnerf_kernels.vectors import LANES
 
@@ -98,20 +98,21 @@ class AdjointLaunch:
         self.parcels: parcels.Parcels | None = None
         """What the workers leave for each other; None: kernels are plain."""
         if variant.packed:
-            most_work = most_steps + LANES + parcels.RAY
+            most_work = most_steps + LANES + order.RAY
             # Where rays are so long that two for each worker would not fit, fewer work.
             count = min(workers.count, max(1, SAMPLES // (2 * most_work)))
             if count < workers.count:
                 self._workers = Workers("cpu", count)
             room = SAMPLES // count if count > 1 else 0
-            self._work_a_turn = count * (room - most_work)  # a worker may get a ray more than it
+            # A worker may get a ray more than it should.
+            self._work_a_turn = count * (room - most_work) if count > 1 else 1 << 62
             self.parcels = _make_parcels(room // LANES, count)
-            self._order = wp.array(np.arange(n_rays), dtype=wp.int32, device="cpu")
             # What share_out takes from measure_rays, its scratch, and what it gives.
-            self._work, self._middles, self._owners = (
-                wp.empty(n_rays, dtype=wp.int32, device="cpu") for _ in range(3)
+            self._work, self._cells, self._by_cell, self._owners, self._order = (
+                wp.empty(n_rays, dtype=wp.int32, device="cpu") for _ in range(5)
             )
-            self._work_before = wp.empty(parcels.MIDDLES, dtype=wp.int64, device="cpu")
+            self._work_before = wp.empty(order.COLUMNS, dtype=wp.int64, device="cpu")
+            self._rays_before = wp.empty(order.CELLS, dtype=wp.int32, device="cpu")
             self._bounds = wp.empty(count + 1, dtype=wp.int32, device="cpu")
         elif not workers.device.is_cuda:
             self._workers = Workers("cpu", 1)
@@ -130,11 +131,6 @@ class AdjointLaunch:
             return
         self.parcels.gradient = gradient
         self.parcels.order = self._order
-        if self._workers.count == 1:
-            self._workers.launch_owned(
-                self._kernel, n_rays, *arguments, self.parcels, packed=self._packed
-            )
-            return
         self._measure(n_rays, arguments)
         begin = 0
         while begin < n_rays:
@@ -157,9 +153,9 @@ class AdjointLaunch:
         """Find how much work each ray is, and where its middle lies."""
         grid, _, march, origins, directions = arguments[:5]
         self._workers.launch(
-            parcels.measure_rays_kernel(self._contraction),
+            order.measure_rays_kernel(self._contraction),
             n_rays,
-            *(grid, march, origins, directions, self._work, self._middles),
+            *(grid, march, origins, directions, self._work, self._cells),
             packed=self._packed,
         )
 
@@ -171,13 +167,15 @@ class AdjointLaunch:
             end.
         """
         self._workers.launch_alone(
-            parcels.share_out,
+            order.share_out,
             begin,
             end,
             self._work_a_turn,
             self._work,
-            self._middles,
+            self._cells,
             self._work_before,
+            self._rays_before,
+            self._by_cell,
             self._owners,
             self._bounds,
             self._order,

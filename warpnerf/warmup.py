@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import get_args
 
 import warp as wp
-from warpnerf_kernels import adam, camera, interp, occupancy, parcels, regularize, render
+from warpnerf_kernels import adam, camera, interp, occupancy, order, parcels, regularize, render
 
 from warpnerf import kernel_cache
 from warpnerf.config import PRESETS, Contraction, Jacobian, Scaling
@@ -38,8 +38,8 @@ def training_kernels(
     """
     variant = _variant(contraction, scaling, jacobian, device)
     sharing = [
-        parcels.measure_rays_kernel(variant.contraction),
-        parcels.share_out,
+        order.measure_rays_kernel(variant.contraction),
+        order.share_out,
         parcels.deliver_parcels,
     ]
     return [

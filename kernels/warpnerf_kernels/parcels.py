@@ -4,22 +4,18 @@ Rays cross the grid in every direction; adding as they go, threads would race fo
 worker owns a part of the grid, some planes of nodes along x, and is the only one to add to it. What
 its rays have for its own part it adds at once; a pack of samples that has something for others goes
 into a parcel. Once all rays are through, each worker adds what the others have left for it. That is
-the less, the more of a ray goes through the part of the worker that has it: rays are shared out
-along x by where their middles lie, to each worker as much work. What is added to a node, and in
-which order, depends on nothing but the rays and the number of workers.
+the less, the more of a ray goes through the part of the worker that has it, for which order.py
+cares. What is added to a node, and in which order, depends on nothing but the rays and the number
+of workers.
 
 Like packs.py this is for float32 on the CPU, and most of it C++ on Clang's vector types.
 """
 
-from functools import cache
-
 import warp as wp
 
-from .contraction import contract
-from .march import prepare_ray, step_edge
 from .packs import Pack
-from .types import Gradient, Grid, March, real, vec3
-from .vectors import LANES, VECTORS, lanes, lanes_int
+from .types import Gradient
+from .vectors import VECTORS, lanes, lanes_int
 
 wp.set_module_options({"enable_backward": False})
 
@@ -196,87 +192,3 @@ def take_in(size: wp.vec3i, worker: int, parcels: Parcels):
 def deliver_parcels(first: int, size: wp.vec3i, parcels: Parcels):
     """Add what lies in parcels to the grid's gradient, each worker to its own part."""
     take_in(size, first + wp.tid(), parcels)
-
-
-RAY = 4
-"""What a ray takes besides its packs, in steps."""
-
-MIDDLES = 1024
-"""How many middles of rays are told apart along x."""
-
-
-@cache
-def measure_rays_kernel(contraction: int) -> wp.Kernel:
-    """How much work rays are, and where along x their middle steps lie."""
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def measure_rays(
-        first: int,
-        grid: Grid,
-        march: March,
-        origins: wp.array(dtype=vec3),  # [n_rays] scene units
-        directions: wp.array(dtype=vec3),  # [n_rays] unit vectors
-        out_work: wp.array(dtype=wp.int32),  # [n_rays] steps in the grid in whole packs, and RAY
-        out_middle: wp.array(dtype=wp.int32),  # [n_rays] 0: first plane; MIDDLES - 1: last
-    ):
-        i = first + wp.tid()
-        ray = prepare_ray(grid, march, origins[i], directions[i], real(0.0), contraction)
-        t = wp.min(step_edge(march, (ray.begin + ray.end) // 2), march.far)
-        q = contract(ray.q_origin + t * ray.q_direction, grid.border, contraction)
-        x = (q[0] * grid.to_nodes[0] + grid.middle[0]) / (real(2.0) * grid.middle[0])
-        # A pack more where the last one is full: a step more or less is a matter of rounding.
-        n_packs = (ray.end - ray.begin) // wp.static(LANES) + 1
-        out_work[i] = n_packs * wp.static(LANES) + wp.static(RAY)
-        middle = int(wp.clamp(x, real(0.0), real(1.0)) * real(wp.static(MIDDLES - 1)))
-        out_middle[i] = wp.clamp(middle, 0, wp.static(MIDDLES - 1))  # x may be no number
-
-    return measure_rays
-
-
-@wp.kernel
-def share_out(
-    begin: int,  # ray to begin with
-    end: int,  # after the last one, at most
-    most_work: wp.int64,  # that there is room for
-    work: wp.array(dtype=wp.int32),  # [n_rays] by measure_rays
-    middles: wp.array(dtype=wp.int32),  # [n_rays] by measure_rays
-    work_before: wp.array(dtype=wp.int64),  # [MIDDLES] scratch
-    owners: wp.array(dtype=wp.int32),  # [n_rays] scratch
-    out_bounds: wp.array(dtype=wp.int32),  # [n_workers + 1] where in order each worker's begin
-    out_order: wp.array(dtype=wp.int32),  # [n_rays] all of the first worker's, of the second's, ...
-):
-    """Give the workers the next rays by where their middles lie, each as much work.
-
-    These are as many as there is room for, but one at least. A worker's rays keep their order.
-    """
-    n_workers = out_bounds.shape[0] - 1
-    for m in range(wp.static(MIDDLES)):
-        work_before[m] = wp.int64(0)
-    total = wp.int64(0)
-    last = int(begin)
-    while last < end and (last == begin or total + wp.int64(work[last]) <= most_work):
-        total += wp.int64(work[last])
-        work_before[middles[last]] += wp.int64(work[last])
-        last += 1
-    before = wp.int64(0)
-    for m in range(wp.static(MIDDLES)):  # from the work at a middle to that at lower ones
-        here = work_before[m]
-        work_before[m] = before
-        before += here
-    out_bounds[0] = begin
-    for w in range(n_workers):
-        out_bounds[w + 1] = 0
-    for i in range(begin, last):
-        before = work_before[middles[i]]
-        work_before[middles[i]] = before + wp.int64(work[i])
-        owners[i] = int(before * wp.int64(n_workers) // total)
-        out_bounds[owners[i] + 1] += 1  # counts a worker's rays
-    at = int(begin)
-    for w in range(n_workers):
-        n = out_bounds[w + 1]
-        out_bounds[w + 1] = at  # where its next ray goes
-        at += n
-    for i in range(begin, last):
-        at = out_bounds[owners[i] + 1]
-        out_bounds[owners[i] + 1] = at + 1
-        out_order[at] = i

@@ -1,0 +1,175 @@
+"""Which worker takes which rays, and in which order."""
+
+import itertools
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import reference
+import torch
+import warp as wp
+from drive import Problem, assert_close, unbounded, unit
+from test_kernel_parcels import most_steps, of, problem
+from warpnerf_kernels import order
+
+from warpnerf import adjoint
+from warpnerf.render import Steps
+
+
+@pytest.fixture(autouse=True)
+def _(on_cpu: None) -> None:
+    """CUDA takes rays as they come."""
+
+
+def indices_of(cell: Any) -> np.ndarray:
+    """Of cells [...], along the three axes [..., 3]: their bits in turn, x's first."""
+    bits = (np.asarray(cell)[..., None] >> np.arange(3 * order.BITS)[::-1]) & 1
+    places = 2 ** np.arange(order.BITS)[::-1]
+    return np.stack([(bits[..., axis::3] * places).sum(-1) for axis in range(3)], axis=-1)
+
+
+def middles(p: Problem) -> np.ndarray:
+    """Where rays have half of their steps behind them [n_rays, 3], in shares of the grid."""
+    at = reference.sample_distances(
+        p.steps.near, p.steps.far, p.steps.step, p.steps.growth, p.steps.n_linear, most_steps(p)
+    )
+    points = p.origins[:, None] + at.t.numpy()[:, None] * p.directions[:, None]
+    box_min, box_max = torch.tensor(p.box_min), torch.tensor(p.box_max)
+    u = reference.grid_coordinates(
+        torch.tensor(points), box_min, box_max, p.raw.shape, p.contraction, p.border
+    ).numpy() / (np.array(p.raw.shape[:3]) - 1)
+    inside = ((u >= 0) & (u <= 1)).all(axis=2) & at.before_far.numpy()
+    return np.array(
+        [points[found][found.sum() // 2] for points, found in zip(u, inside, strict=True)]
+    )
+
+
+@pytest.mark.parametrize("contraction", ["none", "linf", "l2"])
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_each_worker_has_the_rays_nearest_its_part_cell_by_cell(
+    contraction: str, threads: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    p = problem(4)
+    if contraction != "none":
+        steps = Steps(near=0.07, far=40.0, step=0.03, n_linear=60, growth=0.02)
+        p = replace(unbounded(p, contraction, 0.2), steps=steps)
+    met = of(1).forward(p).n_samples > 3
+    p = replace(p, origins=p.origins[met], directions=p.directions[met])
+    p = replace(
+        p,
+        background=p.background[:1],
+        **{
+            name: getattr(p, name)[met]
+            for name in ("target", "adj_rgb", "adj_opacity", "adj_depth")
+        },
+    )
+    if threads > 1:
+        monkeypatch.setattr(adjoint, "SAMPLES", p.n_rays * most_steps(p) // 2)
+    middle, off = middles(p), 0.06  # which of two steps is the middle one is no matter
+    turns = turns_of(lambda: of(threads).backward(p), monkeypatch)
+    assert len(turns) >= 2 if threads > 1 else len(turns) == 1
+    first = 0
+    for turn, cells in turns:
+        assert np.abs((indices_of(cells) + 0.5) / order.COLUMNS - middle).max() < off + 1 / 32
+        assert len(turn) == threads
+        rays = np.concatenate(turn)
+        assert sorted(rays) == list(range(first, first + len(rays)))
+        first += len(rays)
+        for share, following in itertools.pairwise(turn):
+            most, least = middle[share, 0].max(), middle[following, 0].min()
+            assert most <= least + off + 1 / order.COLUMNS
+        for share in turn:
+            # Rays of a cell stay in order.
+            assert np.array_equal(share, share[np.lexsort((share, cells[share]))])
+    assert first == p.n_rays
+
+
+Turn = tuple[list[np.ndarray], np.ndarray]
+"""The rays of each worker, and the cells of all rays."""
+
+
+def turns_of(launch: Callable[[], Any], monkeypatch: pytest.MonkeyPatch) -> list[Turn]:
+    """The turns of what is launched."""
+    turns = []
+    share_out = adjoint.AdjointLaunch._share_out
+
+    def spy(launch: adjoint.AdjointLaunch, begin: int, end: int) -> list[int]:
+        bounds = share_out(launch, begin, end)
+        assert bounds[0] == begin < bounds[-1] <= end
+        rays = launch._order.numpy().copy()
+        shares = [rays[i:j] for i, j in itertools.pairwise(bounds)]
+        turns.append((shares, launch._cells.numpy().copy()))
+        return bounds
+
+    monkeypatch.setattr(adjoint.AdjointLaunch, "_share_out", spy)
+    launch()
+    return turns
+
+
+@pytest.mark.parametrize("contraction", ["none", "linf"])
+def test_rays_that_are_not_finite_are_someone_s(contraction: str) -> None:
+    p = problem(9)
+    if contraction != "none":
+        p = unbounded(p, contraction, 0.2)
+    p.directions[:30] = np.nan
+    p.directions[30:60, 0] = np.inf
+    p.origins[60:90, 0] = -np.inf
+    assert_close(of(2).backward(p), of(1).backward(p), 3e-6)
+
+
+@pytest.mark.parametrize("n_workers", [1, 2, 3, 7])
+@pytest.mark.parametrize("largest", [20, 1 << 30])
+def test_rays_are_shared_out_by_column_and_work(largest: int, n_workers: int) -> None:
+    """Against sorting: rays of more work than there is room for, and many in the same cell."""
+    rng = np.random.default_rng(n_workers)
+    n, begin, most_work = 200, 17, 900 * largest // 20
+    work = rng.integers(1, largest, n)
+    work[[begin, 150]] = 2 * most_work if largest == 20 else 2**31 - 1
+    cell = rng.integers(0, order.CELLS, n)
+    cell[::2] = rng.choice([0, 5, order.CELLS - 1], n // 2)
+    column = indices_of(cell)[:, 0]
+    scratch = [
+        np.full(order.COLUMNS, 99, np.int64),
+        np.full(order.CELLS, 99, np.int32),
+        *np.zeros((2, n), np.int32),
+    ]
+    bounds, rays = np.zeros(n_workers + 1, np.int32), np.full(n, -1, np.int32)
+    arrays = [work.astype(np.int32), cell.astype(np.int32), *scratch, bounds, rays]
+    on_device = [wp.array(array, device="cpu", copy=False) for array in arrays]
+    while begin < n:
+        until = np.cumsum(work[begin:])
+        end = begin + max(1, int((until <= most_work).sum()))
+        wp.launch(order.share_out, 1, inputs=[begin, n, most_work, *on_device], device="cpu")
+        by_cell = begin + np.argsort(cell[begin:end], kind="stable")
+        by_column = by_cell[np.argsort(column[by_cell], kind="stable")]
+        until = np.cumsum(work[by_column]) - work[by_column]
+        owner = np.zeros(n, int)
+        owner[by_column] = until * n_workers // work[by_column].sum()
+        assert (bounds[0], bounds[-1]) == (begin, end)
+        for worker, (first, last) in enumerate(itertools.pairwise(bounds)):
+            assert np.array_equal(rays[first:last], by_cell[owner[by_cell] == worker])
+        assert (rays[end:] == -1).all()
+        begin = end
+
+
+@pytest.mark.parametrize("threads", [2, 3, 5])
+@pytest.mark.parametrize("distance", [0.1, 9.0])
+def test_each_worker_has_as_much_work(
+    distance: float, threads: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Cameras at one end of the box, whose rays often miss it, and one on the other side of it."""
+    p = replace(problem(6), steps=Steps(near=0.0, far=20.0, step=0.04))
+    rng = np.random.default_rng(6)
+    middle = 0.5 * (p.box_min + p.box_max)
+    p.origins[:] = p.box_max + 0.1
+    p.directions[:] = unit(rng.normal(size=p.directions.shape))
+    p.directions[::3] = unit(middle - p.origins[::3])
+    p.origins[1::3] = middle - (distance, 0.5, 0.5)
+    p.directions[1::3] = unit(middle - (0.3, 0, 0) - p.origins[1::3])
+    steps = of(1).forward(p).n_samples
+    assert 0.5 < (steps > 0).mean() < 0.9
+    ((turn, _),) = turns_of(lambda: of(threads).backward(p), monkeypatch)
+    work = np.array([steps[share].sum() for share in turn])
+    assert work.max() < 1.2 * work.mean()
