@@ -10,9 +10,10 @@ import pytest
 import reference
 import torch
 import warp as wp
-from drive import Problem, assert_close, unbounded, unit
+from drive import Kernels, Problem, assert_close, unbounded, unit
 from test_kernel_parcels import most_steps, of, problem
 from warpnerf_kernels import order
+from warpnerf_kernels.types import vec3
 
 from warpnerf import adjoint
 from warpnerf.render import Steps
@@ -72,14 +73,14 @@ def test_each_worker_has_the_rays_nearest_its_part_cell_by_cell(
     assert len(turns) >= 2 if threads > 1 else len(turns) == 1
     first = 0
     for turn, cells in turns:
-        assert np.abs((indices_of(cells) + 0.5) / order.COLUMNS - middle).max() < off + 1 / 32
+        assert np.abs((indices_of(cells) + 0.5) / order.ACROSS - middle).max() < off + 1 / 32
         assert len(turn) == threads
         rays = np.concatenate(turn)
         assert sorted(rays) == list(range(first, first + len(rays)))
         first += len(rays)
         for share, following in itertools.pairwise(turn):
             most, least = middle[share, 0].max(), middle[following, 0].min()
-            assert most <= least + off + 1 / order.COLUMNS
+            assert most <= least + off + 1 / order.ACROSS
         for share in turn:
             # Rays of a cell stay in order.
             assert np.array_equal(share, share[np.lexsort((share, cells[share]))])
@@ -116,12 +117,38 @@ def test_rays_that_are_not_finite_are_someone_s(contraction: str) -> None:
     p.directions[:30] = np.nan
     p.directions[30:60, 0] = np.inf
     p.origins[60:90, 0] = -np.inf
-    assert_close(of(2).backward(p), of(1).backward(p), 3e-6)
+    plain = Kernels("float32", "cpu").backward(p)
+    for threads in (1, 2):
+        assert_close(of(threads).backward(p), plain, 1e-5)
+
+
+@wp.kernel(enable_backward=False)
+def cells_at(positions: wp.array(dtype=vec3), out_cell: wp.array(dtype=wp.int32)):
+    i = wp.tid()
+    out_cell[i] = order.cell_at(positions[i])
+
+
+def test_cells_are_numbered_along_a_curve() -> None:
+    """All of them, from just inside; what lies at their borders, beyond the grid, or nowhere."""
+    cells = np.arange(order.CELLS)
+    index = indices_of(cells)
+    assert len(np.unique(index, axis=0)) == order.CELLS
+    inside = [(index + share) / order.ACROSS for share in (1e-3, 0.5, 1 - 1e-3)]
+    outside = [[1, 1, 1], [0, 1, 2], [np.inf, -np.inf, -0.2], [np.nan, 0.5, np.nan]]
+    last, half = order.ACROSS - 1, order.ACROSS // 2
+    expected = [[last, last, last], [0, last, last], [last, 0, 0], [0, half, 0]]
+    positions = np.concatenate([*inside, outside]).astype(np.float32)
+    out = wp.zeros(len(positions), dtype=wp.int32, device="cpu")
+    given = wp.array(positions, dtype=vec3, device="cpu")
+    wp.launch(cells_at, len(positions), inputs=[given, out], device="cpu")
+    found = out.numpy()
+    assert np.array_equal(found[: 3 * order.CELLS], np.tile(cells, 3))
+    assert np.array_equal(indices_of(found[3 * order.CELLS :]), expected)
 
 
 @pytest.mark.parametrize("n_workers", [1, 2, 3, 7])
 @pytest.mark.parametrize("largest", [20, 1 << 30])
-def test_rays_are_shared_out_by_column_and_work(largest: int, n_workers: int) -> None:
+def test_rays_are_shared_out_by_slab_and_work(largest: int, n_workers: int) -> None:
     """Against sorting: rays of more work than there is room for, and many in the same cell."""
     rng = np.random.default_rng(n_workers)
     n, begin, most_work = 200, 17, 900 * largest // 20
@@ -129,9 +156,9 @@ def test_rays_are_shared_out_by_column_and_work(largest: int, n_workers: int) ->
     work[[begin, 150]] = 2 * most_work if largest == 20 else 2**31 - 1
     cell = rng.integers(0, order.CELLS, n)
     cell[::2] = rng.choice([0, 5, order.CELLS - 1], n // 2)
-    column = indices_of(cell)[:, 0]
+    slab = indices_of(cell)[:, 0]
     scratch = [
-        np.full(order.COLUMNS, 99, np.int64),
+        np.full(order.ACROSS, 99, np.int64),
         np.full(order.CELLS, 99, np.int32),
         *np.zeros((2, n), np.int32),
     ]
@@ -143,10 +170,10 @@ def test_rays_are_shared_out_by_column_and_work(largest: int, n_workers: int) ->
         end = begin + max(1, int((until <= most_work).sum()))
         wp.launch(order.share_out, 1, inputs=[begin, n, most_work, *on_device], device="cpu")
         by_cell = begin + np.argsort(cell[begin:end], kind="stable")
-        by_column = by_cell[np.argsort(column[by_cell], kind="stable")]
-        until = np.cumsum(work[by_column]) - work[by_column]
+        by_slab = by_cell[np.argsort(slab[by_cell], kind="stable")]
+        until = np.cumsum(work[by_slab]) - work[by_slab]
         owner = np.zeros(n, int)
-        owner[by_column] = until * n_workers // work[by_column].sum()
+        owner[by_slab] = until * n_workers // work[by_slab].sum()
         assert (bounds[0], bounds[-1]) == (begin, end)
         for worker, (first, last) in enumerate(itertools.pairwise(bounds)):
             assert np.array_equal(rays[first:last], by_cell[owner[by_cell] == worker])

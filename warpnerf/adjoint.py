@@ -104,14 +104,14 @@ class AdjointLaunch:
             if count < workers.count:
                 self._workers = Workers("cpu", count)
             room = SAMPLES // count if count > 1 else 0
-            # A worker may get a ray more than it should.
+            # One worker leaves no parcels. Of several, each may get a ray more than its share.
             self._work_a_turn = count * (room - most_work) if count > 1 else 1 << 62
             self.parcels = _make_parcels(room // LANES, count)
             # What share_out takes from measure_rays, its scratch, and what it gives.
             self._work, self._cells, self._by_cell, self._owners, self._order = (
                 wp.empty(n_rays, dtype=wp.int32, device="cpu") for _ in range(5)
             )
-            self._work_before = wp.empty(order.COLUMNS, dtype=wp.int64, device="cpu")
+            self._work_before = wp.empty(order.ACROSS, dtype=wp.int64, device="cpu")
             self._rays_before = wp.empty(order.CELLS, dtype=wp.int32, device="cpu")
             self._bounds = wp.empty(count + 1, dtype=wp.int32, device="cpu")
         elif not workers.device.is_cuda:

@@ -23,10 +23,10 @@ RAY = 4
 BITS = 4
 """Of a cell's index along each axis."""
 
-COLUMNS = 1 << BITS
+ACROSS = 1 << BITS
 """Cells along each axis."""
 
-CELLS = COLUMNS**3
+CELLS = ACROSS**3
 """Cells that the grid is divided into, to tell middles of rays apart."""
 
 
@@ -38,20 +38,20 @@ def cell_at(x: vec3) -> int:
     """
     cell = int(0)
     for axis in range(3):
-        scaled = wp.clamp(x[axis], real(0.0), real(1.0)) * real(wp.static(COLUMNS))
-        index = wp.clamp(int(scaled), 0, wp.static(COLUMNS - 1))  # x may be no number
+        scaled = wp.clamp(x[axis], real(0.0), real(1.0)) * real(wp.static(ACROSS))
+        index = wp.min(int(scaled), wp.static(ACROSS - 1))  # 1 lies in the last cell
         for bit in range(wp.static(BITS)):
             cell += ((index >> bit) & 1) << (3 * bit + 2 - axis)
     return cell
 
 
 @wp.func
-def column_of(cell: int) -> int:
-    """A cell's index along x."""
-    column = int(0)
+def slab_of(cell: int) -> int:
+    """A cell's index along x: which slab of cells it lies in."""
+    slab = int(0)
     for bit in range(wp.static(BITS)):
-        column += ((cell >> (3 * bit + 2)) & 1) << bit
-    return column
+        slab += ((cell >> (3 * bit + 2)) & 1) << bit
+    return slab
 
 
 @cache
@@ -88,33 +88,33 @@ def share_out(
     most_work: wp.int64,  # that there is room for
     work: wp.array(dtype=wp.int32),  # [n_rays] by measure_rays
     cells: wp.array(dtype=wp.int32),  # [n_rays] by measure_rays
-    work_before: wp.array(dtype=wp.int64),  # [COLUMNS] scratch
+    work_before: wp.array(dtype=wp.int64),  # [ACROSS] scratch
     rays_before: wp.array(dtype=wp.int32),  # [CELLS] scratch
     by_cell: wp.array(dtype=wp.int32),  # [n_rays] scratch
     owners: wp.array(dtype=wp.int32),  # [n_rays] scratch
     out_bounds: wp.array(dtype=wp.int32),  # [n_workers + 1] where in order each worker's begin
     out_order: wp.array(dtype=wp.int32),  # [n_rays] all of the first worker's, of the second's, ...
 ):
-    """Give the workers the next rays by column, each as much work, and each in the order of cells.
+    """Give the workers the next rays by slab, each as much work, and each in the order of cells.
 
     These are as many as there is room for, but one at least. Rays of a cell keep their order.
     """
     n_workers = out_bounds.shape[0] - 1
-    for column in range(wp.static(COLUMNS)):
-        work_before[column] = wp.int64(0)
+    for slab in range(wp.static(ACROSS)):
+        work_before[slab] = wp.int64(0)
     for cell in range(wp.static(CELLS)):
         rays_before[cell] = 0
     total = wp.int64(0)
     last = int(begin)
     while last < end and (last == begin or total + wp.int64(work[last]) <= most_work):
         total += wp.int64(work[last])
-        work_before[column_of(cells[last])] += wp.int64(work[last])
+        work_before[slab_of(cells[last])] += wp.int64(work[last])
         rays_before[cells[last]] += 1
         last += 1
     before = wp.int64(0)
-    for column in range(wp.static(COLUMNS)):  # from the work in a column to that in lower ones
-        here = work_before[column]
-        work_before[column] = before
+    for slab in range(wp.static(ACROSS)):  # from the work in a slab to that in lower ones
+        here = work_before[slab]
+        work_before[slab] = before
         before += here
     at = int(begin)
     for cell in range(wp.static(CELLS)):  # from the rays of a cell to where they begin
@@ -130,9 +130,9 @@ def share_out(
         out_bounds[w + 1] = 0
     for place in range(begin, last):
         i = by_cell[place]
-        column = column_of(cells[i])
-        before = work_before[column]
-        work_before[column] = before + wp.int64(work[i])
+        slab = slab_of(cells[i])
+        before = work_before[slab]
+        work_before[slab] = before + wp.int64(work[i])
         owners[place] = int(before * wp.int64(n_workers) // total)
         out_bounds[owners[place] + 1] += 1  # counts a worker's rays
     at = int(begin)
