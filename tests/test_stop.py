@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
+import time
 from collections.abc import Iterator
 
 import pytest
@@ -14,8 +16,9 @@ from warpnerf.stop import SIGNALS, Stopped, StopRequest, raise_when_asked
 @pytest.fixture(autouse=True)
 def handlers() -> Iterator[None]:
     """The test runner's, put back afterwards."""
-    before = {number: signal.getsignal(number) for number in SIGNALS}
+    before, hook = {number: signal.getsignal(number) for number in SIGNALS}, sys.unraisablehook
     yield
+    sys.unraisablehook = hook
     for number, handler in before.items():
         signal.signal(number, handler)
 
@@ -54,3 +57,29 @@ def test_handlers_are_given_back() -> None:
     assert [signal.getsignal(number) for number in SIGNALS] == before
     with pytest.raises(Stopped):
         ask(signal.SIGTERM)
+
+
+class Ending:
+    """Asked to stop in its finaliser, as Warp's arrays are when they give their memory back."""
+
+    def __del__(self) -> None:
+        ask(signal.SIGTERM)
+
+
+def test_a_signal_is_not_lost_in_a_finaliser() -> None:
+    raise_when_asked()
+    with pytest.raises(Stopped) as stopped:
+        Ending()
+        for _ in range(1000):
+            time.sleep(0.01)
+    assert stopped.value.exit_code == 143
+
+
+def test_other_errors_of_finalisers_are_reported(capsys: pytest.CaptureFixture[str]) -> None:
+    class Failing:
+        def __del__(self) -> None:
+            raise ValueError("of no signal")
+
+    raise_when_asked()
+    Failing()
+    assert "ValueError: of no signal" in capsys.readouterr().err

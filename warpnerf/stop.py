@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import _thread
 import signal
+import sys
+import threading
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -21,6 +24,7 @@ def raise_when_asked() -> None:
     """From now on, Ctrl-C and SIGTERM raise Stopped in the main thread."""
     for number in SIGNALS:
         signal.signal(number, _raise)
+    sys.unraisablehook = _ask_again
 
 
 class StopRequest:
@@ -49,3 +53,17 @@ class StopRequest:
 
 def _raise(number: int, frame: object) -> None:
     raise Stopped(number)
+
+
+def _ask_again(lost: sys.UnraisableHookArgs) -> None:
+    """Let a signal that came in a finaliser, or a callback from C, come again when that has ended.
+
+    Python drops what these raise.
+    """
+    if not isinstance(lost.exc_value, Stopped):
+        sys.__unraisablehook__(lost)
+        return
+    number = lost.exc_value.exit_code - 128
+    again = threading.Timer(0.01, _thread.interrupt_main, (number,))
+    again.daemon = True
+    again.start()
