@@ -20,8 +20,17 @@ from warpnerf.render import Steps
 
 
 @pytest.fixture(autouse=True)
-def _(on_cpu: None) -> None:
-    """CUDA takes rays as they come."""
+def _(on_cpu: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """CUDA takes rays as they come. Memory begins with what no ray or cell has for a number."""
+    initialise = adjoint.AdjointLaunch.__init__
+
+    def unwritten(launch: adjoint.AdjointLaunch, *given: Any) -> None:
+        initialise(launch, *given)
+        if launch.parcels is not None:
+            for name in ("work", "cells", "by_cell", "owners", "order", "rays_before", "bounds"):
+                getattr(launch, f"_{name}").fill_(-(1 << 28))
+
+    monkeypatch.setattr(adjoint.AdjointLaunch, "__init__", unwritten)
 
 
 def indices_of(cell: Any) -> np.ndarray:

@@ -140,13 +140,14 @@ class AdjointLaunch:
             self._workers.launch_owned(
                 self._kernel, bounds, *arguments, self.parcels, packed=self._packed
             )
-            self._workers.launch(
-                parcels.deliver_parcels,
-                self._workers.count,
-                self._size,
-                self.parcels,
-                packed=self._packed,
-            )
+            if self._workers.count > 1:
+                self._workers.launch(
+                    parcels.deliver_parcels,
+                    self._workers.count,
+                    self._size,
+                    self.parcels,
+                    packed=self._packed,
+                )
             begin = bounds[-1]
 
     def _measure(self, n_rays: int, arguments: tuple[Any, ...]) -> None:

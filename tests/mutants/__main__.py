@@ -19,6 +19,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import order
 import packed
 import parcels
 import plain
@@ -29,7 +30,7 @@ COPIED = ("kernels", "warpnerf", "tests")
 TIME_LIMIT = 300.0
 """Seconds for the tests of one mutant; one that runs longer never ends, and is noticed as well."""
 
-MUTANTS = (*plain.MUTANTS, *packed.MUTANTS, *parcels.MUTANTS)
+MUTANTS = (*plain.MUTANTS, *packed.MUTANTS, *parcels.MUTANTS, *order.MUTANTS)
 
 
 def copy_to(folder: Path) -> None:
