@@ -100,6 +100,13 @@ def main() -> None:
     print(f"wrote {write_record(record, arguments.output, 'training', arguments.device)}")
 
 
+def path_of(name: str) -> str:
+    """A scene's folder, here or in the one that WARPNERF_DATA names; or a built-in one."""
+    if ":" in name or Path(name).exists():
+        return name
+    return str(Path(os.environ.get("WARPNERF_DATA", "")) / name)
+
+
 def profile(name: str, downscale: int, config: wn.TrainConfig) -> dict[str, float]:
     """Train on a scene.
 
@@ -107,9 +114,7 @@ def profile(name: str, downscale: int, config: wn.TrainConfig) -> dict[str, floa
         Each part's share of the time, "rest" for what is in none, steps, and samples per ray of the
         last update.
     """
-    if ":" not in name and not Path(name).exists():
-        name = str(Path(os.environ.get("WARPNERF_DATA", "")) / name)
-    trainer = Trainer(wn.load_scene(name, downscale=downscale), config)
+    trainer = Trainer(wn.load_scene(path_of(name), downscale=downscale), config)
     trainer.update()  # compiles
     clock = Clock(trainer.workers.device.is_cuda)
     patches = [

@@ -139,6 +139,15 @@ def test_training(tmp_path):
     assert row["steps"] == 30 and row["samples_per_ray"] > 1
 
 
+def test_ray_order(tmp_path, on_cpu):
+    options = ("builtin:room", "--downscale", "16", "--steps", "4", "--threads", "2")
+    record, printed = run("ray_order.py", tmp_path / "record.json", *options, "--rounds", "2")
+    row = record["scenes"]["builtin:room"]
+    assert list(row) == [f"2 threads, {steps} steps" for steps in (1, 4, 16)]
+    assert all(is_interval(found) for found in row.values())
+    assert printed.count("builtin:room") == 3
+
+
 def test_compiled_torch_agrees():
     """Apart from the rest, for it takes long to compile."""
     load = candidates.find("cpu")[0].get("torch.compile")

@@ -1,0 +1,92 @@
+"""What it brings that rays of a batch follow each other by where their middles lie.
+
+    python benchmarks/ray_order.py builtin:room path/to/scene --time-limit 25
+
+Scenes are as for training.py. Each is trained; then batches of one, four and sixteen steps go
+through the training pass twice in turns, as they do, and in each worker's slabs of the grid as they
+are drawn. Prints the ratios of their times and writes benchmarks/results/ray_order_cpu.json.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+from measuring import Stopwatch, machine, median_interval, options, show, write_record
+from training import path_of
+from warpnerf_kernels import order
+
+import warpnerf as wn
+from warpnerf.parallel import Workers
+from warpnerf.rays import PixelSampler
+from warpnerf.render import TrainingPass
+
+SLAB = sum(1 << (3 * bit + 2) for bit in range(order.BITS))
+"""The bits of a cell's number that name its slab."""
+
+
+def main() -> None:
+    parser = options(__doc__)
+    parser.add_argument("scenes", nargs="*", default=["builtin:room"], help="builtin:room, folders")
+    parser.add_argument("--time-limit", type=float, default=25.0, help="seconds of training each")
+    parser.add_argument("--steps", type=int, default=100_000, help="at most so many steps")
+    parser.add_argument("--downscale", type=int, default=1)
+    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--rounds", type=int, default=12)
+    arguments = parser.parse_args()
+    if arguments.device != "cpu":
+        parser.error("rays are put in order on the CPU only")
+    rows: dict[str, dict[str, Any]] = {}
+    print("scene           threads  steps  time in order over time as drawn")
+    for name in arguments.scenes:
+        scene = wn.load_scene(path_of(name), downscale=arguments.downscale)
+        config = wn.TrainConfig(steps=arguments.steps, time_limit=arguments.time_limit)
+        field = wn.train(scene, config).field
+        rows[name] = {}
+        for threads in arguments.threads:
+            for steps in (1, 4, 16):
+                found = median_interval(ratios(scene, field, steps, threads, arguments.rounds))
+                rows[name][f"{threads} threads, {steps} steps"] = found
+                print(f"{name:14}  {threads:7}  {steps:5}  {show(found, 2)}", flush=True)
+    record = {
+        "machine": machine("cpu", max(arguments.threads)),
+        "time_limit": arguments.time_limit,
+        "rounds": arguments.rounds,
+        "scenes": rows,
+    }
+    print(f"wrote {write_record(record, arguments.output, 'ray_order', 'cpu')}")
+
+
+def ratios(scene: wn.Scene, field: wn.Field, steps: int, threads: int, rounds: int) -> list[float]:
+    """Of each round, with a batch of its own: the time in order over that as drawn."""
+    workers = Workers("cpu", threads)
+    n_rays = wn.TrainConfig().rays_per_step
+    views = [scene.views[i] for i in scene.splits["train"]]
+    sampler = PixelSampler(views, scene.content_distance, None, n_rays, True, 0, workers)
+    ordered, drawn = (
+        TrainingPass(steps * n_rays, field.grid, field.steps, "clamped", "none", workers)
+        for _ in range(2)
+    )
+    measure = drawn.launch._measure
+
+    def measure_slabs(*given: Any) -> None:
+        measure(*given)
+        drawn.launch._cells.numpy()[:] &= SLAB
+
+    drawn.launch._measure = measure_slabs  # type: ignore[method-assign]
+    watch, found = Stopwatch("cpu"), []
+    for turn in range(rounds + 1):
+        batch = sampler.draw(turn * steps, steps)
+        passes = (ordered, drawn) if turn % 2 else (drawn, ordered)
+        seconds = {p: watch.seconds(partial(p.run, field.free, batch, steps)) for p in passes}
+        if turn == 0:  # the first finds nothing in memory, and is compared
+            a, b = (p.gradients.values.numpy() for p in (ordered, drawn))
+            assert np.abs(a - b).max() <= 1e-4 * np.abs(b).max()
+        else:
+            found.append(seconds[ordered] / seconds[drawn])
+    return found
+
+
+if __name__ == "__main__":
+    main()
