@@ -139,6 +139,17 @@ def test_training(tmp_path):
     assert row["steps"] == 30 and row["samples_per_ray"] > 1
 
 
+def test_schedules(tmp_path):
+    options = ("builtin:room", "--downscale", "8", "--steps", "9", "--seeds", "1", "2")
+    record, printed = run("schedules.py", tmp_path / "record.json", *options)
+    rows = record["rows"]
+    assert [row["seed"] for row in rows] == [1] * 5 + [2] * 5
+    assert len({row["setting"] for row in rows}) == 5
+    for row in rows:
+        assert row["steps"] == 9 and 5 < row["psnr"] < 50 and 0 < row["besides_rays"] < 1
+        assert f"{row['psnr']:.2f}" in printed
+
+
 def test_ray_order(tmp_path, on_cpu):
     options = ("builtin:room", "--downscale", "16", "--steps", "4", "--threads", "2")
     record, printed = run("ray_order.py", tmp_path / "record.json", *options, "--rounds", "2")

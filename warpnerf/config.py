@@ -100,11 +100,12 @@ class MarchConfig:
 class OptimConfig:
     """Adam, its schedule, and regularisation."""
 
-    learning_rate_density: float = 0.5
-    """How far an update moves raw densities, about, at the start."""
-    learning_rate_rgb: float = 0.2
-    """How far an update moves raw colours, about, at the start."""
-    decay: float = 0.1
+    learning_rate_density: float = 0.8
+    """How far an update of one step moves raw densities, about, at the start; one of n steps moves
+    them sqrt(n) times as far."""
+    learning_rate_rgb: float = 0.32
+    """How far an update of one step moves raw colours, about, at the start; likewise."""
+    decay: float = 0.07
     """What is left of the learning rates at the end of training."""
     beta1: float = 0.9
     """Decay of the first moment."""
@@ -123,8 +124,8 @@ class OptimConfig:
     accumulate_at: Literal["auto"] | tuple[float, ...] = "auto"
     """Shares of the training. Before the first, an update of the grid follows each step; from each
     on, twice as many steps, whose rays are put through together and whose losses are added up.
-    auto: 0.5 and 0.7, each once; twice for objects, bounded scenes of photographs with alpha, where
-    rays meet little. At most six, as the rays of an update are in memory at a time."""
+    auto: 0.5 and 0.7; in bounded scenes, where rays meet less, 0.3, 0.4 twice, and 0.5. At most
+    six, as the rays of an update are in memory at a time."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot be optimised with."""
@@ -152,11 +153,11 @@ class OptimConfig:
             if not 0 <= getattr(self, name) < 1:
                 raise InputError(f"optim.{name} must lie in [0, 1), not {getattr(self, name)}.")
 
-    def accumulation(self, of_object: bool) -> tuple[float, ...]:
-        """``accumulate_at``, decided for a scene that is an object, or is not."""
+    def accumulation(self, unbounded: bool) -> tuple[float, ...]:
+        """``accumulate_at``, decided for an unbounded scene, or a bounded one."""
         if not isinstance(self.accumulate_at, str):
             return self.accumulate_at
-        return (0.5, 0.5, 0.7, 0.7) if of_object else (0.5, 0.7)
+        return (0.5, 0.7) if unbounded else (0.3, 0.4, 0.4, 0.5)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -27,7 +27,7 @@ FAR_OFF = 10.0
 
 SECONDS_PER_RAY, SECONDS_PER_SAMPLE, SECONDS_PER_NODE = 1.2e-6, 22e-9, 16e-9
 """Of one core, in a step for what is visited and in an update for each node in use: measured on an
-AMD EPYC (Zen 5)."""
+AMD EPYC."""
 
 SAMPLES_AND_OCCUPIED = {"object": (12, 0.3), "room": (50, 0.8), "unbounded": (190, 0.6)}
 """Samples per ray, and the share of nodes in use: means of lego, builtin:room and fox late in
@@ -276,7 +276,7 @@ def _cost(scene: Scene, config: TrainConfig, threads: int) -> Cost:
     finer = (voxels / PRESETS["fast"].grid.voxels) ** (1.0 / 3.0) / config.march.step_voxels
     share = (np.arange(1000) + 0.5)[:, None] / 1000  # of the training, evenly
     nodes = voxels * 0.5 ** (share < config.grid.grow_at).sum(axis=1)
-    steps_an_update = 2.0 ** (share >= config.optim.accumulation(kind == "object")).sum(axis=1)
+    steps_an_update = 2.0 ** (share >= config.optim.accumulation(scene.unbounded)).sum(axis=1)
     step = config.rays_per_step * (SECONDS_PER_RAY + finer * samples * SECONDS_PER_SAMPLE)
     step += float((nodes / steps_an_update).mean()) * occupied * SECONDS_PER_NODE
     return Cost(memory=memory, seconds=config.steps * step / threads, threads=threads)

@@ -130,7 +130,7 @@ class Trainer:
             config.seed,
             self.workers,
         )
-        self._accumulation = config.optim.accumulation(has_alpha and not scene.unbounded)
+        self._accumulation = config.optim.accumulation(scene.unbounded)
         self._grown = 0
         self._updates = 0
         self.grid = self._first_grid(scene)
@@ -217,7 +217,7 @@ class Trainer:
             self.moments,
             self._pass.gradients,
             self._updates,
-            config.optim.decay**fraction,
+            config.optim.decay**fraction * math.sqrt(n_steps),
             config.optim,
             self.workers,
         )

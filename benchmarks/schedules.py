@@ -1,0 +1,112 @@
+"""What a schedule of learning rates and updates brings within equal time.
+
+    python benchmarks/schedules.py builtin:room path/to/scene --time-limit 25 --seeds 0 1
+
+Scenes are as for training.py. Trainings that differ in nothing but their ``OptimConfig`` take turns
+of a fraction of a second, each for as long on a clock of its own; so a machine that is slow for a
+while is slow for all. Prints PSNR on the test views, in dB, steps, and the share of the time that
+is not rays and their gradient; writes benchmarks/results/schedules_<device>.json.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from functools import partial
+from unittest import mock
+
+from measuring import machine, options, write_record
+from training import Clock, path_of
+
+import warpnerf as wn
+from warpnerf.parallel import Workers
+from warpnerf.render import TrainingPass
+from warpnerf.training import Trainer
+
+SETTINGS = {
+    "auto": wn.OptimConfig(),
+    "update every step": wn.OptimConfig(accumulate_at=()),
+    "up to 4 steps": wn.OptimConfig(accumulate_at=(0.5, 0.7)),
+    "up to 16 steps": wn.OptimConfig(accumulate_at=(0.3, 0.4, 0.4, 0.5)),
+    "lower, up to 4": wn.OptimConfig(
+        accumulate_at=(0.5, 0.7), learning_rate_density=0.5, learning_rate_rgb=0.2
+    ),
+}
+"""What is compared."""
+
+TURN = 0.4
+"""Seconds."""
+
+
+def main() -> None:
+    parser = options(__doc__)
+    parser.add_argument("scenes", nargs="*", default=["builtin:room"], help="builtin:room, folders")
+    parser.add_argument("--time-limit", type=float, default=25.0, help="seconds each")
+    parser.add_argument("--steps", type=int, default=100_000, help="at most so many steps")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--downscale", type=int, default=1)
+    arguments = parser.parse_args()
+    config = wn.TrainConfig(
+        steps=arguments.steps, time_limit=arguments.time_limit, device=arguments.device
+    )
+    print("scene           seed  setting             PSNR  steps  besides rays")
+    rows = []
+    for name in arguments.scenes:
+        scene = wn.load_scene(path_of(name), downscale=arguments.downscale)
+        for seed in arguments.seeds:
+            for setting, found in race(scene, replace(config, seed=seed)).items():
+                rows.append({"scene": name, "seed": seed, "setting": setting, **found})
+                print(
+                    f"{name:14}  {seed:4}  {setting:17}  {found['psnr']:5.2f}  "
+                    f"{found['steps']:5.0f}  {100 * found['besides_rays']:10.1f} %",
+                    flush=True,
+                )
+    record = {
+        "machine": machine(arguments.device, Workers(arguments.device).count),
+        "time_limit": arguments.time_limit,
+        "steps": arguments.steps,
+        "downscale": arguments.downscale,
+        "rows": rows,
+    }
+    print(f"wrote {write_record(record, arguments.output, 'schedules', arguments.device)}")
+
+
+def race(scene: wn.Scene, config: wn.TrainConfig) -> dict[str, dict[str, float]]:
+    """Train with each of the settings, in turns."""
+    trainers = {
+        setting: Trainer(scene, replace(config, optim=optim)) for setting, optim in SETTINGS.items()
+    }
+    for trainer in trainers.values():
+        trainer.update()  # compiles; its clock starts after it
+    left = dict.fromkeys(trainers, time.perf_counter())  # when its last turn ended
+    spent, rays = dict.fromkeys(trainers, 0.0), dict.fromkeys(trainers, 0.0)
+    clock = Clock(Workers(config.device).device.is_cuda)
+    turn = 0
+    with mock.patch.object(TrainingPass, "run", clock.timing("rays", TrainingPass.run)):
+        while waiting := [setting for setting in trainers if trainers[setting].fraction < 1.0]:
+            turn += 1
+            for setting in waiting[:: 1 if turn % 2 else -1]:
+                trainer, rays_before = trainers[setting], clock.seconds["rays"]
+                begin = time.perf_counter()
+                assert trainer._started is not None
+                trainer._started += begin - left[setting]
+                trainer.run(stop=partial(_is_past, begin + TURN))
+                left[setting] = time.perf_counter()
+                spent[setting] += left[setting] - begin
+                rays[setting] += clock.seconds["rays"] - rays_before
+    return {
+        setting: {
+            "psnr": wn.evaluate(trainer.field(), scene).mean["psnr"],
+            "steps": trainer.steps_done,
+            "besides_rays": 1.0 - rays[setting] / spent[setting],
+        }
+        for setting, trainer in trainers.items()
+    }
+
+
+def _is_past(until: float) -> bool:
+    return time.perf_counter() > until
+
+
+if __name__ == "__main__":
+    main()
