@@ -130,19 +130,25 @@ def test_updates_take_more_steps_as_training_goes_on(
 
 
 @pytest.mark.parametrize(
-    ("unbounded", "late"),
-    [(False, [8, 16, 20]), (True, [*range(7, 11), 12, 14, 18, 20])],
+    ("unbounded", "channels", "late"),
+    [
+        (False, 3, [14, 16, 24, 40]),
+        (False, 4, [14, 16, 24, 40]),
+        (True, 4, [*range(13, 21), *range(22, 29, 2), 32, 36, 40]),
+    ],
 )
 def test_updates_take_more_steps_in_bounded_scenes_unless_told(
-    unbounded: bool, late: list[int]
+    unbounded: bool, channels: int, late: list[int]
 ) -> None:
+    scene = ball()
+    views = [replace(view, image=view.image[..., :channels]) for view in scene.views]
     seen: list[int] = []
     train(
-        replace(ball(), unbounded=unbounded),
-        tiny_config(checkpoint_every=1e-9, optim=OptimConfig()),
+        replace(scene, views=views, unbounded=unbounded),
+        tiny_config(steps=40, checkpoint_every=1e-9, optim=OptimConfig()),
         on_checkpoint=lambda state: seen.append(state.progress.step),
     )
-    assert seen == [*range(1, 7), *late]
+    assert seen == [*range(1, 13), *late]
 
 
 @pytest.mark.parametrize("shares", [(0.0,), (0.5, 0.4), (1.0,), (math.nan,)])
@@ -170,7 +176,8 @@ def test_updates_are_counted_apart_from_steps(monkeypatch: pytest.MonkeyPatch) -
     looked: list[int] = []
     add, adam = training.add_total_variation, training.adam_step
     look = Trainer._look_for_free_space
-    trainer = Trainer(ball(), accumulating(tiny_config(grid=NO_GROWTH), 0.2, 0.5))
+    config = accumulating(tiny_config(grid=NO_GROWTH), 0.2, 0.5)
+    trainer = Trainer(ball(), replace(config, optim=replace(config.optim, decay=0.3)))
 
     def adding(*arguments: Any) -> None:
         smoothed.append((trainer._updates, arguments[3]))
@@ -192,7 +199,7 @@ def test_updates_are_counted_apart_from_steps(monkeypatch: pytest.MonkeyPatch) -
     # Updates end after 1, 2, 3, 4, 6, 8, 10, 14, 18 and 20 steps.
     assert updates == list(range(1, 11))
     begun, n_steps = [0, 1, 2, 3, 4, 6, 8, 10, 14, 18], [1, 1, 1, 1, 2, 2, 2, 4, 4, 2]
-    fading = 0.07 ** (np.array(begun) / STEPS)
+    fading = 0.3 ** (np.array(begun) / STEPS)
     np.testing.assert_allclose(rates, fading * np.sqrt(n_steps), rtol=1e-12)
     assert smoothed == [(0, 1), (3, 1), (6, 2), (9, 2)]  # every third
     assert looked == [0, 6]  # before every fifth

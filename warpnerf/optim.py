@@ -47,7 +47,7 @@ def adam_step(
     moments: wp.array,
     gradients: Gradients,
     update: int,
-    rate: float,
+    factor: float,
     config: OptimConfig,
     workers: Workers,
 ) -> None:
@@ -58,16 +58,16 @@ def adam_step(
         moments: [n_nodes] updated likewise.
         gradients: Of the update's steps.
         update: Counts from 1.
-        rate: Factor on the learning rates.
+        factor: On the learning rates.
         config: The rest.
         workers: Where to work.
     """
-    rgb_rate = rate * config.learning_rate_rgb
+    rgb_rate = factor * config.learning_rate_rgb
     workers.launch(
         adam.adam_step,
         *_shares(grid, workers),
         update,
-        vec4(rate * config.learning_rate_density, rgb_rate, rgb_rate, rgb_rate),
+        vec4(factor * config.learning_rate_density, rgb_rate, rgb_rate, rgb_rate),
         config.beta1,
         config.beta2,
         config.epsilon,
