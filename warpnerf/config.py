@@ -105,7 +105,7 @@ class OptimConfig:
     them sqrt(n) times as far."""
     learning_rate_rgb: float = 0.32
     """How far an update of one step moves raw colours, about, at the start; likewise."""
-    decay: float = 0.07
+    decay: float = 0.03
     """What is left of the learning rates at the end of training."""
     beta1: float = 0.9
     """Decay of the first moment."""
