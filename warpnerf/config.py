@@ -100,12 +100,12 @@ class MarchConfig:
 class OptimConfig:
     """Adam, its schedule, and regularisation."""
 
-    learning_rate_density: float = 0.8
+    learning_rate_density: float = 0.5
     """How far an update of one step moves raw densities, about, at the start; one of n steps moves
     them sqrt(n) times as far."""
-    learning_rate_rgb: float = 0.32
+    learning_rate_rgb: float = 0.2
     """How far an update of one step moves raw colours, about, at the start; likewise."""
-    decay: float = 0.03
+    decay: float = 0.05
     """What is left of the learning rates at the end of training."""
     beta1: float = 0.9
     """Decay of the first moment."""
