@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import warp as wp
@@ -87,6 +91,7 @@ class Module:
 def test_compiling_is_announced_once_and_reading_is_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    kernel_cache.start()  # or Warp would choose a folder of its own when it is first used
     said: list[str] = []
     monkeypatch.setattr(kernel_cache._log, "info", said.append)
     monkeypatch.setattr(kernel_cache, "_said", False)
@@ -97,3 +102,21 @@ def test_compiling_is_announced_once_and_reading_is_not(
     for name, times in (("cached", 0), ("first", 1), ("second", 1), ("first", 1)):
         kernel_cache._load(Module(tmp_path / name), cpu)
         assert said == ["compiling kernels (once; later runs start at once)"] * times
+
+
+def test_one_thread_loads_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Warp crashes where two load a module for the first time."""
+    inside: list[int] = []
+    together: list[int] = []
+
+    def load(module: object, device: object) -> None:
+        inside.append(threading.get_ident())
+        time.sleep(0.05)
+        together.append(len(inside))
+        inside.remove(threading.get_ident())
+
+    monkeypatch.setattr(kernel_cache, "_load", load)
+    kernel = SimpleNamespace(module=None)
+    with ThreadPoolExecutor(3) as pool:
+        list(pool.map(lambda _: kernel_cache.load(kernel, None), range(3)))
+    assert together == [1, 1, 1]

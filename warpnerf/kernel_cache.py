@@ -27,6 +27,8 @@ SUMS = "SHA256SUMS"
 COMPILED = (".o", ".cubin", ".ptx", ".meta")
 
 _log = logging.getLogger("warpnerf")
+_loading = threading.Lock()
+"""Warp would load a module twice where two threads ask for it, and free the code of one of them."""
 _temporary: Path | None = None
 _said = False
 
@@ -50,19 +52,20 @@ def start() -> None:
 
 
 def load(kernel: wp.Kernel, device: wp.Device) -> None:
-    """Compile a kernel's module for a device, or fetch it from the cache.
+    """Compile a kernel's module for a device, or fetch it from the cache; for any thread.
 
     Raises:
         InputError: The cache cannot be used, nor can a temporary folder be made.
     """
-    try:
-        _load(kernel.module, device)
-    except Exception as error:  # whatever came of it: Warp raises plain exceptions
-        if _temporary is not None:
-            raise
-        _leave_cache(error)
-        kernel.module.unload()  # forgets that it failed
-        _load(kernel.module, device)
+    with _loading:
+        try:
+            _load(kernel.module, device)
+        except Exception as error:  # whatever came of it: Warp raises plain exceptions
+            if _temporary is not None:
+                raise
+            _leave_cache(error)
+            kernel.module.unload()  # forgets that it failed
+            _load(kernel.module, device)
 
 
 def _load(module: wp.Module, device: wp.Device) -> None:
