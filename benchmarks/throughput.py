@@ -24,8 +24,9 @@ from __future__ import annotations
 
 import argparse
 import gc
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import candidates
@@ -34,6 +35,7 @@ import roofline
 from candidates import Candidate, Load, torch_eager
 from candidates.warpnerf_step import WarpStep
 from measuring import (
+    Interval,
     Stopwatch,
     default_threads,
     machine,
@@ -48,6 +50,7 @@ from workload import Rays, Scene, Workload, make_workload
 TOLERANCE = 1e-4
 """Of the largest value: by how much candidates may differ from the first."""
 OURS = "warpnerf"
+IN_TURN, AT_ONCE = "apart, in turn", "apart, at once"
 
 
 @dataclass(frozen=True)
@@ -114,25 +117,60 @@ def check(runs: dict[tuple[str, int], Candidate]) -> dict[str, dict[str, float]]
     return differences
 
 
-def race(runs: dict[tuple[str, int], Candidate], rounds: int, device: str) -> list[dict]:
-    """Seconds of each run, in each round."""
+class Apart:
+    """What the machine's threads are worth: as many warpnerfs, on one thread each.
+
+    Each has its share of the rays, and a grid and a gradient of its own; so all that slows them
+    down when they work at once is the machine.
+    """
+
+    def __init__(self, work: Workload, threads: int, device: str) -> None:
+        """Share a workload out."""
+        self.steps = [
+            WarpStep(replace(work, origins=o, directions=d, target_rgb=rgb), 1, device)
+            for o, d, rgb in zip(
+                np.array_split(work.origins, threads),
+                np.array_split(work.directions, threads),
+                np.array_split(work.target_rgb, threads),
+                strict=True,
+            )
+        ]
+        self._pool = ThreadPoolExecutor(threads - 1)
+        self.at_once()  # compiles, and touches all memory
+
+    def in_turn(self) -> None:
+        """One after the other."""
+        for step in self.steps:
+            step.step()
+
+    def at_once(self) -> None:
+        """All together."""
+        others = [self._pool.submit(step.step) for step in self.steps[1:]]
+        self.steps[0].step()
+        for other in others:
+            other.result()
+
+
+def race(
+    calls: dict[tuple[str, int], Callable[[], None]], rounds: int, device: str
+) -> list[dict[tuple[str, int], float]]:
+    """Seconds of each, by name and number of threads, in each round."""
     stopwatch = Stopwatch(device)
-    order = list(runs)
+    order = list(calls)
     seconds = []
     for turn in range(rounds):
         first = turn % len(order)
         turns = order[first:] + order[:first]
         if turn % 2:
             turns.reverse()
-        seconds.append({key: stopwatch.better_of_two(runs[key].step) for key in turns})
+        seconds.append({key: stopwatch.better_of_two(calls[key]) for key in turns})
     return seconds
 
 
 def summarise(
-    seconds: list[dict[tuple[str, int], float]], threads: int, n_samples: int
+    seconds: list[dict[tuple[str, int], float]], names: Sequence[str], threads: int, n_samples: int
 ) -> dict[str, dict[str, Any]]:
     """For each candidate, what it needs with up to that many threads."""
-    names = dict.fromkeys(name for name, _ in seconds[0])
     best = {
         name: [min(s for (n, t), s in r.items() if n == name and t <= threads) for r in seconds]
         for name in names
@@ -145,10 +183,23 @@ def summarise(
                 s / ours for s, ours in zip(best[name], best[OURS], strict=True)
             ),
             "over_one_thread": median_interval(
-                r[name, min(t for _, t in r)] / s for r, s in zip(seconds, best[name], strict=True)
+                r[name, min(t for n, t in r if n == name)] / s
+                for r, s in zip(seconds, best[name], strict=True)
             ),
         }
         for name in names
+    }
+
+
+def compare_threads(
+    seconds: list[dict[tuple[str, int], float]], threads: int
+) -> dict[str, Interval]:
+    """What threads are worth to warpnerf, of which all work on one step, and to Apart."""
+    apart = [r[IN_TURN, threads] / r[AT_ONCE, threads] for r in seconds]
+    ours = [r[OURS, 1] / r[OURS, threads] for r in seconds]
+    return {
+        "apart_over_one_thread": median_interval(apart),
+        "share_of_apart": median_interval(us / all for us, all in zip(ours, apart, strict=True)),
     }
 
 
@@ -164,13 +215,20 @@ def run_case(
     print(f"\n{case}: {needed.n_samples} samples")
     runs = {(n, t): load(work, t, args.device) for n, load in found.items() for t in args.threads}
     differences = check(runs)
-    seconds = race(runs, args.rounds, args.device)
+    calls = {key: run.step for key, run in runs.items()}
+    several = [t for t in args.threads if t > 1 and 1 in args.threads]
+    for t in several:
+        apart = Apart(work, t, args.device)
+        calls |= {(IN_TURN, t): apart.in_turn, (AT_ONCE, t): apart.at_once}
+    seconds = race(calls, args.rounds, args.device)
     rows = []
     for threads in args.threads:
         row: dict[str, Any] = {
             "threads": threads,
-            "candidates": summarise(seconds, threads, needed.n_samples),
+            "candidates": summarise(seconds, list(found), threads, needed.n_samples),
         }
+        if threads in several:
+            row |= compare_threads(seconds, threads)
         if threads in machines:
             bound = roofline.bounds(work, needed, machines[threads])
             row["bounds_ms"] = {key: 1e3 * value for key, value in asdict(bound).items()}
@@ -195,6 +253,12 @@ def print_row(row: dict[str, Any]) -> None:
         print(
             f"  {name:16s}{show(figures['ms'], 1):22s}{show(figures['over_warpnerf'], 2):22s}"
             f"{show(figures['over_one_thread'], 2)}",
+            flush=True,
+        )
+    if "apart_over_one_thread" in row:
+        print(
+            f"  that many apart: {show(row['apart_over_one_thread'], 2)} times one thread; "
+            f"warpnerf reaches {show(row['share_of_apart'], 2)} of it",
             flush=True,
         )
 

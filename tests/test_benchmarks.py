@@ -99,6 +99,9 @@ def test_throughput(tmp_path):
             assert row["candidates"]["warpnerf"]["over_warpnerf"]["median"] == 1.0
             bounds = row["bounds_ms"]
             assert 0 < row["least_ms"] == max(bounds["arithmetic"], bounds["traffic"])
+        assert "apart_over_one_thread" not in case["rows"][0]
+        for key in ("apart_over_one_thread", "share_of_apart"):
+            assert is_interval(case["rows"][1][key])
     rows = record["memory"]
     assert [row["n_samples"] for row in rows] == [64 * 8, 64 * 16, 64 * 32]
     assert len({row["warpnerf_room_bytes"] for row in rows}) == 1
@@ -107,6 +110,22 @@ def test_throughput(tmp_path):
     plot = tmp_path / "record.png"
     assert plot.exists() == (f"plot: {plot}" in printed)
     assert plot.exists() or "no plot: matplotlib is not installed" in printed
+
+
+def test_apart_does_the_same_work(on_cpu):
+    work = workload.make_workload("random", 8, 65, 16)
+    apart = throughput.Apart(work, 2, "cpu")
+    whole = WarpStep(work, 1, "cpu")
+    whole.step()
+    for call in (apart.in_turn, apart.at_once):
+        for step in apart.steps:
+            step.gradient().fill(0.0)
+        call()
+        sizes = [len(step.rgb()) for step in apart.steps]
+        assert sizes == [33, 32]
+        mean = sum(n * step.gradient() for n, step in zip(sizes, apart.steps, strict=True)) / 65
+        largest = np.abs(whole.gradient()).max()
+        assert np.abs(mean - whole.gradient()).max() < 1e-5 * largest
 
 
 def test_one_thread_uses_all_that_it_has_room_for(on_cpu):
@@ -147,6 +166,7 @@ def test_schedules(tmp_path):
     assert list(record["schedules"]) == [row["schedule"] for row in rows[:4]]
     for row in rows:
         assert row["steps"] > 2 and 5 < row["psnr"] < 50 and 0 < row["besides_rays"] < 1
+        assert row["seconds"] > 1.4  # the others' turns do not count
         assert f"{row['psnr']:.2f}" in printed
 
 

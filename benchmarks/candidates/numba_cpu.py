@@ -3,8 +3,8 @@
 A ray is taken in phases, each a loop over its samples on plain rows of numbers: LLVM makes vectors
 of all but the walk and the sequential sums. For that the exponential has to be arithmetic (0.15 ns)
 instead of a call (3.6 ns), indices unsigned (a signed one may count from the end) and the eight
-numbers of a column written out; these two halve the time of what is left. One core of an AMD EPYC
-(Zen 5), 64^3 grid.
+numbers of a column written out; these two halve the time of what is left. One core of an AMD EPYC,
+64^3 grid.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 Positions of the samples in the box are packed, and once more those of them that are not free; the
 grid is read by grid_sample, compositing uses cumulated optical depth, autograd does the rest. What
-was tried for the grid, forward + backward of 524 288 samples on one core of an AMD EPYC (Zen 5),
-64^3 and 160^3 grids:
+was tried for the grid, forward + backward of 524 288 samples on one core of an AMD EPYC, 64^3 and
+160^3 grids:
 
     grid_sample, channels last                    68 ms    144 ms
     grid_sample, channels first                   70 ms    180 ms
