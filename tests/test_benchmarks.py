@@ -158,6 +158,21 @@ def test_training(tmp_path):
     assert row["steps"] == 30 and row["samples_per_ray"] > 1
 
 
+def test_footprint(tmp_path):
+    options = ("builtin:room", "--downscale", "8", "--steps", "30", "--starts", "2")
+    record, printed = run("footprint.py", tmp_path / "record.json", *options)
+    assert record["cold_seconds"] > record["cached_seconds"]["median"]
+    assert is_interval(record["cached_seconds"])
+    memory = record["memory"]
+    assert memory["steps"] == 30
+    assert memory["arrays_bytes"] == 64 * math.prod(memory["grid"])
+    if memory["peak_bytes"] is None:
+        assert "is not there to tell" in printed
+    else:
+        assert 0 < memory["before_bytes"] < memory["peak_bytes"]
+        assert memory["over_arrays"] == memory["peak_bytes"] / memory["arrays_bytes"]
+
+
 def test_schedules(tmp_path):
     options = ("builtin:room", "--downscale", "8", "--seeds", "1", "2", "--time-limit", "1.5")
     record, printed = run("schedules.py", tmp_path / "record.json", *options)

@@ -10,7 +10,7 @@ from warpnerf_kernels.types import vec4
 from warpnerf.adjoint import Gradients
 from warpnerf.config import OptimConfig
 from warpnerf.grid import VoxelGrid
-from warpnerf.optim import add_total_variation
+from warpnerf.optim import adam_step, add_total_variation, no_moments
 from warpnerf.parallel import Workers
 
 
@@ -36,3 +36,34 @@ def test_total_variation_counts_the_face_between_two_nodes(coarser: int, device:
     added = gradients.values.numpy().reshape(*size, 4) - 1.0
     assert raw.grad is not None
     np.testing.assert_allclose(added, raw.grad.numpy(), atol=1e-6)
+
+
+def test_updates_pack_their_launches_once(monkeypatch: pytest.MonkeyPatch, on_cpu: None) -> None:
+    """And take what they are given: another grid, another rate."""
+    size, workers, config = (4, 5, 3), Workers("cpu", 2), OptimConfig()
+    gradients = Gradients.zeros(size, workers)
+
+    def update(grid: VoxelGrid, moments: wp.array, number: int, factor: float) -> np.ndarray:
+        before = grid.values.numpy().copy()
+        gradients.values.fill_(1.0)
+        gradients.touched.fill_(1)
+        add_total_variation(grid, gradients, 60, 1, config, workers)
+        adam_step(grid, moments, gradients, number, factor, config, workers)
+        return before - grid.values.numpy()
+
+    grids = [
+        VoxelGrid(
+            values=wp.zeros(60, dtype=vec4, device="cpu"),
+            size=size,
+            box_min=np.zeros(3),
+            box_max=np.ones(3),
+        )
+        for _ in range(2)
+    ]
+    moments = [no_moments(grid, workers) for grid in grids]
+    rates = np.array([config.learning_rate_density, *[config.learning_rate_rgb] * 3])
+    np.testing.assert_allclose(update(grids[0], moments[0], 1, 1.0), [rates] * 60, rtol=1e-2)
+    monkeypatch.setattr(wp, "launch", None)
+    np.testing.assert_allclose(update(grids[0], moments[0], 2, 0.5), [rates / 2] * 60, rtol=1e-2)
+    np.testing.assert_allclose(update(grids[1], moments[1], 1, 3.0), [rates * 3] * 60, rtol=1e-2)
+    np.testing.assert_allclose(grids[0].values.numpy(), [-1.5 * rates] * 60, rtol=1e-2)

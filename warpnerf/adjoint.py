@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from types import ModuleType
 from typing import Any
@@ -30,6 +30,8 @@ class Gradients:
     """[X * Y * Z] vec4; zero in tiles that are not flagged, nor the one before them."""
     touched: wp.array
     """[n_tiles] uint8, 1 where a pair of nodes begins that got some; see warpnerf_kernels.tiles."""
+    packed: Packed = field(default_factory=Packed)
+    """Launches that use it up."""
 
     @staticmethod
     def zeros(size: tuple[int, int, int], workers: Workers) -> Gradients:

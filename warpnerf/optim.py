@@ -77,6 +77,7 @@ def adam_step(
         grid.values,
         moments,
         chunk=NODES // tiles.STRETCH,
+        packed=gradients.packed,
     )
     gradients.touched.zero_()
 
@@ -115,6 +116,7 @@ def add_total_variation(
         vec4(density, rgb, rgb, rgb),
         gradients.struct,
         chunk=NODES // tiles.STRETCH,
+        packed=gradients.packed,
     )
 
 
