@@ -19,22 +19,19 @@ from measuring import machine, options, write_record
 from training import Clock, path_of
 
 import warpnerf as wn
+from warpnerf.config import ACCUMULATE_AT
 from warpnerf.parallel import Workers
 from warpnerf.render import TrainingPass
 from warpnerf.training import Trainer
 
-UP_TO_16 = (0.3, 0.4, 0.4, 0.5)
-
 SCHEDULES = {
     "1 step": wn.OptimConfig(accumulate_at=()),
-    "up to 4": wn.OptimConfig(accumulate_at=(0.5, 0.7)),
-    "up to 16": wn.OptimConfig(accumulate_at=UP_TO_16),
-    "same, high rates": wn.OptimConfig(
-        accumulate_at=UP_TO_16, learning_rate_density=0.8, learning_rate_rgb=0.32
-    ),
+    "up to 4": wn.OptimConfig(accumulate_at=ACCUMULATE_AT["unbounded"]),
+    "up to 16": wn.OptimConfig(accumulate_at=ACCUMULATE_AT["room"]),
+    "up to 16, earlier": wn.OptimConfig(accumulate_at=ACCUMULATE_AT["object"]),
 }
-"""What is compared, by the steps of an update. The second is what ``auto`` takes in unbounded
-scenes, the third in bounded ones."""
+"""What is compared, by the steps of an update: what ``auto`` takes for one kind of scene or other,
+and updates of a step each."""
 
 TURN_SECONDS = 0.4
 
@@ -50,7 +47,7 @@ def main() -> None:
     config = wn.TrainConfig(
         steps=arguments.steps, time_limit=arguments.time_limit, device=arguments.device
     )
-    print("scene           seed  schedule           seconds   PSNR  steps  besides rays")
+    print("scene           seed  schedule            seconds   PSNR  steps  besides rays")
     rows = []
     for name in arguments.scenes:
         scene = wn.load_scene(path_of(name), downscale=arguments.downscale)
@@ -58,7 +55,7 @@ def main() -> None:
             for schedule, found in race(scene, replace(config, seed=seed)).items():
                 rows.append({"scene": name, "seed": seed, "schedule": schedule, **found})
                 print(
-                    f"{name:14}  {seed:4}  {schedule:16}  {found['seconds']:7.1f}  "
+                    f"{name:14}  {seed:4}  {schedule:17}  {found['seconds']:7.1f}  "
                     f"{found['psnr']:5.2f}  {found['steps']:5.0f}  "
                     f"{100 * found['besides_rays']:10.1f} %",
                     flush=True,

@@ -170,7 +170,7 @@ def test_metadata_tell_what_a_file_is(tmp_path: Path) -> None:
     with safe_open(tmp_path / "training", framework="numpy") as file:
         metadata = file.metadata()
     header = json.loads(metadata["header"])
-    assert header["format"] == "warpnerf-training-4"
+    assert header["format"] == "warpnerf-training-5"
     assert header["training"]["progress"]["step"] == 3
     assert header["training"]["config"]["grid"]["voxels"] == TrainConfig().grid.voxels
     assert len(metadata["sha256"]) == 64
@@ -198,7 +198,7 @@ def test_a_short_write_is_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 @pytest.mark.parametrize(
     ("header", "tensors", "says"),
     [
-        (lambda text: text.replace("training-4", "training-5"), {}, "training-5"),
+        (lambda text: text.replace("training-5", "training-6"), {}, "training-6"),
         (lambda text: text[:-1], {}, "header"),
         (lambda text: "[" * 100_000, {}, "header"),
         (lambda text: "[]", {}, "header"),

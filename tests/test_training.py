@@ -132,12 +132,13 @@ def test_updates_take_more_steps_as_training_goes_on(
 @pytest.mark.parametrize(
     ("unbounded", "channels", "late"),
     [
-        (False, 3, [14, 16, 24, 40]),
+        (False, 3, [13, 14, 15, 16, 18, 20, 28, 40]),
         (False, 4, [14, 16, 24, 40]),
+        (True, 3, [*range(13, 21), *range(22, 29, 2), 32, 36, 40]),
         (True, 4, [*range(13, 21), *range(22, 29, 2), 32, 36, 40]),
     ],
 )
-def test_updates_take_more_steps_in_bounded_scenes_unless_told(
+def test_updates_take_more_steps_the_less_rays_meet_unless_told(
     unbounded: bool, channels: int, late: list[int]
 ) -> None:
     scene = ball()
@@ -200,7 +201,7 @@ def test_updates_are_counted_apart_from_steps(monkeypatch: pytest.MonkeyPatch) -
     assert updates == list(range(1, 11))
     begun, n_steps = [0, 1, 2, 3, 4, 6, 8, 10, 14, 18], [1, 1, 1, 1, 2, 2, 2, 4, 4, 2]
     fading = 0.3 ** (np.array(begun) / STEPS)
-    np.testing.assert_allclose(rates, fading * np.sqrt(n_steps), rtol=1e-12)
+    np.testing.assert_allclose(rates, fading * np.array(n_steps) ** 0.25, rtol=1e-12)
     assert smoothed == [(0, 1), (3, 1), (6, 2), (9, 2)]  # every third
     assert looked == [0, 6]  # before every fifth
 

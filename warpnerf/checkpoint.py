@@ -30,7 +30,7 @@ from warpnerf.render import Steps
 from warpnerf.state import Progress, TrainingState
 
 FIELD = "warpnerf-field-1"
-TRAINING = "warpnerf-training-4"
+TRAINING = "warpnerf-training-5"
 """What a file holds, and the version of its format."""
 
 CHUNK = 1 << 24

@@ -19,6 +19,15 @@ Scaling = Literal["none", "quadratic", "clamped"]
 Jacobian = Literal["none", "density", "paper"]
 Contraction = Literal["none", "linf", "l2"]
 Background = Literal["auto", "white", "black", "random"]
+SceneKind = Literal["object", "room", "unbounded"]
+"""Bounded with photographs that have alpha, bounded without, or not bounded."""
+
+ACCUMULATE_AT: dict[SceneKind, tuple[float, ...]] = {
+    "object": (0.3, 0.4, 0.4, 0.5),
+    "room": (0.4, 0.5, 0.5, 0.7),
+    "unbounded": (0.5, 0.7),
+}
+"""What ``OptimConfig.accumulate_at`` is by default: the fewer samples rays meet, the more."""
 
 MAX_VOXELS = 2**31
 """Nodes are counted in 32 bits."""
@@ -102,10 +111,10 @@ class OptimConfig:
 
     learning_rate_density: float = 0.5
     """How far an update of one step moves raw densities, about, at the start; one of n steps moves
-    them sqrt(n) times as far."""
+    them n^(1/4) times as far."""
     learning_rate_rgb: float = 0.2
     """How far an update of one step moves raw colours, about, at the start; likewise."""
-    decay: float = 0.05
+    decay: float = 0.07
     """What is left of the learning rates at the end of training."""
     beta1: float = 0.9
     """Decay of the first moment."""
@@ -124,8 +133,8 @@ class OptimConfig:
     accumulate_at: Literal["auto"] | tuple[float, ...] = "auto"
     """Shares of the training. Before the first, an update of the grid follows each step; from each
     on, twice as many steps, whose rays are put through together and whose losses are added up.
-    auto: 0.5 and 0.7; in bounded scenes, where rays meet less, 0.3, 0.4 twice, and 0.5. At most
-    six, as the rays of an update are in memory at a time."""
+    auto: those of ``ACCUMULATE_AT``. At most six, as the rays of an update are in memory at a
+    time."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot be optimised with."""
@@ -153,11 +162,11 @@ class OptimConfig:
             if not 0 <= getattr(self, name) < 1:
                 raise InputError(f"optim.{name} must lie in [0, 1), not {getattr(self, name)}.")
 
-    def accumulation(self, unbounded: bool) -> tuple[float, ...]:
-        """``accumulate_at``, decided for an unbounded scene, or a bounded one."""
+    def accumulation(self, kind: SceneKind) -> tuple[float, ...]:
+        """``accumulate_at``, decided for a kind of scene."""
         if not isinstance(self.accumulate_at, str):
             return self.accumulate_at
-        return (0.5, 0.7) if unbounded else (0.3, 0.4, 0.4, 0.5)
+        return ACCUMULATE_AT[kind]
 
 
 @dataclass(frozen=True, kw_only=True)

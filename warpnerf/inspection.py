@@ -14,7 +14,7 @@ import numpy as np
 
 from warpnerf.camera import Camera
 from warpnerf.checks import InputError, require_at_least, require_positive
-from warpnerf.config import PRESETS, TRAINING_BYTES, TrainConfig
+from warpnerf.config import PRESETS, TRAINING_BYTES, SceneKind, TrainConfig
 from warpnerf.data import load_scene
 from warpnerf.data.survey import Survey, survey
 from warpnerf.scene import Scene, find_focus, share_aimed_at, up_direction
@@ -29,7 +29,11 @@ SECONDS_PER_RAY, SECONDS_PER_SAMPLE, SECONDS_PER_NODE = 1.2e-6, 22e-9, 16e-9
 """Of one core, in a step for what is visited and in an update for each node in use: measured on an
 AMD EPYC."""
 
-SAMPLES_AND_OCCUPIED = {"object": (12, 0.3), "room": (50, 0.8), "unbounded": (190, 0.6)}
+SAMPLES_AND_OCCUPIED: dict[SceneKind, tuple[int, float]] = {
+    "object": (12, 0.3),
+    "room": (50, 0.8),
+    "unbounded": (190, 0.6),
+}
 """Samples per ray, and the share of nodes in use: means of lego, builtin:room and fox late in
 training with the preset fast."""
 
@@ -270,13 +274,11 @@ def _cost(scene: Scene, config: TrainConfig, threads: int) -> Cost:
     pixels = sum(camera.width * camera.height for camera in scene.training_cameras)
     memory = TRAINING_BYTES * voxels + images + 4 * pixels
 
-    with_alpha = any(view.image.shape[2] == 4 for view in scene.views)
-    kind = "unbounded" if scene.unbounded else "object" if with_alpha else "room"
-    samples, occupied = SAMPLES_AND_OCCUPIED[kind]
+    samples, occupied = SAMPLES_AND_OCCUPIED[scene.kind]
     finer = (voxels / PRESETS["fast"].grid.voxels) ** (1.0 / 3.0) / config.march.step_voxels
     share = (np.arange(1000) + 0.5)[:, None] / 1000  # of the training, evenly
     nodes = voxels * 0.5 ** (share < config.grid.grow_at).sum(axis=1)
-    steps_an_update = 2.0 ** (share >= config.optim.accumulation(scene.unbounded)).sum(axis=1)
+    steps_an_update = 2.0 ** (share >= config.optim.accumulation(scene.kind)).sum(axis=1)
     step = config.rays_per_step * (SECONDS_PER_RAY + finer * samples * SECONDS_PER_SAMPLE)
     step += float((nodes / steps_an_update).mean()) * occupied * SECONDS_PER_NODE
     return Cost(memory=memory, seconds=config.steps * step / threads, threads=threads)

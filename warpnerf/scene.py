@@ -9,6 +9,7 @@ import numpy as np
 
 from warpnerf.camera import Camera
 from warpnerf.checks import InputError, require_positive
+from warpnerf.config import SceneKind
 
 UNBOUNDED_BOX_SHARE = 0.75
 """Half edge of the box of photographs, in content distances."""
@@ -116,6 +117,18 @@ class Scene:
     def cameras(self) -> list[Camera]:
         """The camera of every view, in the order of ``views``."""
         return [view.camera for view in self.views]
+
+    @property
+    def has_alpha(self) -> bool:
+        """Whether any training photograph does."""
+        return any(self.views[index].image.shape[2] == 4 for index in self.splits["train"])
+
+    @property
+    def kind(self) -> SceneKind:
+        """By its box and its photographs."""
+        if self.unbounded:
+            return "unbounded"
+        return "object" if self.has_alpha else "room"
 
     @property
     def training_cameras(self) -> list[Camera]:

@@ -116,10 +116,9 @@ class Trainer:
             self.content_distance, self._reach = resume.content_distance, resume.reach
         self._scene_digest = scene_digest(scene)
         views = [scene.views[i] for i in scene.splits["train"]]
-        has_alpha = any(view.image.shape[2] == 4 for view in views)
         behind = config.background
         if behind == "auto":
-            behind = "white" if has_alpha else "black"
+            behind = "white" if scene.has_alpha else "black"
         self._background = _COLOURS[behind] if isinstance(behind, str) else behind
         self._sampler = PixelSampler(
             views,
@@ -130,7 +129,7 @@ class Trainer:
             config.seed,
             self.workers,
         )
-        self._accumulation = config.optim.accumulation(scene.unbounded)
+        self._accumulation = config.optim.accumulation(scene.kind)
         self._grown = 0
         self._updates = 0
         self.grid = self._first_grid(scene)
@@ -217,7 +216,7 @@ class Trainer:
             self.moments,
             self._pass.gradients,
             self._updates,
-            config.optim.decay**fraction * math.sqrt(n_steps),
+            config.optim.decay**fraction * n_steps**0.25,
             config.optim,
             self.workers,
         )
