@@ -4,9 +4,9 @@
 
 The scene is as for training.py. `warpnerf train` is started with an empty cache of compiled kernels
 and then again with that one, each time until its first step is done. Another process trains and
-notes the most memory of its own that it had (Linux: RssAnon; not what it shares with others, such
-as libraries' code), beside the four arrays that nobody can do without: values, gradient and two
-moments of the grid, in float32. Writes benchmarks/results/footprint_<device>.json.
+notes every 10 ms how much memory of its own it has (Linux: RssAnon; without what it shares with
+others, such as libraries' code). For comparison, what four arrays of the grid would take in
+float32: values, gradient and two moments. Writes benchmarks/results/footprint_cpu.json.
 """
 
 from __future__ import annotations
@@ -44,8 +44,10 @@ def main() -> None:
     parser.add_argument("--downscale", type=int, default=1)
     parser.add_argument("--starts", type=int, default=5, help="with kernels in the cache")
     arguments = parser.parse_args()
+    if arguments.device != "cpu":
+        parser.error("it looks at the CPU's memory only")
     scene = path_of(arguments.scene)
-    train = ["train", scene, "--device", arguments.device, "--downscale", str(arguments.downscale)]
+    train = ["train", scene, "--downscale", str(arguments.downscale)]
     with tempfile.TemporaryDirectory() as folder:
         cold = seconds_to_first_step([*train, "--output", f"{folder}/cold"], f"{folder}/cache")
         print(f"to the first step, kernels compiled:  {cold:.1f} s", flush=True)
@@ -56,8 +58,7 @@ def main() -> None:
         print(f"to the first step, kernels in cache:  {show(cached, 2)} s", flush=True)
     memory = json.loads(
         run_here(
-            f"train({scene!r}, {arguments.downscale}, {arguments.device!r}, {arguments.steps}, "
-            f"{arguments.time_limit})"
+            f"train({scene!r}, {arguments.downscale}, {arguments.steps}, {arguments.time_limit})"
         )
     )
     if memory["peak_bytes"] is None:
@@ -71,7 +72,7 @@ def main() -> None:
             f"ratio {memory['over_arrays']:.2f}"
         )
     record = {
-        "machine": machine(arguments.device, Workers(arguments.device).count),
+        "machine": machine("cpu", Workers("cpu").count),
         "scene": arguments.scene,
         "downscale": arguments.downscale,
         "time_limit": arguments.time_limit,
@@ -79,7 +80,7 @@ def main() -> None:
         "cached_seconds": cached,
         "memory": memory,
     }
-    print(f"wrote {write_record(record, arguments.output, 'footprint', arguments.device)}")
+    print(f"wrote {write_record(record, arguments.output, 'footprint', 'cpu')}")
 
 
 def seconds_to_first_step(command: list[str], cache: str) -> float:
@@ -114,7 +115,7 @@ def first_step(command: list[str]) -> None:
         sys.exit(cli.main(command))
 
 
-def train(path: str, downscale: int, device: str, steps: int, time_limit: float) -> None:
+def train(path: str, downscale: int, steps: int, time_limit: float) -> None:
     """Train; print how much memory that took."""
     scene = wn.load_scene(path, downscale=downscale)
     peak = before = own_bytes()
@@ -127,7 +128,7 @@ def train(path: str, downscale: int, device: str, steps: int, time_limit: float)
 
     watching = threading.Thread(target=watch)
     watching.start()
-    result = wn.train(scene, wn.TrainConfig(steps=steps, time_limit=time_limit, device=device))
+    result = wn.train(scene, wn.TrainConfig(steps=steps, time_limit=time_limit))
     done.set()
     watching.join()
     found: dict[str, Any] = {

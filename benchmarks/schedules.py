@@ -27,7 +27,7 @@ from warpnerf.training import Trainer
 SCHEDULES = {
     "1 step": wn.OptimConfig(accumulate_at=()),
     "up to 4": wn.OptimConfig(accumulate_at=ACCUMULATE_AT["unbounded"]),
-    "up to 16": wn.OptimConfig(accumulate_at=ACCUMULATE_AT["room"]),
+    "up to 16": wn.OptimConfig(accumulate_at=ACCUMULATE_AT["bounded"]),
     "up to 16, earlier": wn.OptimConfig(accumulate_at=ACCUMULATE_AT["object"]),
 }
 """What is compared, by the steps of an update: what ``auto`` takes for one kind of scene or other,

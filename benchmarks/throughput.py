@@ -194,12 +194,12 @@ def summarise(
 def compare_threads(
     seconds: list[dict[tuple[str, int], float]], threads: int
 ) -> dict[str, Interval]:
-    """What threads are worth to warpnerf, of which all work on one step, and to Apart."""
+    """What threads are worth that share nothing; and those of one warpnerf, in shares of that."""
     apart = [r[IN_TURN, threads] / r[AT_ONCE, threads] for r in seconds]
     ours = [r[OURS, 1] / r[OURS, threads] for r in seconds]
     return {
         "apart_over_one_thread": median_interval(apart),
-        "share_of_apart": median_interval(us / all for us, all in zip(ours, apart, strict=True)),
+        "share_of_apart": median_interval(a / b for a, b in zip(ours, apart, strict=True)),
     }
 
 

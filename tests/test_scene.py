@@ -231,3 +231,13 @@ def test_share_of_cameras_aimed_at_a_point() -> None:
     assert share_aimed_at(cameras[:1], edge) == 0.0
     inner = cameras[0].position + cameras[0].forward + 0.15 * cameras[0].c2w[:, 0]
     assert share_aimed_at(cameras[:1], inner) == 1.0
+
+
+def test_kinds_of_scenes() -> None:
+    """By what is trained on: a test view with alpha makes no object."""
+    views = [view_of(), view_of(name="b.png", image=picture(1, channels=4)), view_of(name="c.png")]
+    scene = scene_of(views=views, splits={"train": (0, 1), "test": (2,)})
+    assert scene.has_alpha and scene.kind == "object"
+    assert scene_of(views=views, splits=scene.splits, unbounded=True).kind == "unbounded"
+    plain = scene_of(views=views, splits={"train": (0, 2), "test": (1,)})
+    assert not plain.has_alpha and plain.kind == "bounded"

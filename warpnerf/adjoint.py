@@ -31,7 +31,7 @@ class Gradients:
     touched: wp.array
     """[n_tiles] uint8, 1 where a pair of nodes begins that got some; see warpnerf_kernels.tiles."""
     packed: Packed = field(default_factory=Packed)
-    """Launches that use it up."""
+    """The optimiser's launches that take it."""
 
     @staticmethod
     def zeros(size: tuple[int, int, int], workers: Workers) -> Gradients:

@@ -19,15 +19,16 @@ Scaling = Literal["none", "quadratic", "clamped"]
 Jacobian = Literal["none", "density", "paper"]
 Contraction = Literal["none", "linf", "l2"]
 Background = Literal["auto", "white", "black", "random"]
-SceneKind = Literal["object", "room", "unbounded"]
-"""Bounded with photographs that have alpha, bounded without, or not bounded."""
+SceneKind = Literal["object", "bounded", "unbounded"]
+"""Bounded with photographs that have alpha, other bounded ones, and those that are not."""
 
 ACCUMULATE_AT: dict[SceneKind, tuple[float, ...]] = {
     "object": (0.3, 0.4, 0.4, 0.5),
-    "room": (0.4, 0.5, 0.5, 0.7),
+    "bounded": (0.4, 0.5, 0.5, 0.7),
     "unbounded": (0.5, 0.7),
 }
-"""What ``OptimConfig.accumulate_at`` is by default: the fewer samples rays meet, the more."""
+"""What ``OptimConfig.accumulate_at`` is by default. Where rays meet fewer samples, as they should
+where photographs have alpha, updates take more steps, and earlier."""
 
 MAX_VOXELS = 2**31
 """Nodes are counted in 32 bits."""

@@ -31,7 +31,7 @@ AMD EPYC."""
 
 SAMPLES_AND_OCCUPIED: dict[SceneKind, tuple[int, float]] = {
     "object": (12, 0.3),
-    "room": (50, 0.8),
+    "bounded": (50, 0.8),
     "unbounded": (190, 0.6),
 }
 """Samples per ray, and the share of nodes in use: means of lego, builtin:room and fox late in

@@ -52,7 +52,7 @@ def start() -> None:
 
 
 def load(kernel: wp.Kernel, device: wp.Device) -> None:
-    """Compile a kernel's module for a device, or fetch it from the cache; for any thread.
+    """Compile a kernel's module for a device, or fetch it from the cache. Any thread may ask.
 
     Raises:
         InputError: The cache cannot be used, nor can a temporary folder be made.

@@ -120,15 +120,15 @@ class Scene:
 
     @property
     def has_alpha(self) -> bool:
-        """Whether any training photograph does."""
+        """Whether any training photograph has an alpha channel, opaque or not."""
         return any(self.views[index].image.shape[2] == 4 for index in self.splits["train"])
 
     @property
     def kind(self) -> SceneKind:
-        """By its box and its photographs."""
+        """What the default schedule of updates goes by."""
         if self.unbounded:
             return "unbounded"
-        return "object" if self.has_alpha else "room"
+        return "object" if self.has_alpha else "bounded"
 
     @property
     def training_cameras(self) -> list[Camera]:
