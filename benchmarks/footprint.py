@@ -97,8 +97,9 @@ def run_here(call: str, **environment: str) -> str:
         env=os.environ | environment | {"PYTHONPATH": path},
         stdout=subprocess.PIPE,
         text=True,
-        check=True,
     )
+    if done.returncode:  # it has said why
+        sys.exit(done.returncode)
     return done.stdout.splitlines()[-1]
 
 
@@ -128,9 +129,11 @@ def train(path: str, downscale: int, steps: int, time_limit: float) -> None:
 
     watching = threading.Thread(target=watch)
     watching.start()
-    result = wn.train(scene, wn.TrainConfig(steps=steps, time_limit=time_limit))
-    done.set()
-    watching.join()
+    try:
+        result = wn.train(scene, wn.TrainConfig(steps=steps, time_limit=time_limit))
+    finally:
+        done.set()
+        watching.join()
     found: dict[str, Any] = {
         "peak_bytes": peak,
         "before_bytes": before,

@@ -194,7 +194,7 @@ def summarise(
 def compare_threads(
     seconds: list[dict[tuple[str, int], float]], threads: int
 ) -> dict[str, Interval]:
-    """What threads are worth that share nothing; and those of one warpnerf, in shares of that."""
+    """How much faster threads are than one: those of Apart, and of warpnerf in shares of that."""
     apart = [r[IN_TURN, threads] / r[AT_ONCE, threads] for r in seconds]
     ours = [r[OURS, 1] / r[OURS, threads] for r in seconds]
     return {
