@@ -13,17 +13,27 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import warp as wp
 from measuring import Stopwatch, machine, median_interval, options, show, write_record
 from training import path_of
-from warpnerf_kernels import order
+from warpnerf_kernels import gradscale, order, render
+from warpnerf_kernels.types import vec3
 
 import warpnerf as wn
+from warpnerf.grid import CONTRACTIONS
 from warpnerf.parallel import Workers
 from warpnerf.rays import PixelSampler
 from warpnerf.render import TrainingPass
 
 SLAB = sum(1 << (3 * bit + 2) for bit in range(order.BITS))
 """The bits of a cell's number that name its slab."""
+cell_at = order.cell_at
+
+
+@wp.func
+def cell_of_slab(x: vec3) -> int:
+    """The same for all cells of a slab, so that their rays stay as they are."""
+    return cell_at(x) & wp.static(SLAB)
 
 
 def main() -> None:
@@ -68,13 +78,7 @@ def ratios(scene: wn.Scene, field: wn.Field, steps: int, threads: int, rounds: i
         TrainingPass(steps * n_rays, field.grid, field.steps, "clamped", "none", workers)
         for _ in range(2)
     )
-    measure = drawn.launch._measure
-
-    def measure_slabs(*given: Any) -> None:
-        measure(*given)
-        drawn.launch._cells.numpy()[:] &= SLAB
-
-    drawn.launch._measure = measure_slabs  # type: ignore[method-assign]
+    drawn.launch._kernel = as_drawn(field, workers)
     watch, found = Stopwatch("cpu"), []
     for turn in range(rounds + 1):
         batch = sampler.draw(turn * steps, steps)
@@ -86,6 +90,23 @@ def ratios(scene: wn.Scene, field: wn.Field, steps: int, threads: int, rounds: i
         else:
             found.append(seconds[ordered] / seconds[drawn])
     return found
+
+
+def as_drawn(field: wn.Field, workers: Workers) -> wp.Kernel:
+    """The kernel of a training pass, but for it all cells of a slab are one."""
+    variant = render.Variant(
+        CONTRACTIONS[field.grid.contraction],
+        gradscale.CLAMPED,
+        gradscale.JACOBIAN_NONE,
+        packed=True,
+    )
+    order.cell_at = cell_of_slab
+    try:
+        kernel = render.render_train_kernel.__wrapped__(variant)
+        workers.load(kernel)
+    finally:
+        order.cell_at = cell_at
+    return kernel
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from warpnerf_kernels import order
 from warpnerf_kernels.types import vec3
 
 from warpnerf import adjoint
+from warpnerf.parallel import Workers
 from warpnerf.render import Steps
 
 
@@ -27,8 +28,8 @@ def _(on_cpu: None, monkeypatch: pytest.MonkeyPatch) -> None:
     def unwritten(launch: adjoint.AdjointLaunch, *given: Any) -> None:
         initialise(launch, *given)
         if launch.parcels is not None:
-            for name in ("work", "cells", "by_cell", "owners", "order", "rays_before", "bounds"):
-                getattr(launch, f"_{name}").fill_(-(1 << 28))
+            for name in ("work", "cells", "by_cell", "owners", "rays", "rays_before", "bounds"):
+                getattr(launch.parcels.turn, name).fill_(-(1 << 28))
 
     monkeypatch.setattr(adjoint.AdjointLaunch, "__init__", unwritten)
 
@@ -103,17 +104,21 @@ Turn = tuple[list[np.ndarray], np.ndarray]
 def turns_of(launch: Callable[[], Any], monkeypatch: pytest.MonkeyPatch) -> list[Turn]:
     """The turns of what is launched."""
     turns = []
-    share_out = adjoint.AdjointLaunch._share_out
+    launch_owned = Workers.launch_owned
 
-    def spy(launch: adjoint.AdjointLaunch, begin: int, end: int) -> list[int]:
-        bounds = share_out(launch, begin, end)
-        assert bounds[0] == begin < bounds[-1] <= end
-        rays = launch._order.numpy().copy()
+    def spy(
+        workers: Workers, kernel: wp.Kernel, items: Any, *arguments: Any, **packed: Any
+    ) -> None:
+        launch_owned(workers, kernel, items, *arguments, **packed)
+        if "backward" not in kernel.key:
+            return
+        turn = arguments[-1].turn
+        bounds, rays = turn.bounds.numpy().tolist(), turn.rays.numpy().copy()
+        assert bounds[0] == turn.begin < bounds[-1] <= turn.end
         shares = [rays[i:j] for i, j in itertools.pairwise(bounds)]
-        turns.append((shares, launch._cells.numpy().copy()))
-        return bounds
+        turns.append((shares, turn.cells.numpy().copy()))
 
-    monkeypatch.setattr(adjoint.AdjointLaunch, "_share_out", spy)
+    monkeypatch.setattr(Workers, "launch_owned", spy)
     launch()
     return turns
 
@@ -155,6 +160,11 @@ def test_cells_are_numbered_along_a_curve() -> None:
     assert np.array_equal(indices_of(found[3 * order.CELLS :]), expected)
 
 
+@wp.kernel(enable_backward=False)
+def share_out(turn: order.Turn):
+    order.share_out(turn)
+
+
 @pytest.mark.parametrize("n_workers", [1, 2, 3, 7])
 @pytest.mark.parametrize("largest", [20, 1 << 30])
 def test_rays_are_shared_out_by_slab_and_work(largest: int, n_workers: int) -> None:
@@ -166,18 +176,26 @@ def test_rays_are_shared_out_by_slab_and_work(largest: int, n_workers: int) -> N
     cell = rng.integers(0, order.CELLS, n)
     cell[::2] = rng.choice([0, 5, order.CELLS - 1], n // 2)
     slab = indices_of(cell)[:, 0]
-    scratch = [
-        np.full(order.ACROSS, 99, np.int64),
-        np.full(order.CELLS, 99, np.int32),
-        *np.zeros((2, n), np.int32),
-    ]
     bounds, rays = np.zeros(n_workers + 1, np.int32), np.full(n, -1, np.int32)
-    arrays = [work.astype(np.int32), cell.astype(np.int32), *scratch, bounds, rays]
-    on_device = [wp.array(array, device="cpu", copy=False) for array in arrays]
+    arrays = {
+        "work": work.astype(np.int32),
+        "cells": cell.astype(np.int32),
+        "work_before": np.full(order.ACROSS, 99, np.int64),
+        "rays_before": np.full(order.CELLS, 99, np.int32),
+        "by_cell": np.zeros(n, np.int32),
+        "owners": np.zeros(n, np.int32),
+        "bounds": bounds,
+        "rays": rays,
+    }
+    turn = order.Turn()
+    turn.end, turn.most_work = n, most_work
+    for name, array in arrays.items():
+        setattr(turn, name, wp.array(array, device="cpu", copy=False))
     while begin < n:
         until = np.cumsum(work[begin:])
         end = begin + max(1, int((until <= most_work).sum()))
-        wp.launch(order.share_out, 1, inputs=[begin, n, most_work, *on_device], device="cpu")
+        turn.begin = begin
+        wp.launch(share_out, 1, inputs=[turn], device="cpu")
         by_cell = begin + np.argsort(cell[begin:end], kind="stable")
         by_slab = by_cell[np.argsort(slab[by_cell], kind="stable")]
         until = np.cumsum(work[by_slab]) - work[by_slab]

@@ -170,7 +170,8 @@ def test_there_is_room_for_all_parcels(monkeypatch: pytest.MonkeyPatch) -> None:
     p = replace(p, steps=Steps(near=0.0, far=4.0, step=0.004))
     launches = launches_of(monkeypatch)
     of(3).backward(p)
-    work = int(launches[0]._work.numpy().sum())
+    assert launches[0].parcels is not None
+    work = int(launches[0].parcels.turn.work.numpy().sum())
     monkeypatch.setattr(adjoint, "SAMPLES", work + 3 * (most_steps(p) + LANES + order.RAY) + 2)
     kernels = of(3)
     kernels.backward(p)
@@ -180,70 +181,46 @@ def test_there_is_room_for_all_parcels(monkeypatch: pytest.MonkeyPatch) -> None:
     assert 0.9 * room < most <= room
 
 
-def test_workers_take_rays_in_the_order_that_they_are_given(
-    monkeypatch: pytest.MonkeyPatch,
+def test_nothing_is_sent_where_each_takes_its_own_rays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of the second worker's part come first."""
+    n = 20
+    nodes = np.random.default_rng(9).uniform(size=(n, 3)) * (0.9, 6, 5)
+    nodes[: n // 2, 0] += 3
+    p = one_sample_each(nodes, (PLANES, 7, 6))
+    launches = launches_of(monkeypatch)
+    gradient = of(2).backward(p)
+    made = launches[0].parcels
+    assert made is not None
+    assert made.n_contents.numpy()[:, 0].tolist() == [0, 0]
+    assert_close(gradient, of(1).backward(p), 3e-6)
+
+
+@pytest.mark.parametrize("threads", [2, 3])
+def test_workers_add_to_no_planes_but_their_own(
+    threads: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    p = problem(5)
-    whole = of(2).train(p)
-
-    def all_but_the_last(launch: adjoint.AdjointLaunch, begin: int, end: int) -> list[int]:
-        launch._order.numpy()[begin:end] = [*range(end - 2, begin - 1, -1), begin]
-        return [begin, (begin + end) // 2, end]
-
-    monkeypatch.setattr(adjoint.AdjointLaunch, "_share_out", all_but_the_last)
-    error, _ = of(2).train(p)
-    assert np.array_equal(error[:-1], whole[0][:-1])
-    assert whole[0][-1] != 0 and error[-1] == 0
-
-
-def test_workers_add_to_no_planes_but_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each delivery by itself."""
+    """Each worker with a gradient for itself."""
     p = problem(2)
     whole = of(1).backward(p)
-    seen = []
+    kernels = of(threads)
+    own = [kernels.no_gradient(p.raw.shape) for _ in range(threads)]
+    start = Packed.launch
 
-    def deliver_in_turns(kernels: Kernels) -> None:
-        launch = kernels.workers.launch
+    def launch(
+        packed: Packed, worker: int, kernel: wp.Kernel, n: int, arguments: list[Any], device: Any
+    ) -> None:
+        shared, alone = arguments[-1], parcels.Parcels()
+        for name in ("contents", "n_contents", "addressed", "n_addressed", "turn"):
+            setattr(alone, name, getattr(shared, name))
+        alone.gradient = own[worker]
+        start(packed, worker, kernel, n, [*arguments[:-1], alone], device)
 
-        def spy(kernel: wp.Kernel, n: int, *arguments: Any, packed: Packed) -> None:
-            if kernel is not parcels.deliver_parcels:
-                return launch(kernel, n, *arguments, packed=packed)
-            size, sent = arguments
-            planes = -(-PLANES // n)
-            for worker in range(n):
-                before = sent.gradient.values.numpy().copy()
-                wp.launch(kernel, 1, inputs=[worker, size, sent], device="cpu")
-                changed = sent.gradient.values.numpy() != before
-                changed = np.flatnonzero(changed.reshape(whole.shape).any((1, 2, 3)))
-                assert len(changed) and (changed // planes == worker).all()
-                seen.append(worker)
-
-        monkeypatch.setattr(kernels.workers, "launch", spy)
-
-    for threads in (2, 3):
-        kernels = of(threads)
-        deliver_in_turns(kernels)
-        assert_close(kernels.backward(p), whole, 3e-6)
-    assert seen == [0, 1, 0, 1, 2]
-
-
-def test_what_a_worker_adds_at_once_is_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All rays given to one worker of three: what it does not own is in parcels."""
-    p = problem(3)
-    whole = of(1).backward(p)
-    kernels = of(3)
-    launch, make_parcels = kernels.workers.launch_owned, adjoint._make_parcels
-    planes: list[list[int]] = []
-
-    def by_owner(kernel: wp.Kernel, items: Any, *arguments: Any, **packed: Packed) -> None:
-        if "backward" not in kernel.key:
-            return launch(kernel, items, *arguments, **packed)
-        wp.launch(kernel, items[-1], inputs=[0, len(planes), *arguments], device="cpu")
-        found = arguments[-1].gradient.values.numpy().reshape(whole.shape)
-        planes.append(np.flatnonzero(found.any((1, 2, 3))).tolist())
-
-    monkeypatch.setattr(kernels.workers, "launch_owned", by_owner)
-    monkeypatch.setattr(adjoint, "_make_parcels", lambda n, workers: make_parcels(3 * n, workers))
-    for _ in range(3):
-        assert_close(kernels.backward(p), whole, 3e-6)
-    assert planes == [[0, 1], [2, 3], [4]]
+    monkeypatch.setattr(Packed, "launch", launch)
+    kernels.backward(p)
+    n_planes = -(-PLANES // threads)
+    found = [gradient.values.numpy().reshape(whole.shape) for gradient in own]
+    for worker, gradient in enumerate(found):
+        planes = np.flatnonzero(gradient.any((1, 2, 3)))
+        first = worker * n_planes
+        assert planes.tolist() == list(range(first, min(first + n_planes, PLANES)))
+    assert_close(np.sum(found, axis=0), whole, 3e-6)

@@ -1,12 +1,14 @@
 """Shares of the workers: disjoint and complete."""
 
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 import pytest
 import warp as wp
 from drive import Kernels, make_problem
+from warpnerf_kernels.meeting import meet
 
 from warpnerf.checks import InputError
 from warpnerf.parallel import NODES, RAYS, Packed, Workers
@@ -113,12 +115,82 @@ def test_what_was_interrupted_is_packed_anew(monkeypatch: pytest.MonkeyPatch, on
     assert (visits.numpy() == 2).all() and not others.numpy().any()
 
 
-def test_a_thread_alone(on_cpu: None) -> None:
-    workers, packed = Workers("cpu", 2), Packed()
-    visits = wp.zeros(10, dtype=wp.int32, device="cpu")
-    for first in (3, 3, 7):
-        workers.launch_alone(count_visits, first, visits, packed=packed)
-    assert visits.numpy().tolist() == [0, 0, 0, 2, 0, 0, 0, 1, 0, 0]
+@wp.kernel(enable_backward=False)
+def add_up_together(
+    first: int,
+    worker: int,
+    n_meetings: int,
+    meeting: wp.array(dtype=wp.int32),
+    numbers: wp.array(dtype=wp.int32),
+    out_sum: wp.array2d(dtype=wp.int32),
+):
+    n_workers = numbers.shape[0]
+    for turn in range(n_meetings):
+        numbers[worker] = numbers[worker] + worker + 1
+        if not meet(meeting, n_workers):
+            return
+        for other in range(n_workers):
+            out_sum[worker, turn] += numbers[other]
+        if not meet(meeting, n_workers):
+            return
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3, 7])
+def test_workers_meet(threads: int, on_cpu: None) -> None:
+    """More of them than cores, again and again: none goes on before all have come."""
+    workers, packed = Workers("cpu", threads), Packed()
+    expected = threads * (threads + 1) // 2 * np.arange(1, 51)
+    for _ in range(20):
+        numbers = wp.zeros(threads, dtype=wp.int32, device="cpu")
+        sums = wp.zeros((threads, 50), dtype=wp.int32, device="cpu")
+        workers.launch_owned(
+            add_up_together, threads, 50, workers.meeting, numbers, sums, packed=packed
+        )
+        assert (sums.numpy() == expected).all()
+
+
+@pytest.mark.parametrize("missing", [0, 1, 2])
+def test_nobody_waits_for_who_does_not_come(
+    missing: int, monkeypatch: pytest.MonkeyPatch, on_cpu: None
+) -> None:
+    workers, packed = Workers("cpu", 3), Packed()
+    numbers = wp.zeros(3, dtype=wp.int32, device="cpu")
+    sums = wp.zeros((3, 1), dtype=wp.int32, device="cpu")
+
+    def launch() -> None:
+        workers.launch_owned(add_up_together, 3, 1, workers.meeting, numbers, sums, packed=packed)
+
+    launch()
+    start = Packed.launch
+
+    def fails(packed: Packed, worker: int, *given: Any) -> None:
+        if worker == missing:
+            raise KeyboardInterrupt
+        start(packed, worker, *given)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Packed, "launch", fails)
+        with pytest.raises(KeyboardInterrupt):
+            launch()
+    assert (sums.numpy() == 6).all()
+    launch()
+    assert (sums.numpy() > 6).all()
+
+
+def test_launches_from_several_threads_do_not_wait_for_each_other(on_cpu: None) -> None:
+    """Each needs all workers to meet."""
+    workers = Workers("cpu", 3)
+
+    def launch(n: int) -> np.ndarray:
+        numbers = wp.zeros(3, dtype=wp.int32, device="cpu")
+        sums = wp.zeros((3, n), dtype=wp.int32, device="cpu")
+        workers.launch_owned(add_up_together, 3, n, workers.meeting, numbers, sums)
+        return sums.numpy()
+
+    launch(1)
+    with ThreadPoolExecutor(4) as pool:
+        for sums in pool.map(launch, [5] * 100):
+            assert (sums == 6 * np.arange(1, 6)).all()
 
 
 def test_one_keeps_what_several_kernels_take(on_cpu: None) -> None:

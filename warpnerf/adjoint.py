@@ -21,6 +21,10 @@ SAMPLES = 1 << 21
 for 68 MB, and half a megabyte more for each worker, of which what is used takes memory. Rays that
 might have more take turns, so parcels grow with neither rays nor samples."""
 
+ALONE = 1 << 24
+"""Steps, in whole packs, that one worker makes at a time: signals wait for that, a third of a
+second."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Gradients:
@@ -93,8 +97,6 @@ class AdjointLaunch:
             workers: Where to work.
         """
         self._kernel = kernel
-        self._contraction = variant.contraction
-        self._size = wp.vec3i(*size)
         self._workers = workers
         self._packed = Packed()
         self.parcels: parcels.Parcels | None = None
@@ -106,16 +108,12 @@ class AdjointLaunch:
             if count < workers.count:
                 self._workers = Workers("cpu", count)
             room = SAMPLES // count if count > 1 else 0
-            # One worker leaves no parcels. Of several, each may get a ray more than its share.
-            self._work_a_turn = count * (room - most_work) if count > 1 else 1 << 62
             self.parcels = _make_parcels(room // LANES, count)
-            # What share_out takes from measure_rays, its scratch, and what it gives.
-            self._work, self._cells, self._by_cell, self._owners, self._order = (
-                wp.empty(n_rays, dtype=wp.int32, device="cpu") for _ in range(5)
-            )
-            self._work_before = wp.empty(order.ACROSS, dtype=wp.int64, device="cpu")
-            self._rays_before = wp.empty(order.CELLS, dtype=wp.int32, device="cpu")
-            self._bounds = wp.empty(count + 1, dtype=wp.int32, device="cpu")
+            turn = _make_turn(n_rays, count)
+            turn.meeting = self._workers.meeting
+            # One worker leaves no parcels. Of several, each may get a ray more than its share.
+            turn.most_work = count * (room - most_work) if count > 1 else ALONE
+            self.parcels.turn = turn
         elif not workers.device.is_cuda:
             self._workers = Workers("cpu", 1)
 
@@ -132,59 +130,27 @@ class AdjointLaunch:
             self._workers.launch_owned(self._kernel, n_rays, *arguments, gradient)
             return
         self.parcels.gradient = gradient
-        self.parcels.order = self._order
-        self._measure(n_rays, arguments)
-        begin = 0
-        while begin < n_rays:
-            bounds = self._share_out(begin, n_rays)
-            self.parcels.n_contents.zero_()
-            self.parcels.n_addressed.zero_()
+        turn = self.parcels.turn
+        turn.begin, turn.end = 0, n_rays
+        while turn.begin < n_rays:
             self._workers.launch_owned(
-                self._kernel, bounds, *arguments, self.parcels, packed=self._packed
+                self._kernel, self._workers.count, *arguments, self.parcels, packed=self._packed
             )
-            if self._workers.count > 1:
-                self._workers.launch(
-                    parcels.deliver_parcels,
-                    self._workers.count,
-                    self._size,
-                    self.parcels,
-                    packed=self._packed,
-                )
-            begin = bounds[-1]
+            turn.begin = int(turn.bounds.numpy()[-1])
 
-    def _measure(self, n_rays: int, arguments: tuple[Any, ...]) -> None:
-        """Find how much work each ray is, and where its middle lies."""
-        grid, _, march, origins, directions = arguments[:5]
-        self._workers.launch(
-            order.measure_rays_kernel(self._contraction),
-            n_rays,
-            *(grid, march, origins, directions, self._work, self._cells),
-            packed=self._packed,
-        )
 
-    def _share_out(self, begin: int, end: int) -> list[int]:
-        """Give the workers rays from begin on, as many as there is room for, to end at most.
+def _make_turn(n_rays: int, n_workers: int) -> order.Turn:
+    """With room for batches of so many rays."""
 
-        Returns:
-            [workers + 1] where in the order each worker's rays begin, and where the last one's
-            end.
-        """
-        self._workers.launch_alone(
-            order.share_out,
-            begin,
-            end,
-            self._work_a_turn,
-            self._work,
-            self._cells,
-            self._work_before,
-            self._rays_before,
-            self._by_cell,
-            self._owners,
-            self._bounds,
-            self._order,
-            packed=self._packed,
-        )
-        return self._bounds.numpy().tolist()
+    def room(n: int, dtype: Any = wp.int32) -> wp.array:
+        return wp.empty(n, dtype=dtype, device="cpu")
+
+    turn = order.Turn()
+    turn.work, turn.cells, turn.by_cell, turn.owners, turn.rays = (room(n_rays) for _ in range(5))
+    turn.work_before = room(order.ACROSS, wp.int64)
+    turn.rays_before = room(order.CELLS)
+    turn.bounds = room(n_workers + 1)
+    return turn
 
 
 def _make_parcels(n_packs: int, n_workers: int) -> parcels.Parcels:

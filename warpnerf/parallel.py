@@ -7,11 +7,13 @@ whatever else the machine is doing.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import warp as wp
+from warpnerf_kernels import meeting
 
 from warpnerf import kernel_cache
 from warpnerf.checks import InputError, require_at_least
@@ -80,7 +82,11 @@ class Workers:
                 "use --device cpu."
             ) from error
         self.count = 1 if self.device.is_cuda else (threads or usable_cores())
-        self._pool = ThreadPoolExecutor(self.count - 1) if self.count > 1 else None
+        self._pool = ThreadPoolExecutor(max(1, self.count - 1))  # starts threads when they are used
+        self._launching = threading.Lock()
+        self.meeting = wp.zeros(meeting.SIZE, dtype=wp.int32, device="cpu")
+        """Where they wait for each other in a launch on the CPU; see warpnerf_kernels.meeting."""
+        self._attendance = self.meeting.numpy()
         self._loaded: set[Any] = set()
 
     def launch(
@@ -123,11 +129,6 @@ class Workers:
         bounds = items if isinstance(items, Sequence) else self._alike(items)
         self._launch(kernel, bounds, lambda worker: (worker, *arguments), RAYS, packed)
 
-    def launch_alone(self, kernel: wp.Kernel, *arguments: Any, packed: Packed) -> None:
-        """Run kernel(*arguments) once on the CPU, in this thread."""
-        self.load(kernel)
-        packed.launch(0, kernel, 1, list(arguments), self.device)
-
     def load(self, kernel: wp.Kernel) -> None:
         """Compile a kernel, or fetch it from the cache, once: else every thread would."""
         if kernel not in self._loaded:
@@ -155,16 +156,32 @@ class Workers:
 
         def share(worker: int) -> None:
             until = bounds[worker + 1]
-            for first in range(bounds[worker], until, chunk):
-                n, inputs = min(chunk, until - first), [first, *arguments(worker)]
-                if packed is not None:
-                    packed.launch(worker, kernel, n, inputs, self.device)
-                else:
-                    wp.launch(kernel, n, inputs=inputs, device=self.device)
+            try:
+                for first in range(bounds[worker], until, chunk):
+                    n, inputs = min(chunk, until - first), [first, *arguments(worker)]
+                    if packed is not None:
+                        packed.launch(worker, kernel, n, inputs, self.device)
+                    else:
+                        wp.launch(kernel, n, inputs=inputs, device=self.device)
+            except BaseException:
+                self._call_off()
+                raise
 
-        others = [self._pool.submit(share, w) for w in range(1, self.count)] if self._pool else []
-        try:
-            share(0)
-        finally:
-            for other in others:
-                other.result()
+        # Workers that meet in a launch must all be at it, so there is one at a time.
+        with self._launching:
+            self._attendance[:] = 0
+            others: list[Future[None]] = []
+            try:
+                for worker in range(1, self.count):
+                    others.append(self._pool.submit(share, worker))
+                share(0)
+            except BaseException:
+                self._call_off()
+                raise
+            finally:
+                for other in others:
+                    other.result()
+
+    def _call_off(self) -> None:
+        """Let nobody wait for a worker that does not come to a meeting."""
+        self._attendance[meeting.CALLED_OFF] = 1

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import get_args
 
 import warp as wp
-from warpnerf_kernels import adam, camera, interp, occupancy, order, parcels, regularize, render
+from warpnerf_kernels import adam, camera, interp, occupancy, regularize, render
 
 from warpnerf import kernel_cache
 from warpnerf.config import PRESETS, Contraction, Jacobian, Scaling
@@ -37,14 +37,8 @@ def training_kernels(
     Kernels that share a module with one of these are compiled along with it.
     """
     variant = _variant(contraction, scaling, jacobian, device)
-    sharing = [
-        order.measure_rays_kernel(variant.contraction),
-        order.share_out,
-        parcels.deliver_parcels,
-    ]
     return [
         camera.sample_pixels,
-        *(sharing if variant.packed else []),
         render.render_train_kernel(variant),
         regularize.total_variation_backward,
         adam.adam_step,

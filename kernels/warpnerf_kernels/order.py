@@ -6,12 +6,11 @@ of the grid that its worker owns, the less is left for others to add (see parcel
 are shared out along x, to each worker as much work.
 """
 
-from functools import cache
-
 import warp as wp
 
 from .contraction import contract
 from .march import prepare_ray, step_edge
+from .meeting import meet
 from .types import Grid, March, real, vec3
 from .vectors import LANES
 
@@ -28,6 +27,24 @@ ACROSS = 1 << BITS
 
 CELLS = ACROSS**3
 """Cells that the grid is divided into, to tell middles of rays apart."""
+
+
+@wp.struct
+class Turn:
+    """The rays of a batch that are put through together: as many as there is room for."""
+
+    begin: int  # ray to begin with
+    end: int  # after the last one of the batch
+    most_work: wp.int64  # that there is room for
+    work: wp.array(dtype=wp.int32)  # [n_rays] steps in the grid in whole packs, and RAY
+    cells: wp.array(dtype=wp.int32)  # [n_rays] of the middle step, by cell_at
+    work_before: wp.array(dtype=wp.int64)  # [ACROSS] scratch
+    rays_before: wp.array(dtype=wp.int32)  # [CELLS] scratch
+    by_cell: wp.array(dtype=wp.int32)  # [n_rays] scratch
+    owners: wp.array(dtype=wp.int32)  # [n_rays] scratch
+    bounds: wp.array(dtype=wp.int32)  # [n_workers + 1] where in rays each worker's begin
+    rays: wp.array(dtype=wp.int32)  # [n_rays] all of the first worker's, of the second's, ...
+    meeting: wp.array(dtype=wp.int32)  # of the workers
 
 
 @wp.func
@@ -54,93 +71,107 @@ def slab_of(cell: int) -> int:
     return slab
 
 
-@cache
-def measure_rays_kernel(contraction: int) -> wp.Kernel:
-    """How much work rays are, and where their middle steps lie."""
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def measure_rays(
-        first: int,
-        grid: Grid,
-        march: March,
-        origins: wp.array(dtype=vec3),  # [n_rays] scene units
-        directions: wp.array(dtype=vec3),  # [n_rays] unit vectors
-        out_work: wp.array(dtype=wp.int32),  # [n_rays] steps in the grid in whole packs, and RAY
-        out_cell: wp.array(dtype=wp.int32),  # [n_rays] of the middle step, by cell_at
-    ):
-        i = first + wp.tid()
-        ray = prepare_ray(grid, march, origins[i], directions[i], real(0.0), contraction)
-        t = wp.min(step_edge(march, (ray.begin + ray.end) // 2), march.far)
-        q = contract(ray.q_origin + t * ray.q_direction, grid.border, contraction)
-        u = wp.cw_mul(q, grid.to_nodes) + grid.middle
-        # A pack more where the last one is full: a step more or less is a matter of rounding.
-        n_packs = (ray.end - ray.begin) // wp.static(LANES) + 1
-        out_work[i] = n_packs * wp.static(LANES) + wp.static(RAY)
-        out_cell[i] = cell_at(wp.cw_div(u, real(2.0) * grid.middle))
-
-    return measure_rays
-
-
-@wp.kernel
-def share_out(
-    begin: int,  # ray to begin with
-    end: int,  # after the last one, at most
-    most_work: wp.int64,  # that there is room for
-    work: wp.array(dtype=wp.int32),  # [n_rays] by measure_rays
-    cells: wp.array(dtype=wp.int32),  # [n_rays] by measure_rays
-    work_before: wp.array(dtype=wp.int64),  # [ACROSS] scratch
-    rays_before: wp.array(dtype=wp.int32),  # [CELLS] scratch
-    by_cell: wp.array(dtype=wp.int32),  # [n_rays] scratch
-    owners: wp.array(dtype=wp.int32),  # [n_rays] scratch
-    out_bounds: wp.array(dtype=wp.int32),  # [n_workers + 1] where in order each worker's begin
-    out_order: wp.array(dtype=wp.int32),  # [n_rays] all of the first worker's, of the second's, ...
+@wp.func
+def measure_ray(
+    i: int,
+    grid: Grid,
+    march: March,
+    origins: wp.array(dtype=vec3),  # [n_rays] scene units
+    directions: wp.array(dtype=vec3),  # [n_rays] unit vectors
+    contraction: int,
+    turn: Turn,  # its work and cells are written
 ):
+    """How much work a ray is, and where its middle step lies."""
+    ray = prepare_ray(grid, march, origins[i], directions[i], real(0.0), contraction)
+    t = wp.min(step_edge(march, (ray.begin + ray.end) // 2), march.far)
+    q = contract(ray.q_origin + t * ray.q_direction, grid.border, contraction)
+    u = wp.cw_mul(q, grid.to_nodes) + grid.middle
+    # A pack more where the last one is full: a step more or less is a matter of rounding.
+    n_packs = (ray.end - ray.begin) // wp.static(LANES) + 1
+    turn.work[i] = n_packs * wp.static(LANES) + wp.static(RAY)
+    turn.cells[i] = cell_at(wp.cw_div(u, real(2.0) * grid.middle))
+
+
+@wp.func
+def share_out(turn: Turn):
     """Give the workers the next rays by slab, each as much work, and each in the order of cells.
 
     These are as many as there is room for, but one at least. Rays of a cell keep their order.
+    Written: the turn's bounds and rays, and its scratch.
     """
-    n_workers = out_bounds.shape[0] - 1
+    n_workers = turn.bounds.shape[0] - 1
     for slab in range(wp.static(ACROSS)):
-        work_before[slab] = wp.int64(0)
+        turn.work_before[slab] = wp.int64(0)
     for cell in range(wp.static(CELLS)):
-        rays_before[cell] = 0
+        turn.rays_before[cell] = 0
     total = wp.int64(0)
-    last = int(begin)
-    while last < end and (last == begin or total + wp.int64(work[last]) <= most_work):
-        total += wp.int64(work[last])
-        work_before[slab_of(cells[last])] += wp.int64(work[last])
-        rays_before[cells[last]] += 1
+    last = int(turn.begin)
+    while last < turn.end and (
+        last == turn.begin or total + wp.int64(turn.work[last]) <= turn.most_work
+    ):
+        total += wp.int64(turn.work[last])
+        turn.work_before[slab_of(turn.cells[last])] += wp.int64(turn.work[last])
+        turn.rays_before[turn.cells[last]] += 1
         last += 1
     before = wp.int64(0)
     for slab in range(wp.static(ACROSS)):  # from the work in a slab to that in lower ones
-        here = work_before[slab]
-        work_before[slab] = before
+        here = turn.work_before[slab]
+        turn.work_before[slab] = before
         before += here
-    at = int(begin)
+    at = int(turn.begin)
     for cell in range(wp.static(CELLS)):  # from the rays of a cell to where they begin
-        n = rays_before[cell]
-        rays_before[cell] = at
+        n = turn.rays_before[cell]
+        turn.rays_before[cell] = at
         at += n
-    for i in range(begin, last):
-        at = rays_before[cells[i]]
-        rays_before[cells[i]] = at + 1
-        by_cell[at] = i
-    out_bounds[0] = begin
+    for i in range(turn.begin, last):
+        at = turn.rays_before[turn.cells[i]]
+        turn.rays_before[turn.cells[i]] = at + 1
+        turn.by_cell[at] = i
+    turn.bounds[0] = turn.begin
     for w in range(n_workers):
-        out_bounds[w + 1] = 0
-    for place in range(begin, last):
-        i = by_cell[place]
-        slab = slab_of(cells[i])
-        before = work_before[slab]
-        work_before[slab] = before + wp.int64(work[i])
-        owners[place] = int(before * wp.int64(n_workers) // total)
-        out_bounds[owners[place] + 1] += 1  # counts a worker's rays
-    at = int(begin)
+        turn.bounds[w + 1] = 0
+    for place in range(turn.begin, last):
+        i = turn.by_cell[place]
+        slab = slab_of(turn.cells[i])
+        before = turn.work_before[slab]
+        turn.work_before[slab] = before + wp.int64(turn.work[i])
+        turn.owners[place] = int(before * wp.int64(n_workers) // total)
+        turn.bounds[turn.owners[place] + 1] += 1  # counts a worker's rays
+    at = int(turn.begin)
     for w in range(n_workers):
-        n = out_bounds[w + 1]
-        out_bounds[w + 1] = at  # where its next ray goes
+        n = turn.bounds[w + 1]
+        turn.bounds[w + 1] = at  # where its next ray goes
         at += n
-    for place in range(begin, last):
-        at = out_bounds[owners[place] + 1]
-        out_bounds[owners[place] + 1] = at + 1
-        out_order[at] = by_cell[place]
+    for place in range(turn.begin, last):
+        at = turn.bounds[turn.owners[place] + 1]
+        turn.bounds[turn.owners[place] + 1] = at + 1
+        turn.rays[at] = turn.by_cell[place]
+
+
+@wp.func
+def take_share(
+    worker: int,
+    turn: Turn,
+    grid: Grid,
+    march: March,
+    origins: wp.array(dtype=vec3),  # [n_rays] scene units
+    directions: wp.array(dtype=vec3),  # [n_rays] unit vectors
+    contraction: int,
+) -> wp.vec2i:
+    """Which of the turn's rays are a worker's: from the first of two places to before the second.
+
+    All workers call it at the same time. None are its where one of them never came.
+    """
+    n_workers = turn.bounds.shape[0] - 1
+    if turn.begin == 0:
+        n = wp.int64(turn.end)
+        until = int(n * wp.int64(worker + 1) // wp.int64(n_workers))
+        for i in range(int(n * wp.int64(worker) // wp.int64(n_workers)), until):
+            measure_ray(i, grid, march, origins, directions, contraction, turn)
+    if not meet(turn.meeting, n_workers):
+        return wp.vec2i(0, 0)
+    if worker == 0:
+        share_out(turn)
+    if not meet(turn.meeting, n_workers):
+        return wp.vec2i(0, 0)
+    return wp.vec2i(turn.bounds[worker], turn.bounds[worker + 1])

@@ -13,6 +13,8 @@ Like packs.py this is for float32 on the CPU, and most of it C++ on Clang's vect
 
 import warp as wp
 
+from .meeting import meet
+from .order import Turn
 from .packs import Pack
 from .types import Gradient
 from .vectors import VECTORS, lanes, lanes_int
@@ -47,7 +49,7 @@ class Parcels:
     n_contents: wp.array2d(dtype=wp.int32)  # [n_workers, row] in the first column
     n_addressed: wp.array2d(dtype=wp.int32)  # [n_workers, row] by receiver
     gradient: Gradient  # where it all goes
-    order: wp.array(dtype=wp.int32)  # [n_rays] all of the first worker's, of the second's, ...
+    turn: Turn  # whose rays they are from
 
 
 WORDS = (
@@ -188,7 +190,18 @@ def take_in(size: wp.vec3i, worker: int, parcels: Parcels):
     ...
 
 
-@wp.kernel
-def deliver_parcels(first: int, size: wp.vec3i, parcels: Parcels):
-    """Add what lies in parcels to the grid's gradient, each worker to its own part."""
-    take_in(size, first + wp.tid(), parcels)
+@wp.func
+def leave_none(worker: int, parcels: Parcels):
+    """Forget what a worker left in the last turn."""
+    parcels.n_contents[worker, 0] = 0
+    for receiver in range(parcels.contents.shape[0]):
+        parcels.n_addressed[worker, receiver] = 0
+
+
+@wp.func
+def deliver(size: wp.vec3i, worker: int, parcels: Parcels):
+    """Once the rays of all workers are through, add what lies in parcels to a worker's own part."""
+    n_workers = parcels.contents.shape[0]
+    if n_workers > 1:
+        if meet(parcels.turn.meeting, n_workers):
+            take_in(size, worker, parcels)

@@ -10,9 +10,10 @@ from typing import NamedTuple
 
 import warp as wp
 
-from . import integral, integral_packed, packs, parcels
+from . import integral, integral_packed, order, packs, parcels
 from .loss import adj_squared_error, squared_error
 from .march import prepare_ray
+from .parcels import deliver, leave_none
 from .types import FreeSpace, Gradient, Grid, Integral, March, Sample, real, vec3
 
 
@@ -47,16 +48,65 @@ def ray_value(values: wp.array(dtype=real), ray: int) -> real:  # noqa: F811 (an
     return values[wp.min(ray, values.shape[0] - 1)]
 
 
+# How a kernel that ends in a gradient takes rays, and what is left to do after them. Plain kernels
+# have a ray for each thread, and nothing to do but to add to the gradient.
+
+
 @wp.func
-def ray_of(place: int, gradient: Gradient) -> int:
-    """The ray at a place in the order: they come as they are."""
+def take_rays(
+    thread: int,
+    worker: int,
+    grid: Grid,
+    march: March,
+    origins: wp.array(dtype=vec3),
+    directions: wp.array(dtype=vec3),
+    contraction: int,
+    gradient: Gradient,
+) -> wp.vec2i:
+    """A single one."""
+    return wp.vec2i(thread, thread + 1)
+
+
+@wp.func
+def ray_at(place: int, gradient: Gradient) -> int:
+    """They come as they are."""
     return place
 
 
 @wp.func
-def ray_of(place: int, gradient: parcels.Parcels) -> int:  # noqa: F811 (an overload)
-    """The ray at a place in the order, in which each worker's lie side by side."""
-    return gradient.order[place]
+def finish(size: wp.vec3i, worker: int, gradient: Gradient):
+    """Nothing."""
+
+
+# Packed ones have a thread for each worker, all of which run at the same time.
+
+
+@wp.func
+def take_rays(  # noqa: F811 (an overload)
+    thread: int,
+    worker: int,
+    grid: Grid,
+    march: March,
+    origins: wp.array(dtype=vec3),
+    directions: wp.array(dtype=vec3),
+    contraction: int,
+    gradient: parcels.Parcels,
+) -> wp.vec2i:
+    """Its share of the turn."""
+    leave_none(worker, gradient)
+    return order.take_share(worker, gradient.turn, grid, march, origins, directions, contraction)
+
+
+@wp.func
+def ray_at(place: int, gradient: parcels.Parcels) -> int:  # noqa: F811 (an overload)
+    """Each worker's lie side by side."""
+    return gradient.turn.rays[place]
+
+
+@wp.func
+def finish(size: wp.vec3i, worker: int, gradient: parcels.Parcels):  # noqa: F811 (an overload)
+    """Others have left something for it."""
+    deliver(size, worker, gradient)
 
 
 @cache
@@ -115,7 +165,7 @@ def render_backward_kernel(variant: Variant) -> wp.Kernel:
 
     @wp.kernel(module="unique", enable_backward=False)
     def render_backward(
-        first: int,  # this launch works on rays first, first + 1, ...
+        first: int,  # number of this launch's first thread: of a ray, or where packed of a worker
         worker: int,  # row of kept; owner of a part of the gradient
         # scene
         grid: Grid,
@@ -142,35 +192,40 @@ def render_backward_kernel(variant: Variant) -> wp.Kernel:
         # out
         out_gradient: OutGradient,  # of the grid's values, added to
     ):
-        i = ray_of(first + wp.tid(), out_gradient)
-        ray = prepare_ray(
-            grid, march, origins[i], directions[i], ray_value(offsets, i), contraction
+        places = take_rays(
+            first + wp.tid(), worker, grid, march, origins, directions, contraction, out_gradient
         )
-        total = Integral()
-        total.transmittance = transmittance[i]
-        total.rgb = rgb[i] - transmittance[i] * ray_value(background, i)
-        total.depth = depth[i]
-        total.n_samples = n_samples[i]
-        adj_integrate(
-            grid,
-            free,
-            march,
-            ray,
-            total,
-            ray_value(background, i),
-            adj_rgb[i],
-            adj_opacity[i],
-            adj_depth[i],
-            ray_value(content_distance, i),
-            worker * capacity,
-            capacity,
-            contraction,
-            scaling,
-            jacobian,
-            kept,
-            worker,
-            out_gradient,
-        )
+        for place in range(places[0], places[1]):
+            i = ray_at(place, out_gradient)
+            ray = prepare_ray(
+                grid, march, origins[i], directions[i], ray_value(offsets, i), contraction
+            )
+            total = Integral()
+            total.transmittance = transmittance[i]
+            total.rgb = rgb[i] - transmittance[i] * ray_value(background, i)
+            total.depth = depth[i]
+            total.n_samples = n_samples[i]
+            adj_integrate(
+                grid,
+                free,
+                march,
+                ray,
+                total,
+                ray_value(background, i),
+                adj_rgb[i],
+                adj_opacity[i],
+                adj_depth[i],
+                ray_value(content_distance, i),
+                worker * capacity,
+                capacity,
+                contraction,
+                scaling,
+                jacobian,
+                kept,
+                worker,
+                out_gradient,
+            )
+        finish(grid.size, worker, out_gradient)
 
     return render_backward
 
@@ -188,7 +243,7 @@ def render_train_kernel(variant: Variant) -> wp.Kernel:
 
     @wp.kernel(module="unique", enable_backward=False)
     def render_train(
-        first: int,  # this launch works on rays first, first + 1, ...
+        first: int,  # number of this launch's first thread: of a ray, or where packed of a worker
         worker: int,  # row of kept; owner of a part of the gradient
         # scene
         grid: Grid,
@@ -210,35 +265,40 @@ def render_train_kernel(variant: Variant) -> wp.Kernel:
         out_n_samples: wp.array(dtype=wp.int32),  # [n_rays]
         out_gradient: OutGradient,  # of the grid's values, added to
     ):
-        i = ray_of(first + wp.tid(), out_gradient)
-        row = worker * capacity
-        behind_all = ray_value(background, i)
-        ray = prepare_ray(
-            grid, march, origins[i], directions[i], ray_value(offsets, i), contraction
+        places = take_rays(
+            first + wp.tid(), worker, grid, march, origins, directions, contraction, out_gradient
         )
-        total = integrate(grid, free, march, ray, row, capacity, contraction, kept)
-        rgb = total.rgb + total.transmittance * behind_all
-        out_error[i] = squared_error(rgb, target_rgb[i])
-        out_n_samples[i] = total.n_samples
-        adj_integrate(
-            grid,
-            free,
-            march,
-            ray,
-            total,
-            behind_all,
-            adj_squared_error(rgb, target_rgb[i], loss_weight),
-            real(0.0),
-            real(0.0),
-            ray_value(content_distance, i),
-            row,
-            capacity,
-            contraction,
-            scaling,
-            jacobian,
-            kept,
-            worker,
-            out_gradient,
-        )
+        for place in range(places[0], places[1]):
+            i = ray_at(place, out_gradient)
+            row = worker * capacity
+            behind_all = ray_value(background, i)
+            ray = prepare_ray(
+                grid, march, origins[i], directions[i], ray_value(offsets, i), contraction
+            )
+            total = integrate(grid, free, march, ray, row, capacity, contraction, kept)
+            rgb = total.rgb + total.transmittance * behind_all
+            out_error[i] = squared_error(rgb, target_rgb[i])
+            out_n_samples[i] = total.n_samples
+            adj_integrate(
+                grid,
+                free,
+                march,
+                ray,
+                total,
+                behind_all,
+                adj_squared_error(rgb, target_rgb[i], loss_weight),
+                real(0.0),
+                real(0.0),
+                ray_value(content_distance, i),
+                row,
+                capacity,
+                contraction,
+                scaling,
+                jacobian,
+                kept,
+                worker,
+                out_gradient,
+            )
+        finish(grid.size, worker, out_gradient)
 
     return render_train

@@ -7,7 +7,7 @@ TILES = "test_kernel_parcels.py::test_only_tiles_around_a_sample_are_flagged"
 SEVERAL = "test_kernel_parcels.py::test_one_thread_against_more"
 TWO = f"{SEVERAL}[none-2]"
 THREE = f"{SEVERAL}[none-3]"
-AT_ONCE = "test_kernel_parcels.py::test_what_a_worker_adds_at_once_is_its_own"
+OWN = "test_kernel_parcels.py::test_workers_add_to_no_planes_but_their_own"
 NOTHING = "test_kernel_parcels.py::test_nothing_is_sent_of_what_is_all_one_s_own"
 NUMBERS = "test_kernel_parcels.py::test_any_number_of_parcels"
 ROOM = "test_kernel_parcels.py::test_there_is_room_for_all_parcels"
@@ -64,12 +64,12 @@ MUTANTS = [
     # hand_out: to whom
     Mutant("add_own: upper plane taken for the lower", "parcels.py",
            "upper = visited & owned(worker, base + stride_x)",
-           "upper = visited & owned(worker, base)", AT_ONCE),
+           "upper = visited & owned(worker, base)", OWN),
     Mutant("add_own: all where the lower plane is one's own", "parcels.py",
-           "(lower & upper) == visited", "lower == visited", AT_ONCE),
+           "(lower & upper) == visited", "lower == visited", OWN),
     Mutant("add_own: all where the upper plane is one's own", "parcels.py",
-           "(lower & upper) == visited", "upper == visited", AT_ONCE),
-    Mutant("add_own: all", "parcels.py", "(lower & upper) == visited", "true", AT_ONCE),
+           "(lower & upper) == visited", "upper == visited", OWN),
+    Mutant("add_own: all", "parcels.py", "(lower & upper) == visited", "true", OWN),
     Mutant("add_own: never all", "parcels.py", "return true;", "return false;", NOTHING),
     Mutant("hand_out: nothing sent", "parcels.py",
            "    const unsigned theirs = owned(receiver, base) | owned(receiver, base + stride_x);",
@@ -139,9 +139,14 @@ MUTANTS = [
            "parcel = contents[which[k]]", "parcel = contents[k]", THREE),
     Mutant("take_in: the first one is late", "parcels.py", "k = 0;", "k = 1;", NUMBERS),
     Mutant("take_in: one parcel too few", "parcels.py", "k < n;", "k < n - 1;", NUMBERS),
-    Mutant("deliver: to one worker again and again", "parcels.py",
-           "take_in(size, first + wp.tid(), parcels)", "take_in(size, wp.tid(), parcels)", TWO),
+    Mutant("deliver: before all rays are through", "parcels.py",
+           "if meet(parcels.turn.meeting, n_workers):", "if n_workers > 1:", TWO),
+    Mutant("leave_none: contents of the last turn", "parcels.py",
+           "    parcels.n_contents[worker, 0] = 0\n", "", ROOM),
+    Mutant("leave_none: addresses of the last turn", "parcels.py",
+           "        parcels.n_addressed[worker, receiver] = 0\n", "        pass\n",
+           "test_kernel_parcels.py::test_rays_in_turns[none]"),
     # which rays are whose
-    Mutant("ray_of: as they come", "render.py", "return gradient.order[place]", "return place",
-           "test_kernel_parcels.py::test_workers_take_rays_in_the_order_that_they_are_given"),
+    Mutant("ray_at: as they come", "render.py", "return gradient.turn.rays[place]", "return place",
+           "test_kernel_parcels.py::test_nothing_is_sent_where_each_takes_its_own_rays"),
 ]  # fmt: skip

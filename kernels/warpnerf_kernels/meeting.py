@@ -1,0 +1,45 @@
+"""How the workers of a launch on the CPU wait for each other in the middle of it.
+
+They are threads that all run at the same time, and wait awake: to end a launch and begin another
+takes 100 to 150 us, most of it to wake a thread, and a step on a small grid lasts 4 ms. A worker
+that gave up before it came to a meeting calls the meeting off, so that nobody waits for ever.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+ARRIVED = 0
+"""Where a meeting counts how often somebody has come, beginning with 0 in each launch."""
+CALLED_OFF = 16
+"""Where it says that somebody will not come; on another cache line."""
+SIZE = 32
+
+
+@wp.func_native(
+    f"constexpr int ARRIVED = {ARRIVED}, CALLED_OFF = {CALLED_OFF};"
+    """
+constexpr int AWAKE = 10000;  // looks, some 0.1 to 0.4 ms, before others may have the core
+#if defined(__linux__)
+int sched_yield(void) __asm__("sched_yield");
+#endif
+auto read = [&](int at) -> int { return __atomic_load_n(meeting.data + at, __ATOMIC_ACQUIRE); };
+const int before = __atomic_fetch_add(meeting.data + ARRIVED, 1, __ATOMIC_ACQ_REL);
+const int all = (before / n_workers + 1) * n_workers;
+for (int looks = 0; read(ARRIVED) < all; ++looks) {
+    if (read(CALLED_OFF)) return false;
+#if defined(__x86_64__)
+    __builtin_ia32_pause();
+#elif defined(__aarch64__)
+    __asm__ volatile("isb");
+#endif
+#if defined(__linux__)
+    if (looks > AWAKE) sched_yield();
+#endif
+}
+return true;
+"""
+)
+def meet(meeting: wp.array(dtype=wp.int32), n_workers: int) -> bool:
+    """Wait until all workers have come as often as this one; false: somebody never will."""
+    ...
