@@ -127,7 +127,6 @@ class WarpAdjoint:
         launch = AdjointLaunch(
             kernel,
             variant,
-            self._grid.size,
             self._steps.most(self._grid.diagonal),
             batch.count,
             self._workers,
@@ -147,7 +146,7 @@ def share_memory(of: TrainingPass, to: TrainingPass) -> None:
     for name, value in vars(of).items():
         if isinstance(value, wp.array | Gradients):
             vars(to)[name] = value
-    to.launch.parcels = of.launch.parcels
+    to.launch.parcels = of.launch.parcels  # with where workers meet: both have the same ones
 
 
 def check(ours: WarpAdjoint, theirs: dict[Scaling, TorchPipeline]) -> None:

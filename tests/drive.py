@@ -227,8 +227,7 @@ class Kernels:
         """How to launch a kernel that ends in a gradient."""
         length = float(np.linalg.norm(p.box_max - p.box_min))
         most = p.steps.most(math.inf if p.contraction != "none" else length)
-        size = (p.raw.shape[0], p.raw.shape[1], p.raw.shape[2])
-        return AdjointLaunch(kernel, variant, size, most, p.n_rays, self.workers)
+        return AdjointLaunch(kernel, variant, most, p.n_rays, self.workers)
 
     def no_gradient(self, size: tuple[int, ...], flag: int = 0) -> Any:
         """A kernel's Gradient of a grid [X, Y, Z, ...], zero, all tiles flagged alike."""

@@ -11,7 +11,7 @@ import reference
 import torch
 import warp as wp
 from drive import Kernels, Problem, assert_close, unbounded, unit
-from test_kernel_parcels import most_steps, of, problem
+from test_kernel_parcels import leave_turns_unwritten, most_steps, of, problem
 from warpnerf_kernels import order
 from warpnerf_kernels.types import vec3
 
@@ -22,16 +22,8 @@ from warpnerf.render import Steps
 
 @pytest.fixture(autouse=True)
 def _(on_cpu: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """CUDA takes rays as they come. Memory begins with what no ray or cell has for a number."""
-    initialise = adjoint.AdjointLaunch.__init__
-
-    def unwritten(launch: adjoint.AdjointLaunch, *given: Any) -> None:
-        initialise(launch, *given)
-        if launch.parcels is not None:
-            for name in ("work", "cells", "by_cell", "owners", "rays", "rays_before", "bounds"):
-                getattr(launch.parcels.turn, name).fill_(-(1 << 28))
-
-    monkeypatch.setattr(adjoint.AdjointLaunch, "__init__", unwritten)
+    """CUDA takes rays as they come."""
+    leave_turns_unwritten(monkeypatch)
 
 
 def indices_of(cell: Any) -> np.ndarray:

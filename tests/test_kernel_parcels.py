@@ -34,6 +34,20 @@ def _(on_cpu: None, monkeypatch: pytest.MonkeyPatch) -> None:
         return made
 
     monkeypatch.setattr(adjoint, "_make_parcels", unwritten)
+    leave_turns_unwritten(monkeypatch)
+
+
+def leave_turns_unwritten(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their memory begins with what no ray or cell has for a number."""
+    make_turn = adjoint._make_turn
+
+    def of_nothing(n_rays: int, n_workers: int) -> order.Turn:
+        turn = make_turn(n_rays, n_workers)
+        for name in ("work", "cells", "by_cell", "owners", "rays", "rays_before", "bounds"):
+            getattr(turn, name).fill_(-(1 << 28))
+        return turn
+
+    monkeypatch.setattr(adjoint, "_make_turn", of_nothing)
 
 
 def problem(seed: int) -> Problem:
@@ -158,6 +172,41 @@ def test_rays_in_turns(contraction: str, monkeypatch: pytest.MonkeyPatch) -> Non
         assert np.array_equal(in_turns[0], at_once[0])
         assert_close(in_turns[1], at_once[1], 3e-6)
         assert_close(of(2).backward(p), of(1).backward(p), 3e-6)
+
+
+def test_fewer_workers_where_there_is_no_room_for_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two of three."""
+    p = problem(1)
+    monkeypatch.setattr(adjoint, "SAMPLES", 4 * (most_steps(p) + LANES + order.RAY))
+    launches = launches_of(monkeypatch)
+    assert_close(of(3).backward(p), of(1).backward(p), 3e-6)
+    made = launches[0].parcels
+    assert made is not None and made.contents.shape[0] == 2
+
+
+@pytest.mark.parametrize("threads", [2, 3])
+def test_nothing_is_taken_in_where_a_worker_is_missing(
+    threads: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each of them; the others leave, and the next batch is whole."""
+    p = problem(2)
+    whole = of(1).backward(p)
+    kernels = of(threads)
+    start = Packed.launch
+    for missing in range(threads):
+
+        def fails(packed: Packed, worker: int, *given: Any, missing: int = missing) -> None:
+            if worker == missing:
+                raise KeyboardInterrupt
+            start(packed, worker, *given)
+
+        gradient = kernels.no_gradient(p.raw.shape)
+        with monkeypatch.context() as patch:
+            patch.setattr(Packed, "launch", fails)
+            with pytest.raises(KeyboardInterrupt):
+                kernels.add_backward(p, gradient)
+        assert not gradient.values.numpy().any()
+        assert_close(kernels.backward(p), whole, 3e-6)
 
 
 def test_there_is_room_for_all_parcels(monkeypatch: pytest.MonkeyPatch) -> None:

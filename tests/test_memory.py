@@ -35,6 +35,33 @@ def test_a_container_counts(
     assert memory.usable_memory() == (expected or without)
 
 
+@pytest.mark.parametrize(
+    ("texts", "expected"),
+    [
+        (["200000 100000\n"], 2),
+        (["350000 100000\n"], 3),
+        (["50000 100000\n"], 1),
+        (["9900000 100000\n"], 8),
+        (["max 100000\n"], 8),
+        (["300000\n", "100000\n"], 3),
+        (["-1\n", "100000\n"], 8),
+        ([], 8),
+    ],
+)
+def test_a_container_s_share_of_the_cores_counts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, texts: list[str], expected: int
+) -> None:
+    files = tuple(tmp_path / str(i) for i in range(max(1, len(texts))))
+    for file, text in zip(files, texts, strict=False):
+        file.write_text(text)
+    monkeypatch.setattr(memory, "CORE_LIMITS", (files,))
+    monkeypatch.setattr(memory.os, "cpu_count", lambda: 8)
+    monkeypatch.setattr(
+        memory.os, "sched_getaffinity", lambda process: set(range(8)), raising=False
+    )
+    assert memory.usable_cores() == expected
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="no such limit there")
 def test_the_limit_of_the_process_counts() -> None:
     code = (

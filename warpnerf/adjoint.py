@@ -22,8 +22,7 @@ for 68 MB, and half a megabyte more for each worker, of which what is used takes
 might have more take turns, so parcels grow with neither rays nor samples."""
 
 ALONE = 1 << 24
-"""Steps, in whole packs, that one worker makes at a time: signals wait for that, a third of a
-second."""
+"""Steps, in whole packs, that one worker makes at a time: signals wait for that, up to a second."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -73,15 +72,14 @@ def gradient_struct(types: ModuleType, values: wp.array, touched: wp.array) -> A
 class AdjointLaunch:
     """One of render.py's kernels that end in a gradient, for batches of rays.
 
-    On the CPU packed kernels leave part of it in parcels, which are delivered after. Plain ones add
-    to it directly: atomically on CUDA, and on one thread of the CPU.
+    On the CPU packed kernels leave part of it in parcels, and deliver these once all rays are
+    through. Plain ones add to it directly: atomically on CUDA, and on one thread of the CPU.
     """
 
     def __init__(
         self,
         kernel: wp.Kernel,
         variant: render.Variant,
-        size: tuple[int, int, int],
         most_steps: int,
         n_rays: int,
         workers: Workers,
@@ -91,7 +89,6 @@ class AdjointLaunch:
         Args:
             kernel: From ``render_train_kernel`` or ``render_backward_kernel``.
             variant: The one it was made for.
-            size: Of the grid, X, Y, Z.
             most_steps: Of a ray; see ``Steps.most``.
             n_rays: In a batch, at most.
             workers: Where to work.

@@ -199,7 +199,7 @@ class TrainConfig:
     seed: int = 0
     """Same seed, same number of threads: same bits on the CPU."""
     threads: int | None = None
-    """CPU threads; None: one per core."""
+    """CPU threads; None: one per core that the process or its container may use."""
     device: str = "cpu"
     """Where to train: cpu, cuda, cuda:1, ..."""
     checkpoint_every: float = 300.0

@@ -12,6 +12,14 @@ CONTAINER_LIMITS = (
     Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"),
 )
 """Where Linux says how much a container may use: control groups of version 2, and of version 1."""
+CORE_LIMITS = (
+    (Path("/sys/fs/cgroup/cpu.max"),),
+    (
+        Path("/sys/fs/cgroup/cpu/cpu.cfs_quota_us"),
+        Path("/sys/fs/cgroup/cpu/cpu.cfs_period_us"),
+    ),
+)
+"""Likewise, how many microseconds of all cores together it may use in how many."""
 
 
 def usable_memory() -> int | None:
@@ -47,10 +55,19 @@ def _own() -> int | None:
 
 
 def usable_cores() -> int:
-    """Cores that this process may run on."""
+    """Cores that this process may run on, or as many whole ones as its container has time of."""
+    cores = os.cpu_count() or 1
     if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+        cores = len(os.sched_getaffinity(0))
+    return max(1, min([cores, *(share for share in map(_share, CORE_LIMITS) if share is not None)]))
+
+
+def _share(files: tuple[Path, ...]) -> int | None:
+    try:
+        quota, period = (int(word) for file in files for word in file.read_text().split())
+    except (OSError, ValueError):  # not there, or "max"
+        return None
+    return None if quota < 0 else quota // period
 
 
 def give_back() -> None:

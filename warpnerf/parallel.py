@@ -8,8 +8,10 @@ whatever else the machine is doing.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+import weakref
+from collections.abc import Callable
+from functools import partial
+from queue import SimpleQueue
 from typing import Any
 
 import warp as wp
@@ -55,6 +57,50 @@ class Packed:
         command.launch()
 
 
+class Thread:
+    """Does what it is given, one thing after the other, until it is given None.
+
+    Whoever waits for it may be interrupted at any point, and wait again. Futures of the standard
+    library can be left locked by that.
+    """
+
+    def __init__(self) -> None:
+        """Start it."""
+        self._error: BaseException | None = None
+        self._tasks: SimpleQueue[Any] = SimpleQueue()
+        self._news: SimpleQueue[object] = SimpleQueue()
+        threading.Thread(target=self._work, daemon=True).start()
+
+    def give(self, task: Callable[[], None] | None) -> None:
+        """Have something done."""
+        self._tasks.put(task)
+
+    def wait(self) -> BaseException | None:
+        """Until all that it was given is done; returns what some of it raised."""
+        question = object()
+        self._tasks.put(question)
+        while self._news.get() is not question:  # but one that somebody no longer waits for
+            pass
+        error, self._error = self._error, None
+        return error
+
+    def _work(self) -> None:
+        while (task := self._tasks.get()) is not None:
+            if not callable(task):
+                self._news.put(task)
+                continue
+            try:
+                task()
+            except BaseException as error:
+                self._error = error
+            del task  # and what it holds
+
+
+def _end(threads: list[Thread]) -> None:
+    for thread in threads:
+        thread.give(None)
+
+
 class Workers:
     """The threads that launch kernels on one device. A CUDA device needs, and gets, just one."""
 
@@ -82,7 +128,8 @@ class Workers:
                 "use --device cpu."
             ) from error
         self.count = 1 if self.device.is_cuda else (threads or usable_cores())
-        self._pool = ThreadPoolExecutor(max(1, self.count - 1))  # starts threads when they are used
+        self._others = [Thread() for _ in range(1, self.count)]
+        weakref.finalize(self, _end, self._others)
         self._launching = threading.Lock()
         self.meeting = wp.zeros(meeting.SIZE, dtype=wp.int32, device="cpu")
         """Where they wait for each other in a launch on the CPU; see warpnerf_kernels.meeting."""
@@ -106,12 +153,12 @@ class Workers:
             chunk: Items per launch: NODES, RAYS, or as many fewer as an item has nodes.
             packed: From launches before, and for those to come, on the CPU.
         """
-        self._launch(kernel, self._alike(n), lambda worker: arguments, chunk, packed)
+        self._launch(kernel, n, lambda worker: arguments, chunk, packed)
 
     def launch_owned(
         self,
         kernel: wp.Kernel,
-        items: int | Sequence[int],
+        n: int,
         *arguments: Any,
         packed: Packed | None = None,
     ) -> None:
@@ -121,13 +168,11 @@ class Workers:
 
         Args:
             kernel: As for ``launch``; it is also told the worker's number.
-            items: How many there are, shared out alike; or [workers + 1] where the first worker's
-                begin, the second's, ..., and where the last one's end.
+            n: Number of items.
             arguments: The rest of the kernel's arguments.
             packed: As for ``launch``.
         """
-        bounds = items if isinstance(items, Sequence) else self._alike(items)
-        self._launch(kernel, bounds, lambda worker: (worker, *arguments), RAYS, packed)
+        self._launch(kernel, n, lambda worker: (worker, *arguments), RAYS, packed)
 
     def load(self, kernel: wp.Kernel) -> None:
         """Compile a kernel, or fetch it from the cache, once: else every thread would."""
@@ -135,53 +180,53 @@ class Workers:
             kernel_cache.load(kernel, self.device)
             self._loaded.add(kernel)
 
-    def _alike(self, n: int) -> list[int]:
-        return [n * worker // self.count for worker in range(self.count + 1)]
-
     def _launch(
         self,
         kernel: wp.Kernel,
-        bounds: Sequence[int],
+        n: int,
         arguments: Callable[[int], tuple[Any, ...]],
         chunk: int,
         packed: Packed | None,
     ) -> None:
-        if bounds[0] == bounds[-1]:
+        if n == 0:
             return
         self.load(kernel)
         if self.device.is_cuda:
-            n = bounds[-1] - bounds[0]
-            wp.launch(kernel, n, inputs=[bounds[0], *arguments(0)], device=self.device)
+            wp.launch(kernel, n, inputs=[0, *arguments(0)], device=self.device)
             return
 
         def share(worker: int) -> None:
-            until = bounds[worker + 1]
+            begin, end = (n * w // self.count for w in (worker, worker + 1))
             try:
-                for first in range(bounds[worker], until, chunk):
-                    n, inputs = min(chunk, until - first), [first, *arguments(worker)]
+                for first in range(begin, end, chunk):
+                    if self._attendance[meeting.CALLED_OFF]:
+                        return
+                    size, inputs = min(chunk, end - first), [first, *arguments(worker)]
                     if packed is not None:
-                        packed.launch(worker, kernel, n, inputs, self.device)
+                        packed.launch(worker, kernel, size, inputs, self.device)
                     else:
-                        wp.launch(kernel, n, inputs=inputs, device=self.device)
+                        wp.launch(kernel, size, inputs=inputs, device=self.device)
             except BaseException:
-                self._call_off()
+                self._attendance[meeting.CALLED_OFF] = 1
                 raise
 
-        # Workers that meet in a launch must all be at it, so there is one at a time.
+        # Workers that meet must all be at the same launch, so there is one at a time, and it ends
+        # when none is left in it.
         with self._launching:
             self._attendance[:] = 0
-            others: list[Future[None]] = []
             try:
-                for worker in range(1, self.count):
-                    others.append(self._pool.submit(share, worker))
+                for worker, other in enumerate(self._others, 1):
+                    other.give(partial(share, worker))
                 share(0)
+                errors = self._wait()
             except BaseException:
-                self._call_off()
+                self._attendance[meeting.CALLED_OFF] = 1
+                self._wait()
                 raise
-            finally:
-                for other in others:
-                    other.result()
+        for error in errors:
+            raise error
 
-    def _call_off(self) -> None:
-        """Let nobody wait for a worker that does not come to a meeting."""
-        self._attendance[meeting.CALLED_OFF] = 1
+    def _wait(self) -> list[BaseException]:
+        """Until all others have left a launch; returns what they raised."""
+        errors = [other.wait() for other in self._others]
+        return [error for error in errors if error is not None]

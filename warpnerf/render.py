@@ -202,7 +202,6 @@ class TrainingPass:
         self.launch = AdjointLaunch(
             kernels.render_train_kernel(variant),
             variant,
-            grid.size,
             steps.most(math.inf if grid.contraction != "none" else grid.diagonal),
             n_rays,
             workers,

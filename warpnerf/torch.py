@@ -282,7 +282,6 @@ class _Render(torch.autograd.Function):
         launch = AdjointLaunch(
             kernels.render_backward_kernel(variant),
             variant,
-            size,
             call.steps.most(1.01 * diagonal),  # directions may be a little too short
             len(origins),
             workers,

@@ -282,12 +282,10 @@ class TrialKernels:
         return gradient_struct(self._types, values, self._zeros(n_tiles((x, y, z)), wp.uint8))
 
     def _adjoint(self, trial: Trial, kernel: wp.Kernel, variant: Any) -> AdjointLaunch:
-        x, y, z = trial.raw.shape[:3]
         length = float(np.linalg.norm(BOX_MAX - BOX_MIN))
         return AdjointLaunch(
             kernel,
             variant,
-            (x, y, z),
             trial.steps.most(math.inf if trial.contraction != "none" else length),
             trial.n_rays,
             self._workers,

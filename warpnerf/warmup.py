@@ -112,7 +112,7 @@ def _contractions() -> list[Contraction]:
 def _words(kernel: wp.Kernel, contraction: Contraction, scaling: Scaling | None = None) -> str:
     """A kernel's name, and what it is compiled for where it has a module to itself."""
     name = str(kernel.key).rpartition("__")[2].replace("_", " ")
-    if not name.startswith(("render", "measure")):
+    if not name.startswith("render"):
         return name
     space = "" if contraction == "none" else ", space folded in"
-    return name + space + (f", scaling {scaling}" if scaling and "render" in name else "")
+    return name + space + (f", scaling {scaling}" if scaling else "")

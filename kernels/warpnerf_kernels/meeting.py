@@ -19,25 +19,32 @@ SIZE = 32
 @wp.func_native(
     f"constexpr int ARRIVED = {ARRIVED}, CALLED_OFF = {CALLED_OFF};"
     """
+#if defined(__CUDA_ARCH__)
+return true;  // not for CUDA, which compiles it where it stands beside what is
+#else
 constexpr int AWAKE = 10000;  // looks, some 0.1 to 0.4 ms, before others may have the core
-#if defined(__linux__)
-int sched_yield(void) __asm__("sched_yield");
+#if !defined(_WIN32)
+int sched_yield(void) __asm__("sched_yield") __attribute__((weak));  // where it is to be had
 #endif
 auto read = [&](int at) -> int { return __atomic_load_n(meeting.data + at, __ATOMIC_ACQUIRE); };
+if (read(CALLED_OFF)) return false;  // and is not counted again
 const int before = __atomic_fetch_add(meeting.data + ARRIVED, 1, __ATOMIC_ACQ_REL);
 const int all = (before / n_workers + 1) * n_workers;
-for (int looks = 0; read(ARRIVED) < all; ++looks) {
+int looks = 0;
+while (read(ARRIVED) < all) {
     if (read(CALLED_OFF)) return false;
+    if (looks < AWAKE) ++looks;
+#if !defined(_WIN32)
+    else if (sched_yield) sched_yield();
+#endif
 #if defined(__x86_64__)
     __builtin_ia32_pause();
 #elif defined(__aarch64__)
     __asm__ volatile("isb");
 #endif
-#if defined(__linux__)
-    if (looks > AWAKE) sched_yield();
-#endif
 }
 return true;
+#endif
 """
 )
 def meet(meeting: wp.array(dtype=wp.int32), n_workers: int) -> bool:

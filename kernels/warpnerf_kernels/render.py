@@ -63,7 +63,7 @@ def take_rays(
     contraction: int,
     gradient: Gradient,
 ) -> wp.vec2i:
-    """A single one."""
+    """Its places, from the first to before the second: one."""
     return wp.vec2i(thread, thread + 1)
 
 
@@ -92,7 +92,7 @@ def take_rays(  # noqa: F811 (an overload)
     contraction: int,
     gradient: parcels.Parcels,
 ) -> wp.vec2i:
-    """Its share of the turn."""
+    """Its places: its share of the turn."""
     leave_none(worker, gradient)
     return order.take_share(worker, gradient.turn, grid, march, origins, directions, contraction)
 
@@ -165,7 +165,7 @@ def render_backward_kernel(variant: Variant) -> wp.Kernel:
 
     @wp.kernel(module="unique", enable_backward=False)
     def render_backward(
-        first: int,  # number of this launch's first thread: of a ray, or where packed of a worker
+        first: int,  # number of the first thread: a ray's, or where packed a worker's
         worker: int,  # row of kept; owner of a part of the gradient
         # scene
         grid: Grid,
@@ -243,7 +243,7 @@ def render_train_kernel(variant: Variant) -> wp.Kernel:
 
     @wp.kernel(module="unique", enable_backward=False)
     def render_train(
-        first: int,  # number of this launch's first thread: of a ray, or where packed of a worker
+        first: int,  # number of the first thread: a ray's, or where packed a worker's
         worker: int,  # row of kept; owner of a part of the gradient
         # scene
         grid: Grid,
