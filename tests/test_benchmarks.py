@@ -16,6 +16,7 @@ sys.path.insert(0, str(ROOT / "benchmarks"))
 
 import candidates  # noqa: E402
 import roofline  # noqa: E402
+import threads  # noqa: E402
 import throughput  # noqa: E402
 import workload  # noqa: E402
 from candidates.warpnerf_step import WarpStep  # noqa: E402
@@ -156,6 +157,26 @@ def test_training(tmp_path):
     assert abs(sum(row[part] for part in parts) - 1) < 1e-9
     assert all(row[part] > 0 for part in parts if part != "free space")  # not in so few steps
     assert row["steps"] == 30 and row["samples_per_ray"] > 1
+
+
+def test_threads(tmp_path):
+    options = ("--grids", "8", "12", "--rays", "64", "--steps", "16", "--rounds", "8")
+    record, printed = run("threads.py", tmp_path / "record.json", *options)
+    assert len(record["cases"]) == 5
+    for case in record["cases"]:
+        assert case["name"] in printed
+        assert case["all"]["rounds"] == 8
+        for figures in filter(None, (case["all"], case["undisturbed"])):
+            for key in ("one_ms", "several_ms", "times_as_fast"):
+                assert is_interval(figures[key])
+
+
+def test_a_round_counts_where_nobody_else_had_the_cores():
+    quiet = {1: (2.0, 1.0), 2: (1.1, 1.05)}
+    rounds = [quiet, {1: (2.0, 1.3), 2: (1.1, 1.0)}, {1: (2.0, 1.0), 2: (2.1, 1.9)}, quiet]
+    assert threads.undisturbed(rounds) == [quiet, quiet]
+    assert threads.summarise(rounds[:1], 2)["times_as_fast"]["median"] == 2.0 / 1.1
+    assert threads.undisturbed([{1: (2.0, 1.0), 2: (2.1, 1.9)}]) == []
 
 
 def test_footprint(tmp_path):
