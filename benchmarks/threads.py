@@ -27,7 +27,7 @@ from throughput import make_cases
 from warpnerf.parallel import Workers
 
 CHAINS = 1_200_000
-"""Rounds of multiply-adds of a control: some 4 ms, of which the launch is a fiftieth."""
+"""Rounds of multiply-adds of a control: some 4 ms, of which the launch is a few hundredths."""
 ALLOWED = 1.1
 """How much longer than undisturbed a control may take."""
 
@@ -54,7 +54,7 @@ def time_rounds(
 
 
 def undisturbed(rounds: Sequence[Round]) -> list[Round]:
-    """Those in which all threads had cores of their own."""
+    """Those whose controls found the cores free."""
     alone = float(np.quantile([timed[1][1] for timed in rounds], 0.05))
     return [r for r in rounds if all(control <= ALLOWED * alone for _, control in r.values())]
 

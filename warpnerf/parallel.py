@@ -131,6 +131,7 @@ class Workers:
         self._others = [Thread() for _ in range(1, self.count)]
         weakref.finalize(self, _end, self._others)
         self._launching = threading.Lock()
+        self._in_launch = False
         self.meeting = wp.zeros(meeting.SIZE, dtype=wp.int32, device="cpu")
         """Where they wait for each other in a launch on the CPU; see warpnerf_kernels.meeting."""
         self._attendance = self.meeting.numpy()
@@ -164,7 +165,7 @@ class Workers:
     ) -> None:
         """Run kernel(first, worker, *arguments) over items of much work each.
 
-        It writes to what a worker owns.
+        It writes to what a worker owns. A kernel whose workers meet has one item for each.
 
         Args:
             kernel: As for ``launch``; it is also told the worker's number.
@@ -213,20 +214,28 @@ class Workers:
         # Workers that meet must all be at the same launch, so there is one at a time, and it ends
         # when none is left in it.
         with self._launching:
+            if self._in_launch:  # where an interrupt was interrupted
+                self._call_off()
+            self._in_launch = True
             self._attendance[:] = 0
             try:
                 for worker, other in enumerate(self._others, 1):
                     other.give(partial(share, worker))
                 share(0)
-                errors = self._wait()
+                errors = [other.wait() for other in self._others]
             except BaseException:
-                self._attendance[meeting.CALLED_OFF] = 1
-                self._wait()
+                self._call_off()
                 raise
-        for error in errors:
-            raise error
+            self._in_launch = False
+        try:
+            for error in filter(None, errors):
+                raise error
+        finally:
+            del errors  # whose frames would hold this one, and all that it holds
 
-    def _wait(self) -> list[BaseException]:
-        """Until all others have left a launch; returns what they raised."""
-        errors = [other.wait() for other in self._others]
-        return [error for error in errors if error is not None]
+    def _call_off(self) -> None:
+        """Let nobody wait for a worker that does not come, and wait until all have left."""
+        self._attendance[meeting.CALLED_OFF] = 1
+        for other in self._others:
+            other.wait()
+        self._in_launch = False

@@ -1,7 +1,7 @@
 """How the workers of a launch on the CPU wait for each other in the middle of it.
 
 They are threads that all run at the same time, and wait awake: to end a launch and begin another
-takes 100 to 150 us, most of it to wake a thread, and a step on a small grid lasts 4 ms. A worker
+takes 100 to 150 us, most of it to wake a thread, and a step of a training may last 4 ms. A worker
 that gave up before it came to a meeting calls the meeting off, so that nobody waits for ever.
 """
 
