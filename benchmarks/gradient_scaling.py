@@ -20,7 +20,6 @@ memory makes no difference. Compile time is not in it.
 from __future__ import annotations
 
 import argparse
-import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -40,6 +39,7 @@ from workload import Workload, make_workload
 from warpnerf.adjoint import AdjointLaunch, Gradients
 from warpnerf.config import Scaling
 from warpnerf.grid import FreeCells
+from warpnerf.memory import usable_cores
 from warpnerf.parallel import Workers
 from warpnerf.render import JACOBIANS, SCALINGS, TrainingPass, render_rays, scratch
 
@@ -255,7 +255,7 @@ def main() -> None:
     parser.add_argument("--grid", type=int, default=64, help="nodes along each axis")
     parser.add_argument("--pairs", type=int, default=200)
     parser.add_argument("--repeats", type=int, default=2, help="of each side in a pair")
-    parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--threads", type=int, default=usable_cores())
     parser.add_argument("--launch", nargs=2, metavar=("SCALING", "N"), help=argparse.SUPPRESS)
     args = parser.parse_args()
     on_cuda = args.device.startswith("cuda")

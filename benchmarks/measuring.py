@@ -18,6 +18,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warpnerf.memory import usable_cores
+
 RESULTS = Path(__file__).parent / "results"
 
 Interval = dict[str, float]
@@ -99,7 +101,7 @@ def machine(device: str, threads: int) -> dict[str, Any]:
 
 def default_threads() -> list[int]:
     """One, and two where there are two cores."""
-    return sorted({1, min(2, os.cpu_count() or 1)})
+    return sorted({1, min(2, usable_cores())})
 
 
 def _version(package: str) -> str | None:

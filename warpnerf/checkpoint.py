@@ -84,7 +84,7 @@ def load_field(path: str | Path, device: str = "cpu", threads: int | None = None
     Args:
         path: Of the file.
         device: Where the field shall live.
-        threads: CPU threads; None: one per core.
+        threads: CPU threads; None: one per usable core.
 
     Raises:
         InputError: The file is missing, damaged, or of another kind; or the device is missing.

@@ -76,7 +76,7 @@ def train_command(
         near: Nothing is sampled nearer to the camera than this, in the scene's units.
         downscale: Average blocks of so many pixels squared; by default 1, as they are.
         device: cpu, cuda, cuda:1, ...
-        threads: CPU threads; by default one per core, or as many as the run to be resumed had.
+        threads: CPU threads; by default one per usable core, or as the resumed run had.
         seed: Same seed and threads: same result on the CPU.
         checkpoint_every: Seconds between two checkpoints to resume from; by default 300.
         overwrite: Replace the run that the output folder holds.
@@ -139,7 +139,7 @@ def eval_command(
         lpips: Weights of LPIPS, to measure it as well; see warpnerf/lpips.py for the file.
         json: Also write the figures to this file.
         device: cpu, cuda, cuda:1, ...
-        threads: CPU threads; by default one per core.
+        threads: CPU threads; by default one per usable core.
     """
     from warpnerf.data import load_scene
     from warpnerf.evaluation import evaluate, require_measurable

@@ -97,7 +97,7 @@ def demo(
         steps: Of each training.
         downscale: Of the photographs.
         device: Where to train.
-        threads: CPU threads; None: one per core.
+        threads: CPU threads; None: one per usable core.
         report: Told how far it is.
 
     Raises:

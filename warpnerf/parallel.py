@@ -128,10 +128,11 @@ class Workers:
                 "use --device cpu."
             ) from error
         self.count = 1 if self.device.is_cuda else (threads or usable_cores())
-        self._others = [Thread() for _ in range(1, self.count)]
+        self._others: list[Thread] = []
         weakref.finalize(self, _end, self._others)
+        self._others.extend(Thread() for _ in range(1, self.count))
         self._launching = threading.Lock()
-        self._in_launch = False
+        self._in_launch = False  # whether somebody may be in one
         self.meeting = wp.zeros(meeting.SIZE, dtype=wp.int32, device="cpu")
         """Where they wait for each other in a launch on the CPU; see warpnerf_kernels.meeting."""
         self._attendance = self.meeting.numpy()
@@ -228,10 +229,10 @@ class Workers:
                 raise
             self._in_launch = False
         try:
-            for error in filter(None, errors):
-                raise error
+            if any(errors):
+                raise next(filter(None, errors))
         finally:
-            del errors  # whose frames would hold this one, and all that it holds
+            del errors  # else what is raised holds this frame, and this frame what is raised
 
     def _call_off(self) -> None:
         """Let nobody wait for a worker that does not come, and wait until all have left."""

@@ -75,7 +75,7 @@ def verify(
 
     Args:
         device: Where: cpu, cuda, cuda:1, ...
-        threads: CPU threads; None: one per core.
+        threads: CPU threads; None: one per usable core.
         on_check: Called with each check's name before it runs.
         on_result: Called with each result.
 

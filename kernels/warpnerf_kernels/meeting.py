@@ -23,7 +23,7 @@ SIZE = 32
 return true;  // not for CUDA, which compiles it where it stands beside what is
 #else
 constexpr int AWAKE = 10000;  // looks, some 0.1 to 0.4 ms, before others may have the core
-#if !defined(_WIN32)
+#if defined(__linux__)
 int sched_yield(void) __asm__("sched_yield") __attribute__((weak));  // where it is to be had
 #endif
 auto read = [&](int at) -> int { return __atomic_load_n(meeting.data + at, __ATOMIC_ACQUIRE); };
@@ -34,7 +34,7 @@ int looks = 0;
 while (read(ARRIVED) < all) {
     if (read(CALLED_OFF)) return false;
     if (looks < AWAKE) ++looks;
-#if !defined(_WIN32)
+#if defined(__linux__)
     else if (sched_yield) sched_yield();
 #endif
 #if defined(__x86_64__)

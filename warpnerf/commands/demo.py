@@ -21,7 +21,7 @@ def demo_command(
         steps: Of each training.
         downscale: Of the room's photographs.
         device: cpu, cuda, cuda:1, ...
-        threads: CPU threads; by default one per core.
+        threads: CPU threads; by default one per usable core.
     """
     from warpnerf.demonstration import FPS, demo
     from warpnerf.video import video_file

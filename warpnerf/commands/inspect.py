@@ -30,7 +30,7 @@ def inspect_command(
         downscale: As training will be given.
         content_distance: As training will be given; by default the estimate.
         near: As training will be given.
-        threads: CPU threads that training would have; by default one per core.
+        threads: CPU threads that training would have; by default one per usable core.
     """
     from warpnerf.inspection import inspect
 

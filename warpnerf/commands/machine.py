@@ -20,7 +20,7 @@ def check_command(device: str = "cpu", threads: int | None = None, json: Path | 
 
     Args:
         device: cpu, cuda, cuda:1, ...
-        threads: CPU threads; by default one per core.
+        threads: CPU threads; by default one per usable core.
         json: Also write the results to this file.
     """
     require_writable(json)

@@ -51,7 +51,7 @@ def render_command(
         depths: What gets the first and the last colour, scene units; by default what is seen.
         scene: Where the run's photographs are now, if they have moved.
         device: cpu, cuda, cuda:1, ...
-        threads: CPU threads; by default one per core.
+        threads: CPU threads; by default one per usable core.
     """
     from warpnerf.data import load_scene
     from warpnerf.filming import checked_depths, depth_range, render_stills, render_video

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from warpnerf.checks import InputError
 from warpnerf.data.files import find_image
 from warpnerf.data.images import read_image
 from warpnerf.data.lens import Lens
-from warpnerf.memory import usable_memory
+from warpnerf.memory import usable_cores, usable_memory
 from warpnerf.scene import Scene, View, estimate_extent
 
 COPIED_BYTES = 8
@@ -114,7 +113,7 @@ def assemble(
     first = _read_view(frames[0], downscale)
     _require_memory(file, first, len(frames), downscale)
     # Decoders release the interpreter lock. The first error cancels what is not yet read.
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(usable_cores()) as pool:
         views = [first, *pool.map(lambda frame: _read_view(frame, downscale), frames[1:])]
 
     index = {view.name: i for i, view in enumerate(views)}
