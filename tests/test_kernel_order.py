@@ -105,9 +105,10 @@ def turns_of(launch: Callable[[], Any], monkeypatch: pytest.MonkeyPatch) -> list
         if "backward" not in kernel.key:
             return
         turn = arguments[-1].turn
-        bounds, rays = turn.bounds.numpy().tolist(), turn.rays.numpy().copy()
-        assert bounds[0] == turn.begin < bounds[-1] <= turn.end
-        shares = [rays[i:j] for i, j in itertools.pairwise(bounds)]
+        rays, following = turn.rays.numpy(), int(turn.next.numpy()[0])
+        assert turn.begin < following <= turn.end
+        shares = [row[: int((row >= 0).sum())].copy() for row in rays]
+        rays.fill(-1)
         turns.append((shares, turn.cells.numpy().copy()))
 
     monkeypatch.setattr(Workers, "launch_owned", spy)
@@ -153,8 +154,9 @@ def test_cells_are_numbered_along_a_curve() -> None:
 
 
 @wp.kernel(enable_backward=False)
-def share_out(turn: order.Turn):
-    order.share_out(turn)
+def pick_out(turn: order.Turn, out_n: wp.array(dtype=wp.int32)):
+    worker = wp.tid()
+    out_n[worker] = order.pick_out(worker, turn)
 
 
 @pytest.mark.parametrize("n_workers", [1, 2, 3, 7])
@@ -168,15 +170,15 @@ def test_rays_are_shared_out_by_slab_and_work(largest: int, n_workers: int) -> N
     cell = rng.integers(0, order.CELLS, n)
     cell[::2] = rng.choice([0, 5, order.CELLS - 1], n // 2)
     slab = indices_of(cell)[:, 0]
-    bounds, rays = np.zeros(n_workers + 1, np.int32), np.full(n, -1, np.int32)
+    following, rays = np.zeros(1, np.int32), np.full((n_workers, n), -1, np.int32)
+    counts = wp.zeros(n_workers, dtype=wp.int32, device="cpu")
     arrays = {
         "work": work.astype(np.int32),
         "cells": cell.astype(np.int32),
-        "work_before": np.full(order.ACROSS, 99, np.int64),
-        "rays_before": np.full(order.CELLS, 99, np.int32),
-        "by_cell": np.zeros(n, np.int32),
-        "owners": np.zeros(n, np.int32),
-        "bounds": bounds,
+        "next": following,
+        "work_before": np.full((n_workers, order.ACROSS), 99, np.int64),
+        "rays_before": np.full((n_workers, order.CELLS), 99, np.int32),
+        "drawn": np.zeros((n_workers, n), np.int32),
         "rays": rays,
     }
     turn = order.Turn()
@@ -187,16 +189,17 @@ def test_rays_are_shared_out_by_slab_and_work(largest: int, n_workers: int) -> N
         until = np.cumsum(work[begin:])
         end = begin + max(1, int((until <= most_work).sum()))
         turn.begin = begin
-        wp.launch(share_out, 1, inputs=[turn], device="cpu")
-        by_cell = begin + np.argsort(cell[begin:end], kind="stable")
-        by_slab = by_cell[np.argsort(slab[by_cell], kind="stable")]
+        rays.fill(-1)
+        wp.launch(pick_out, n_workers, inputs=[turn, counts], device="cpu")
+        by_slab = begin + np.argsort(slab[begin:end], kind="stable")
         until = np.cumsum(work[by_slab]) - work[by_slab]
-        owner = np.zeros(n, int)
+        owner = np.full(n, -1)
         owner[by_slab] = until * n_workers // work[by_slab].sum()
-        assert (bounds[0], bounds[-1]) == (begin, end)
-        for worker, (first, last) in enumerate(itertools.pairwise(bounds)):
-            assert np.array_equal(rays[first:last], by_cell[owner[by_cell] == worker])
-        assert (rays[end:] == -1).all()
+        assert following == end
+        for worker, (row, count) in enumerate(zip(rays, counts.numpy(), strict=True)):
+            own = np.flatnonzero(owner == worker)
+            assert np.array_equal(row[:count], own[np.argsort(cell[own], kind="stable")])
+            assert (row[count:] == -1).all()
         begin = end
 
 

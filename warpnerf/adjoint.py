@@ -133,20 +133,20 @@ class AdjointLaunch:
             self._workers.launch_owned(
                 self._kernel, self._workers.count, *arguments, self.parcels, packed=self._packed
             )
-            turn.begin = int(turn.bounds.numpy()[-1])
+            turn.begin = int(turn.next.numpy()[0])
 
 
 def _make_turn(n_rays: int, n_workers: int) -> order.Turn:
     """With room for batches of so many rays."""
 
-    def room(n: int, dtype: Any = wp.int32) -> wp.array:
-        return wp.empty(n, dtype=dtype, device="cpu")
+    def room(*shape: int, dtype: Any = wp.int32) -> wp.array:
+        return wp.empty(shape, dtype=dtype, device="cpu")  # no memory until it is used
 
     turn = order.Turn()
-    turn.work, turn.cells, turn.by_cell, turn.owners, turn.rays = (room(n_rays) for _ in range(5))
-    turn.work_before = room(order.ACROSS, wp.int64)
-    turn.rays_before = room(order.CELLS)
-    turn.bounds = room(n_workers + 1)
+    turn.work, turn.cells, turn.next = room(n_rays), room(n_rays), room(1)
+    turn.work_before = room(n_workers, order.ACROSS, dtype=wp.int64)
+    turn.rays_before = room(n_workers, order.CELLS)
+    turn.drawn, turn.rays = room(n_workers, n_rays), room(n_workers, n_rays)
     return turn
 
 

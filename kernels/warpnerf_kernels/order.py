@@ -38,12 +38,12 @@ class Turn:
     most_work: wp.int64  # that there is room for
     work: wp.array(dtype=wp.int32)  # [n_rays] steps in the grid in whole packs, and RAY
     cells: wp.array(dtype=wp.int32)  # [n_rays] of the middle step, by cell_at
-    work_before: wp.array(dtype=wp.int64)  # [ACROSS] scratch
-    rays_before: wp.array(dtype=wp.int32)  # [CELLS] scratch
-    by_cell: wp.array(dtype=wp.int32)  # [n_rays] scratch
-    owners: wp.array(dtype=wp.int32)  # [n_rays] scratch
-    bounds: wp.array(dtype=wp.int32)  # [n_workers + 1] where in rays each worker's begin
-    rays: wp.array(dtype=wp.int32)  # [n_rays] all of the first worker's, of the second's, ...
+    next: wp.array(dtype=wp.int32)  # [1] ray that the next turn begins with
+    # In a row for each worker:
+    work_before: wp.array2d(dtype=wp.int64)  # [n_workers, ACROSS] scratch
+    rays_before: wp.array2d(dtype=wp.int32)  # [n_workers, CELLS] scratch
+    drawn: wp.array2d(dtype=wp.int32)  # [n_workers, n_rays] scratch: its rays as they come
+    rays: wp.array2d(dtype=wp.int32)  # [n_workers, n_rays] its rays by cell
     meeting: wp.array(dtype=wp.int32)  # of the workers
 
 
@@ -93,59 +93,56 @@ def measure_ray(
 
 
 @wp.func
-def share_out(turn: Turn):
-    """Give the workers the next rays by slab, each as much work, and each in the order of cells.
+def pick_out(worker: int, turn: Turn) -> int:
+    """Put a worker's rays of the turn into its row, in the order of cells; how many they are.
 
-    These are as many as there is room for, but one at least. Rays of a cell keep their order.
-    Written: the turn's bounds and rays, and its scratch.
+    The turn's are the next ones, as many as there is room for, but one at least. One slab after the
+    other, they are divided into as much work for each worker. Rays of a slab, and a worker's rays
+    of a cell, keep their order. Each worker does this for itself, so that none waits for another.
     """
-    n_workers = turn.bounds.shape[0] - 1
+    n_workers = turn.rays.shape[0]
     for slab in range(wp.static(ACROSS)):
-        turn.work_before[slab] = wp.int64(0)
-    for cell in range(wp.static(CELLS)):
-        turn.rays_before[cell] = 0
+        turn.work_before[worker, slab] = wp.int64(0)
     total = wp.int64(0)
     last = int(turn.begin)
     while last < turn.end and (
         last == turn.begin or total + wp.int64(turn.work[last]) <= turn.most_work
     ):
         total += wp.int64(turn.work[last])
-        turn.work_before[slab_of(turn.cells[last])] += wp.int64(turn.work[last])
-        turn.rays_before[turn.cells[last]] += 1
+        turn.work_before[worker, slab_of(turn.cells[last])] += wp.int64(turn.work[last])
         last += 1
+    if worker == 0:
+        turn.next[0] = last
     before = wp.int64(0)
     for slab in range(wp.static(ACROSS)):  # from the work in a slab to that in lower ones
-        here = turn.work_before[slab]
-        turn.work_before[slab] = before
+        here = turn.work_before[worker, slab]
+        turn.work_before[worker, slab] = before
         before += here
-    at = int(turn.begin)
-    for cell in range(wp.static(CELLS)):  # from the rays of a cell to where they begin
-        n = turn.rays_before[cell]
-        turn.rays_before[cell] = at
-        at += n
+    for cell in range(wp.static(CELLS)):
+        turn.rays_before[worker, cell] = 0
+    n_drawn = int(0)
     for i in range(turn.begin, last):
-        at = turn.rays_before[turn.cells[i]]
-        turn.rays_before[turn.cells[i]] = at + 1
-        turn.by_cell[at] = i
-    turn.bounds[0] = turn.begin
-    for w in range(n_workers):
-        turn.bounds[w + 1] = 0
-    for place in range(turn.begin, last):
-        i = turn.by_cell[place]
-        slab = slab_of(turn.cells[i])
-        before = turn.work_before[slab]
-        turn.work_before[slab] = before + wp.int64(turn.work[i])
-        turn.owners[place] = int(before * wp.int64(n_workers) // total)
-        turn.bounds[turn.owners[place] + 1] += 1  # counts a worker's rays
-    at = int(turn.begin)
-    for w in range(n_workers):
-        n = turn.bounds[w + 1]
-        turn.bounds[w + 1] = at  # where its next ray goes
-        at += n
-    for place in range(turn.begin, last):
-        at = turn.bounds[turn.owners[place] + 1]
-        turn.bounds[turn.owners[place] + 1] = at + 1
-        turn.rays[at] = turn.by_cell[place]
+        cell = turn.cells[i]
+        slab = slab_of(cell)
+        before = turn.work_before[worker, slab]
+        turn.work_before[worker, slab] = before + wp.int64(turn.work[i])
+        # A ray is that of worker n_workers * before // total.
+        beyond = wp.int64(n_workers) * before - wp.int64(worker) * total
+        if beyond >= wp.int64(0) and beyond < total:
+            turn.drawn[worker, n_drawn] = i
+            n_drawn += 1
+            turn.rays_before[worker, cell] += 1
+    place = int(0)
+    for cell in range(wp.static(CELLS)):  # from the rays of a cell to where they begin
+        n = turn.rays_before[worker, cell]
+        turn.rays_before[worker, cell] = place
+        place += n
+    for k in range(n_drawn):
+        i = turn.drawn[worker, k]
+        place = turn.rays_before[worker, turn.cells[i]]
+        turn.rays_before[worker, turn.cells[i]] = place + 1
+        turn.rays[worker, place] = i
+    return n_drawn
 
 
 @wp.func
@@ -157,21 +154,17 @@ def take_share(
     origins: wp.array(dtype=vec3),  # [n_rays] scene units
     directions: wp.array(dtype=vec3),  # [n_rays] unit vectors
     contraction: int,
-) -> wp.vec2i:
-    """Which of the turn's rays are a worker's: from the first of two places to before the second.
+) -> int:
+    """pick_out, once all rays are measured; none where a worker never came.
 
-    All workers call it at the same time. None are its where one of them never came.
+    All workers call it at the same time.
     """
-    n_workers = turn.bounds.shape[0] - 1
+    n_workers = turn.rays.shape[0]
     if turn.begin == 0:
         n = wp.int64(turn.end)
         until = int(n * wp.int64(worker + 1) // wp.int64(n_workers))
         for i in range(int(n * wp.int64(worker) // wp.int64(n_workers)), until):
             measure_ray(i, grid, march, origins, directions, contraction, turn)
     if not meet(turn.meeting, n_workers):
-        return wp.vec2i(0, 0)
-    if worker == 0:
-        share_out(turn)
-    if not meet(turn.meeting, n_workers):
-        return wp.vec2i(0, 0)
-    return wp.vec2i(turn.bounds[worker], turn.bounds[worker + 1])
+        return 0
+    return pick_out(worker, turn)

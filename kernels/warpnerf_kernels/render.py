@@ -68,7 +68,7 @@ def take_rays(
 
 
 @wp.func
-def ray_at(place: int, gradient: Gradient) -> int:
+def ray_at(place: int, worker: int, gradient: Gradient) -> int:
     """They come as they are."""
     return place
 
@@ -94,13 +94,14 @@ def take_rays(  # noqa: F811 (an overload)
 ) -> wp.vec2i:
     """Its places: its share of the turn."""
     leave_none(worker, gradient)
-    return order.take_share(worker, gradient.turn, grid, march, origins, directions, contraction)
+    n = order.take_share(worker, gradient.turn, grid, march, origins, directions, contraction)
+    return wp.vec2i(0, n)
 
 
 @wp.func
-def ray_at(place: int, gradient: parcels.Parcels) -> int:  # noqa: F811 (an overload)
-    """Each worker's lie side by side."""
-    return gradient.turn.rays[place]
+def ray_at(place: int, worker: int, gradient: parcels.Parcels) -> int:  # noqa: F811 (an overload)
+    """Each worker has a row of them."""
+    return gradient.turn.rays[worker, place]
 
 
 @wp.func
@@ -196,7 +197,7 @@ def render_backward_kernel(variant: Variant) -> wp.Kernel:
             first + wp.tid(), worker, grid, march, origins, directions, contraction, out_gradient
         )
         for place in range(places[0], places[1]):
-            i = ray_at(place, out_gradient)
+            i = ray_at(place, worker, out_gradient)
             ray = prepare_ray(
                 grid, march, origins[i], directions[i], ray_value(offsets, i), contraction
             )
@@ -269,7 +270,7 @@ def render_train_kernel(variant: Variant) -> wp.Kernel:
             first + wp.tid(), worker, grid, march, origins, directions, contraction, out_gradient
         )
         for place in range(places[0], places[1]):
-            i = ray_at(place, out_gradient)
+            i = ray_at(place, worker, out_gradient)
             row = worker * capacity
             behind_all = ray_value(background, i)
             ray = prepare_ray(

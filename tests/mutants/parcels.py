@@ -147,6 +147,7 @@ MUTANTS = [
            "        parcels.n_addressed[worker, receiver] = 0\n", "        pass\n",
            "test_kernel_parcels.py::test_rays_in_turns[none]"),
     # which rays are whose
-    Mutant("ray_at: as they come", "render.py", "return gradient.turn.rays[place]", "return place",
+    Mutant("ray_at: as they come", "render.py",
+           "return gradient.turn.rays[worker, place]", "return place",
            "test_kernel_parcels.py::test_nothing_is_sent_where_each_takes_its_own_rays"),
 ]  # fmt: skip
