@@ -154,9 +154,8 @@ def test_cells_are_numbered_along_a_curve() -> None:
 
 
 @wp.kernel(enable_backward=False)
-def pick_out(turn: order.Turn, out_n: wp.array(dtype=wp.int32)):
-    worker = wp.tid()
-    out_n[worker] = order.pick_out(worker, turn)
+def pick_out(worker: int, turn: order.Turn, out_n: wp.array(dtype=wp.int32)):
+    out_n[0] = order.pick_out(worker, turn)
 
 
 @pytest.mark.parametrize("n_workers", [1, 2, 3, 7])
@@ -171,7 +170,7 @@ def test_rays_are_shared_out_by_slab_and_work(largest: int, n_workers: int) -> N
     cell[::2] = rng.choice([0, 5, order.CELLS - 1], n // 2)
     slab = indices_of(cell)[:, 0]
     following, rays = np.zeros(1, np.int32), np.full((n_workers, n), -1, np.int32)
-    counts = wp.zeros(n_workers, dtype=wp.int32, device="cpu")
+    count = wp.zeros(1, dtype=wp.int32, device="cpu")
     arrays = {
         "work": work.astype(np.int32),
         "cells": cell.astype(np.int32),
@@ -190,16 +189,20 @@ def test_rays_are_shared_out_by_slab_and_work(largest: int, n_workers: int) -> N
         end = begin + max(1, int((until <= most_work).sum()))
         turn.begin = begin
         rays.fill(-1)
-        wp.launch(pick_out, n_workers, inputs=[turn, counts], device="cpu")
         by_slab = begin + np.argsort(slab[begin:end], kind="stable")
         until = np.cumsum(work[by_slab]) - work[by_slab]
         owner = np.full(n, -1)
         owner[by_slab] = until * n_workers // work[by_slab].sum()
+        rows = [arrays[name] for name in ("work_before", "rays_before", "drawn", "rays")]
+        for worker in reversed(range(n_workers)):
+            others = [np.delete(array, worker, axis=0) for array in rows]
+            wp.launch(pick_out, 1, inputs=[worker, turn, count], device="cpu")
+            for array, before in zip(rows, others, strict=True):
+                assert np.array_equal(np.delete(array, worker, axis=0), before)
+            own, n_own = np.flatnonzero(owner == worker), int(count.numpy()[0])
+            assert np.array_equal(rays[worker, :n_own], own[np.argsort(cell[own], kind="stable")])
+            assert (rays[worker, n_own:] == -1).all()
         assert following == end
-        for worker, (row, count) in enumerate(zip(rays, counts.numpy(), strict=True)):
-            own = np.flatnonzero(owner == worker)
-            assert np.array_equal(row[:count], own[np.argsort(cell[own], kind="stable")])
-            assert (row[count:] == -1).all()
         begin = end
 
 

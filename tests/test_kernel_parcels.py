@@ -43,7 +43,7 @@ def leave_turns_unwritten(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def of_nothing(n_rays: int, n_workers: int) -> order.Turn:
         turn = make_turn(n_rays, n_workers)
-        for name in ("work", "cells", "next", "rays_before", "drawn", "rays"):
+        for name in ("work", "cells", "next", "work_before", "rays_before", "drawn", "rays"):
             getattr(turn, name).fill_(-(1 << 28))
         return turn
 

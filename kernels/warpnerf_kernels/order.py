@@ -97,8 +97,9 @@ def pick_out(worker: int, turn: Turn) -> int:
     """Put a worker's rays of the turn into its row, in the order of cells; how many they are.
 
     The turn's are the next ones, as many as there is room for, but one at least. One slab after the
-    other, they are divided into as much work for each worker. Rays of a slab, and a worker's rays
-    of a cell, keep their order. Each worker does this for itself, so that none waits for another.
+    other, they are divided so that each worker has as much work, which is not 0 for any ray. Rays
+    of a slab, and a worker's rays of a cell, keep their order. Each worker does this for itself, so
+    that none waits for another. Written: its rows, and by worker 0 where the next turn begins.
     """
     n_workers = turn.rays.shape[0]
     for slab in range(wp.static(ACROSS)):
@@ -155,9 +156,9 @@ def take_share(
     directions: wp.array(dtype=vec3),  # [n_rays] unit vectors
     contraction: int,
 ) -> int:
-    """pick_out, once all rays are measured; none where a worker never came.
+    """pick_out, once all rays are measured; 0 where a worker never came.
 
-    All workers call it at the same time.
+    All workers call it at the same time. A batch's rays are measured in its first turn.
     """
     n_workers = turn.rays.shape[0]
     if turn.begin == 0:
@@ -165,6 +166,6 @@ def take_share(
         until = int(n * wp.int64(worker + 1) // wp.int64(n_workers))
         for i in range(int(n * wp.int64(worker) // wp.int64(n_workers)), until):
             measure_ray(i, grid, march, origins, directions, contraction, turn)
-    if not meet(turn.meeting, n_workers):
-        return 0
+        if not meet(turn.meeting, n_workers):
+            return 0
     return pick_out(worker, turn)
