@@ -136,30 +136,26 @@ class AdjointLaunch:
             turn.begin = int(turn.next.numpy()[0])
 
 
+def _room(*shape: int, dtype: Any = wp.int32) -> wp.array:
+    return wp.empty(shape, dtype=dtype, device="cpu")  # no memory until it is used
+
+
 def _make_turn(n_rays: int, n_workers: int) -> order.Turn:
     """With room for batches of so many rays."""
-
-    def room(*shape: int, dtype: Any = wp.int32) -> wp.array:
-        return wp.empty(shape, dtype=dtype, device="cpu")  # no memory until it is used
-
     turn = order.Turn()
-    turn.work, turn.cells, turn.next = room(n_rays), room(n_rays), room(1)
-    turn.work_before = room(n_workers, order.ACROSS, dtype=wp.int64)
-    turn.rays_before = room(n_workers, order.CELLS)
-    turn.drawn, turn.rays = room(n_workers, n_rays), room(n_workers, n_rays)
+    turn.work, turn.cells, turn.next = _room(n_rays), _room(n_rays), _room(1)
+    turn.work_before = _room(n_workers, order.ACROSS, dtype=wp.int64)
+    turn.rays_before = _room(n_workers, order.CELLS)
+    turn.drawn, turn.rays = _room(n_workers, n_rays), _room(n_workers, n_rays)
     return turn
 
 
 def _make_parcels(n_packs: int, n_workers: int) -> parcels.Parcels:
     """No parcels, with room for those of so many packs of each worker."""
     row = -(-n_workers // 16) * 16  # whole cache lines
-
-    def room(*shape: int, dtype: Any = wp.int32) -> wp.array:
-        return wp.empty(shape, dtype=dtype, device="cpu")  # no memory until it is used
-
     made = parcels.Parcels()
-    made.contents = room(n_workers, n_packs, dtype=parcels.Parcel)
-    made.n_contents = room(n_workers, row)
-    made.addressed = room(n_workers, n_workers, n_packs)
-    made.n_addressed = room(n_workers, row)
+    made.contents = _room(n_workers, n_packs, dtype=parcels.Parcel)
+    made.n_contents = _room(n_workers, row)
+    made.addressed = _room(n_workers, n_workers, n_packs)
+    made.n_addressed = _room(n_workers, row)
     return made
