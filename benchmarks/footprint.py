@@ -23,31 +23,31 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from measuring import machine, median_interval, options, show, write_record
+from measuring import add_model, machine, median_interval, options, show, write_record
 from training import path_of
 
 import warpnerf as wn
-from warpnerf import cli
-from warpnerf.parallel import Workers
-from warpnerf.training import Trainer
+from warpnerf.cli import main as cli
+from warpnerf.runtime.parallel import Workers
+from warpnerf.training.trainer import Trainer
 
 STATUS = Path("/proc/self/status")
-BYTES_A_NODE = 4 * 4 * 4
-"""Of four arrays of four channels in float32."""
 
 
 def main() -> None:
     parser = options(__doc__)
-    parser.add_argument("scene", nargs="?", default="builtin:room", help="builtin:room, a folder")
+    known = "builtin:room, builtin:room-sparse, a folder"
+    parser.add_argument("scene", nargs="?", default="builtin:room", help=known)
     parser.add_argument("--time-limit", type=float, default=36.0, help="seconds of training")
     parser.add_argument("--steps", type=int, default=100_000, help="at most so many steps")
     parser.add_argument("--downscale", type=int, default=1)
+    add_model(parser)
     parser.add_argument("--starts", type=int, default=5, help="with kernels in the cache")
     arguments = parser.parse_args()
     if arguments.device != "cpu":
         parser.error("it looks at the CPU's memory only")
     scene = path_of(arguments.scene)
-    train = ["train", scene, "--downscale", str(arguments.downscale)]
+    train = ["train", scene, "--downscale", str(arguments.downscale), "--model", arguments.model]
     with tempfile.TemporaryDirectory() as folder:
         cold = seconds_to_first_step([*train, "--output", f"{folder}/cold"], f"{folder}/cache")
         print(f"to the first step, kernels compiled:  {cold:.1f} s", flush=True)
@@ -58,7 +58,8 @@ def main() -> None:
         print(f"to the first step, kernels in cache:  {show(cached, 2)} s", flush=True)
     memory = json.loads(
         run_here(
-            f"train({scene!r}, {arguments.downscale}, {arguments.steps}, {arguments.time_limit})"
+            f"train({scene!r}, {arguments.model!r}, {arguments.downscale}, {arguments.steps}, "
+            f"{arguments.time_limit})"
         )
     )
     if memory["peak_bytes"] is None:
@@ -74,6 +75,7 @@ def main() -> None:
     record = {
         "machine": machine("cpu", Workers("cpu").count),
         "scene": arguments.scene,
+        "model": arguments.model,
         "downscale": arguments.downscale,
         "time_limit": arguments.time_limit,
         "cold_seconds": cold,
@@ -116,7 +118,7 @@ def first_step(command: list[str]) -> None:
         sys.exit(cli.main(command))
 
 
-def train(path: str, downscale: int, steps: int, time_limit: float) -> None:
+def train(path: str, model: str, downscale: int, steps: int, time_limit: float) -> None:
     """Train; print how much memory that took."""
     scene = wn.load_scene(path, downscale=downscale)
     peak = before = own_bytes()
@@ -130,14 +132,15 @@ def train(path: str, downscale: int, steps: int, time_limit: float) -> None:
     watching = threading.Thread(target=watch)
     watching.start()
     try:
-        result = wn.train(scene, wn.TrainConfig(steps=steps, time_limit=time_limit))
+        config = wn.TrainConfig(model=model, steps=steps, time_limit=time_limit)
+        result = wn.train(scene, config)
     finally:
         done.set()
         watching.join()
     found: dict[str, Any] = {
         "peak_bytes": peak,
         "before_bytes": before,
-        "arrays_bytes": BYTES_A_NODE * math.prod(result.field.grid.size),
+        "arrays_bytes": 4 * 4 * math.prod(result.field.grid.size) * result.field.grid.n_floats,
         "grid": result.field.grid.size,
         "steps": result.progress.step,
     }

@@ -11,6 +11,9 @@
     torch backward     the same rendering in torch, with the paper's operation against without
     operation alone    the backward of the paper's operation on 300 000 samples
 
+Of rgb all five, of the other models the first three; each model's launches are held against torch's
+gradient before. What one model takes turns with is its own.
+
 The two of a pair take turns (ABBA), each counts its fastest; the figure is the median over pairs
 of their difference, with a 95 % interval from order statistics. Shares are of the unscaled backward
 pass of the same pipeline. Both of our variants write to the same arrays, so that their place in
@@ -29,23 +32,30 @@ from typing import Any
 import numpy as np
 import torch
 import warp as wp
+from candidates import Candidate, torch_models
 from candidates.torch_eager import Choices, ScaleGradient, TorchPipeline, fastest
 from measuring import Stopwatch, machine, median_interval, options, write_record
-from warpnerf_kernels import contraction
-from warpnerf_kernels import render as kernels
-from warpnerf_kernels.types import real, vec3
-from workload import Workload, make_workload
+from warpnerf_kernels.base.types import real, vec3
+from warpnerf_kernels.launch import assembly
+from workload import MODELS, Workload, make_workload
 
-from warpnerf.adjoint import AdjointLaunch, Gradients
 from warpnerf.config import Scaling
-from warpnerf.grid import FreeCells
-from warpnerf.memory import usable_cores
-from warpnerf.parallel import Workers
-from warpnerf.render import JACOBIANS, SCALINGS, TrainingPass, render_rays, scratch
+from warpnerf.model.grid import FreeCells
+from warpnerf.rendering.adjoint import AdjointLaunch, Gradients
+from warpnerf.rendering.render import (
+    TrainingPass,
+    scene_struct,
+    scratch_struct,
+    seen_struct,
+    variant_of,
+)
+from warpnerf.runtime.memory import usable_cores
+from warpnerf.runtime.parallel import Workers
 
 N_RAYS = 1500
 N_STEPS = 200
 N_SAMPLES = 300_000
+SCALED: tuple[Scaling, ...] = ("none", "clamped")
 
 Call = Callable[[], object]
 
@@ -56,24 +66,28 @@ class WarpAdjoint:
     def __init__(self, work: Workload, device: str, threads: int) -> None:
         """Load a workload and render it once, for what the adjoint starts from."""
         self._workers = workers = Workers(device, threads)
+        self._model = work.warp_model()
         self._grid = work.voxel_grid(workers)
+        self._weights = work.weights(workers)
         self._free = FreeCells.none(workers)
         self._steps = work.steps()
-        self._batch = batch = work.batch(workers)
-        self._out = render_rays(
-            self._grid,
-            self._free,
-            self._steps,
-            batch.origins,
-            batch.directions,
-            batch.offsets,
-            batch.background,
-            workers,
+        self._batch = work.batch(workers)
+        self._scene = scene_struct(
+            self._model,
+            "float32",
+            box=self._grid.box,
+            free=self._free.struct,
+            steps=self._steps,
+            grid=self._grid.struct,
+            density=self._grid.density,
+            weights=self._weights,
+            workers=workers,
         )
-        n = int(self._out.n_samples.numpy().sum())
+        self._seen = self._render()
+        n = int(self._seen.n_samples.numpy().sum())
         if n != N_SAMPLES:
             raise SystemExit(f"gradient_scaling: {n} samples were visited, not {N_SAMPLES}.")
-        rgb = self._out.rgb.numpy()
+        rgb = self._seen.rgb.numpy()
         self._adj_rgb = wp.array(
             2.0 / len(rgb) * (rgb - work.target_rgb), dtype=vec3, device=workers.device
         )
@@ -81,9 +95,34 @@ class WarpAdjoint:
         self._passes = {scaling: self._training_pass(scaling) for scaling in ("none", "clamped")}
         share_memory(self._passes["none"], self._passes["clamped"])
 
+    def _variant(self, scaling: Scaling) -> assembly.Variant:
+        packed = not self._workers.device.is_cuda
+        return variant_of(self._model, "float32", "none", scaling, "none", packed)
+
+    def _render(self) -> Any:
+        variant, n = self._variant("none"), self._batch.count
+        seen = seen_struct(variant, n, self._workers, assembly)
+        self._workers.launch_owned(
+            assembly.render_forward_kernel(variant),
+            -(-n // variant.batch),
+            n,
+            self._scene,
+            self._batch.struct,
+            scratch_struct(variant, 1, self._workers, assembly),
+            seen,
+        )
+        return seen
+
     def _training_pass(self, scaling: Scaling) -> TrainingPass:
         return TrainingPass(
-            self._batch.count, self._grid, self._steps, scaling, "none", self._workers
+            self._batch.count,
+            self._model,
+            self._grid,
+            self._weights,
+            self._steps,
+            scaling,
+            "none",
+            self._workers,
         )
 
     @property
@@ -98,47 +137,32 @@ class WarpAdjoint:
 
     def backward(self, scaling: Scaling) -> Call:
         """The adjoint launch."""
-        variant = kernels.Variant(
-            contraction.NONE,
-            SCALINGS[scaling],
-            JACOBIANS["none"],
-            packed=not self._workers.device.is_cuda,
+        variant = self._variant(scaling)
+        launch = AdjointLaunch(
+            assembly.render_backward_kernel(variant),
+            variant,
+            self._steps.most(self._grid.diagonal),
+            self._batch.count,
+            self._workers,
         )
-        kernel = kernels.render_backward_kernel(variant)
-        batch, out = self._batch, self._out
+        share_deferred(self._passes["none"].launch, launch)
         arguments = (
-            self._grid.struct,
-            self._free.struct,
-            self._steps.struct(),
-            batch.origins,
-            batch.directions,
-            batch.offsets,
-            batch.background,
-            batch.content_distance,
-            out.rgb,
-            out.transmittance,
-            out.depth,
-            out.n_samples,
+            self._scene,
+            self._batch.struct,
+            self._seen,
             self._adj_rgb,
             self._nothing,
             self._nothing,
-            *scratch(kernels, variant, 1, self._workers),
-        )
-        launch = AdjointLaunch(
-            kernel,
-            variant,
-            self._steps.most(self._grid.diagonal),
-            batch.count,
-            self._workers,
+            scratch_struct(variant, 1, launch.workers, assembly),
         )
         gradient = self.gradients.struct
-        return lambda: launch.run(batch.count, gradient, *arguments)
+        return lambda: launch.run(self._batch.count, gradient, *arguments)
 
     def gradient_of(self, launch: Call) -> np.ndarray:
-        """What a launch adds, [X, Y, Z, 4]."""
+        """What a launch adds, [X, Y, Z, n_values]."""
         self.gradients.values.zero_()
         launch()
-        return self.gradients.values.numpy().reshape(*self._grid.size, 4)
+        return self.gradients.values.numpy().reshape(*self._grid.size, self._grid.n_floats)
 
 
 def share_memory(of: TrainingPass, to: TrainingPass) -> None:
@@ -146,10 +170,18 @@ def share_memory(of: TrainingPass, to: TrainingPass) -> None:
     for name, value in vars(of).items():
         if isinstance(value, wp.array | Gradients):
             vars(to)[name] = value
-    to.launch.parcels = of.launch.parcels  # with where workers meet: both have the same ones
+    to._scene = of._scene
+    if of.launch.deferred is not None:
+        to._scratch.packs, to._scratch.rows = of._scratch.packs, of._scratch.rows
+    share_deferred(of.launch, to.launch)
 
 
-def check(ours: WarpAdjoint, theirs: dict[Scaling, TorchPipeline]) -> None:
+def share_deferred(of: AdjointLaunch, to: AdjointLaunch) -> None:
+    """Have two launches leave records in the same place, with where workers meet."""
+    to.deferred = of.deferred
+
+
+def check(ours: WarpAdjoint, theirs: dict[Scaling, Candidate]) -> None:
     """Raise SystemExit unless all launches have the gradient that torch has."""
     for scaling, pipeline in theirs.items():
         pipeline.step()
@@ -180,8 +212,11 @@ def operation_alone(device: str, threads: int) -> Call:
 class Pairs:
     """Times of two calls, taken in turns."""
 
-    def __init__(self, name: str, without: Call, with_it: Call, stopwatch: Stopwatch) -> None:
+    def __init__(
+        self, model: str, name: str, without: Call, with_it: Call, stopwatch: Stopwatch
+    ) -> None:
         """Run both once, so that they are compiled and warm."""
+        self.model = model
         self.name = name
         self._calls = (without, with_it)
         self._stopwatch = stopwatch
@@ -207,6 +242,7 @@ class Pairs:
         """The median difference and its interval, also as shares of a backward pass."""
         difference = median_interval([1e6 * (t[1] - t[0]) for t in self._times])
         return {
+            "model": self.model,
             "name": self.name,
             "pairs": len(self._times),
             "without_us": self.without_us(),
@@ -217,7 +253,7 @@ class Pairs:
         }
 
 
-def counted_instructions(grid: int, scaling: Scaling) -> float | None:
+def counted_instructions(grid: int, model: str, scaling: Scaling) -> float | None:
     """Instructions of one sample's adjoint, by the hardware's counter; None where there is none.
 
     A process that launches more often is set against one that launches less often, so that all but
@@ -227,7 +263,7 @@ def counted_instructions(grid: int, scaling: Scaling) -> float | None:
     counts = []
     for launches in (few, many):
         command = ["perf", "stat", "-x", ",", "-e", "instructions:u", sys.executable, __file__]
-        command += ["--grid", str(grid), "--launch", scaling, str(launches)]
+        command += ["--grid", str(grid), "--models", model, "--launch", scaling, str(launches)]
         try:
             done = subprocess.run(command, capture_output=True, text=True, timeout=300)
         except (OSError, subprocess.TimeoutExpired):
@@ -250,81 +286,116 @@ def has_counters() -> bool:
     return done.stderr.split(",")[0].strip().isdigit()
 
 
+def fastest_choices(work: Workload, args: argparse.Namespace, stopwatch: Stopwatch) -> Choices:
+    """Of torch; more threads are not always faster."""
+    counts = [1] if args.device.startswith("cuda") else sorted({1, args.threads})
+    found = [fastest(work, n, args.device) for n in counts]
+    times = [np.median([stopwatch.seconds(one.step) for _ in range(5)]) for one in found]
+    return found[int(np.argmin(times))].choices
+
+
+def pairs_in_torch(
+    pipelines: dict[Scaling, TorchPipeline], choices: Choices, device: str, stopwatch: Stopwatch
+) -> list[Pairs]:
+    """What the paper's operation costs in torch."""
+
+    def backward(pipeline: TorchPipeline) -> Call:
+        loss = pipeline.loss()
+        return lambda: pipeline.backward(loss, keep_graph=True)
+
+    return [
+        Pairs(
+            "rgb",
+            "torch backward",
+            backward(pipelines["none"]),
+            backward(pipelines["clamped"]),
+            stopwatch,
+        ),
+        Pairs(
+            "rgb",
+            "operation alone",
+            lambda: None,
+            operation_alone(device, choices.threads),
+            stopwatch,
+        ),
+    ]
+
+
 def main() -> None:
     parser = options(__doc__)
     parser.add_argument("--grid", type=int, default=64, help="nodes along each axis")
     parser.add_argument("--pairs", type=int, default=200)
     parser.add_argument("--repeats", type=int, default=2, help="of each side in a pair")
     parser.add_argument("--threads", type=int, default=usable_cores())
+    parser.add_argument("--models", nargs="+", default=list(MODELS), choices=list(MODELS))
     parser.add_argument("--launch", nargs=2, metavar=("SCALING", "N"), help=argparse.SUPPRESS)
     args = parser.parse_args()
-    on_cuda = args.device.startswith("cuda")
-    work = make_workload("inside", args.grid, N_RAYS, N_STEPS)
     if args.launch:  # the process that counted_instructions watches
+        work = make_workload("inside", args.grid, N_RAYS, N_STEPS, model=args.models[0])
         launch = WarpAdjoint(work, "cpu", 1).backward(args.launch[0])
         for _ in range(int(args.launch[1])):
             launch()
         return
 
     stopwatch = Stopwatch(args.device)
-    ours = WarpAdjoint(work, args.device, args.threads)
-    # More threads are not always faster.
-    counts = [1] if on_cuda else sorted({1, args.threads})
-    candidates = [fastest(work, n, args.device) for n in counts]
-    times = [
-        np.median([stopwatch.seconds(candidate.step) for _ in range(5)]) for candidate in candidates
-    ]
-    best: Choices = candidates[int(np.argmin(times))].choices
-    scalings: tuple[Scaling, ...] = ("none", "clamped")
-    theirs = {
-        s: TorchPipeline(replace(work, scaled=s != "none"), best, args.device) for s in scalings
-    }
-    check(ours, theirs)
+    records: list[dict[str, Any]] = []
+    best: Choices | None = None
+    for model in args.models:
+        work = make_workload("inside", args.grid, N_RAYS, N_STEPS, model=model)
+        ours = WarpAdjoint(work, args.device, args.threads)
+        in_torch: list[Pairs] = []
+        if model == "rgb":
+            best = fastest_choices(work, args, stopwatch)
+            theirs = {
+                s: TorchPipeline(replace(work, scaled=s != "none"), best, args.device)
+                for s in SCALED
+            }
+            check(ours, theirs)
+            in_torch = pairs_in_torch(theirs, best, args.device, stopwatch)
+        else:
+            choices = torch_models.Choices(threads=args.threads)
+            check(
+                ours,
+                {
+                    s: torch_models.TorchModels(
+                        replace(work, scaled=s != "none"), choices, args.device
+                    )
+                    for s in SCALED
+                },
+            )
+        plain = ours.backward("none")
+        backward = Pairs(model, "render_backward", plain, ours.backward("clamped"), stopwatch)
+        train = Pairs(model, "render_train", ours.train("none"), ours.train("clamped"), stopwatch)
+        control = Pairs(model, "control", plain, plain, stopwatch)
+        all_pairs = (backward, train, control, *in_torch)
+        for _ in range(args.pairs):
+            for pairs in all_pairs:
+                pairs.take(args.repeats)
+        records += [pairs.record(backward.without_us()) for pairs in (backward, train, control)]
+        records += [pairs.record(in_torch[0].without_us()) for pairs in in_torch]
 
-    def torch_backward(pipeline: TorchPipeline) -> Call:
-        loss = pipeline.loss()
-        return lambda: pipeline.backward(loss, keep_graph=True)
-
-    plain = ours.backward("none")
-    backward = Pairs("render_backward", plain, ours.backward("clamped"), stopwatch)
-    train = Pairs("render_train", ours.train("none"), ours.train("clamped"), stopwatch)
-    control = Pairs("control", plain, plain, stopwatch)
-    in_torch = Pairs(
-        "torch backward",
-        torch_backward(theirs["none"]),
-        torch_backward(theirs["clamped"]),
-        stopwatch,
-    )
-    alone = Pairs(
-        "operation alone", lambda: None, operation_alone(args.device, best.threads), stopwatch
-    )
-    all_pairs = (backward, train, control, in_torch, alone)
-    for _ in range(args.pairs):
-        for pairs in all_pairs:
-            pairs.take(args.repeats)
-
-    ours_us, torch_us = backward.without_us(), in_torch.without_us()
-    records = [pairs.record(ours_us) for pairs in (backward, train, control)]
-    records += [pairs.record(torch_us) for pairs in (in_torch, alone)]
     print(
-        f"{N_SAMPLES} samples, {args.grid}^3 grid, {args.pairs} pairs, {args.threads} threads "
-        f"(torch: {best.threads}); median difference [95 % interval]\n"
+        f"{N_SAMPLES} samples, {args.grid}^3 grid, {args.pairs} pairs, {args.threads} threads"
+        f"{f' (torch: {best.threads})' if best else ''}; median difference [95 % interval]\n"
     )
     print(
-        f"{'':17s}{'without us':>11s}{'with us':>11s}   {'difference us':26s}   "
+        f"{'':27s}{'without us':>11s}{'with us':>11s}   {'difference us':26s}   "
         "of the backward pass"
     )
     for r in records:
         d, s = r["difference_us"], r["share_of_backward"]
         difference = f"{d['median']:+.1f} [{d['low']:+.1f}, {d['high']:+.1f}]"
         print(
-            f"{r['name']:17s}{r['without_us']:11.0f}{r['with_us']:11.0f}   {difference:26s}   "
-            f"{s['median']:+.2%} [{s['low']:+.2%}, {s['high']:+.2%}]"
+            f"{r['model']:10s}{r['name']:17s}{r['without_us']:11.0f}{r['with_us']:11.0f}   "
+            f"{difference:26s}   {s['median']:+.2%} [{s['low']:+.2%}, {s['high']:+.2%}]"
         )
 
-    instructions: dict[str, float | None] | None = None
-    if not on_cuda and has_counters():
-        instructions = {s: counted_instructions(args.grid, s) for s in scalings}
+    instructions: dict[str, dict[str, float | None]] | None = None
+    if not args.device.startswith("cuda") and has_counters():
+        instructions = {
+            model: {s: counted_instructions(args.grid, model, s) for s in SCALED}
+            for model in args.models
+        }
         print(f"\ninstructions of a sample's adjoint: {instructions}")
     else:
         print("\nno hardware counters on this machine")
@@ -334,7 +405,7 @@ def main() -> None:
         "n_samples": N_SAMPLES,
         "grid": args.grid,
         "repeats": args.repeats,
-        "torch_choices": asdict(best),
+        "torch_choices": asdict(best) if best else None,
         "results": records,
         "instructions_per_sample": instructions,
     }

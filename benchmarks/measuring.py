@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpnerf.memory import usable_cores
+from warpnerf.model.models import MODELS
+from warpnerf.runtime.memory import usable_cores
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -32,6 +33,11 @@ def options(doc: str) -> argparse.ArgumentParser:
     parser.add_argument("--device", default="cpu", help="cpu, cuda:0")
     parser.add_argument("--output", type=Path, help="where the record goes")
     return parser
+
+
+def add_model(parser: argparse.ArgumentParser) -> None:
+    """The option --model, of benchmarks that train one."""
+    parser.add_argument("--model", default="deferred", choices=list(MODELS))
 
 
 class Stopwatch:

@@ -11,23 +11,24 @@ from __future__ import annotations
 
 from functools import partial
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import warp as wp
-from measuring import Stopwatch, machine, median_interval, options, show, write_record
+from measuring import Stopwatch, add_model, machine, median_interval, options, show, write_record
 from training import path_of
-from warpnerf_kernels import gradscale, order, render
-from warpnerf_kernels.types import vec3
+from warpnerf_kernels.base.types import vec3
+from warpnerf_kernels.cpu import schedule
+from warpnerf_kernels.launch import assembly
 
 import warpnerf as wn
-from warpnerf.grid import CONTRACTIONS
-from warpnerf.parallel import Workers
-from warpnerf.rays import PixelSampler
-from warpnerf.render import TrainingPass
+from warpnerf.rendering.rays import PixelSampler
+from warpnerf.rendering.render import TrainingPass, variant_of
+from warpnerf.runtime.parallel import Workers
 
-SLAB = sum(1 << (3 * bit + 2) for bit in range(order.BITS))
+SLAB = sum(1 << (3 * bit + 2) for bit in range(schedule.BITS))
 """The bits of a cell's number that name its slab."""
-cell_at = order.cell_at
+cell_at = schedule.cell_at
 
 
 @wp.func
@@ -38,10 +39,12 @@ def cell_of_slab(x: vec3) -> int:
 
 def main() -> None:
     parser = options(__doc__)
-    parser.add_argument("scenes", nargs="*", default=["builtin:room"], help="builtin:room, folders")
+    known = "builtin:room, builtin:room-sparse, folders"
+    parser.add_argument("scenes", nargs="*", default=["builtin:room"], help=known)
     parser.add_argument("--time-limit", type=float, default=25.0, help="seconds of training each")
     parser.add_argument("--steps", type=int, default=100_000, help="at most so many steps")
     parser.add_argument("--downscale", type=int, default=1)
+    add_model(parser)
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--rounds", type=int, default=12)
     arguments = parser.parse_args()
@@ -51,7 +54,11 @@ def main() -> None:
     print("scene           threads  steps  time in order over time as drawn")
     for name in arguments.scenes:
         scene = wn.load_scene(path_of(name), downscale=arguments.downscale)
-        config = wn.TrainConfig(steps=arguments.steps, time_limit=arguments.time_limit)
+        config = wn.TrainConfig(
+            model=arguments.model,
+            steps=arguments.steps,
+            time_limit=arguments.time_limit,
+        )
         field = wn.train(scene, config).field
         rows[name] = {}
         for threads in arguments.threads:
@@ -61,6 +68,7 @@ def main() -> None:
                 print(f"{name:14}  {threads:7}  {steps:5}  {show(found, 2)}", flush=True)
     record = {
         "machine": machine("cpu", max(arguments.threads)),
+        "model": arguments.model,
         "time_limit": arguments.time_limit,
         "rounds": arguments.rounds,
         "scenes": rows,
@@ -75,7 +83,16 @@ def ratios(scene: wn.Scene, field: wn.Field, steps: int, threads: int, rounds: i
     views = [scene.views[i] for i in scene.splits["train"]]
     sampler = PixelSampler(views, scene.content_distance, None, n_rays, True, 0, workers)
     ordered, drawn = (
-        TrainingPass(steps * n_rays, field.grid, field.steps, "clamped", "none", workers)
+        TrainingPass(
+            steps * n_rays,
+            field.model,
+            field.grid,
+            field.weights,
+            field.steps,
+            "clamped",
+            "none",
+            workers,
+        )
         for _ in range(2)
     )
     drawn.launch._kernel = as_drawn(field, workers)
@@ -94,18 +111,16 @@ def ratios(scene: wn.Scene, field: wn.Field, steps: int, threads: int, rounds: i
 
 def as_drawn(field: wn.Field, workers: Workers) -> wp.Kernel:
     """The kernel of a training pass, but for it all cells of a slab are one."""
-    variant = render.Variant(
-        CONTRACTIONS[field.grid.contraction],
-        gradscale.CLAMPED,
-        gradscale.JACOBIAN_NONE,
-        packed=True,
+    variant = variant_of(
+        field.model, "float32", field.grid.contraction, "clamped", "none", packed=True
     )
-    order.cell_at = cell_of_slab
-    try:
-        kernel = render.render_train_kernel.__wrapped__(variant)
+    # Both made anew, for what is kept of them has the cells.
+    with (
+        mock.patch.object(schedule, "cell_at", cell_of_slab),
+        mock.patch.object(assembly, "ray_schedule", schedule.ray_schedule.__wrapped__),
+    ):
+        kernel = assembly._train_packs.__wrapped__(variant)
         workers.load(kernel)
-    finally:
-        order.cell_at = cell_at
     return kernel
 
 

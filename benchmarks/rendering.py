@@ -31,13 +31,13 @@ from measuring import (
     show,
     write_record,
 )
-from warpnerf_kernels.types import real, vec3
+from warpnerf_kernels.base.types import real, vec3
 from workload import BOX, DENSITY_SHIFT, make_workload
 
 import warpnerf as wn
-from warpnerf.parallel import Workers
-from warpnerf.rays import camera_rays
-from warpnerf.render import Steps, render_rays
+from warpnerf.rendering.rays import camera_rays
+from warpnerf.rendering.render import Steps, render_rays
+from warpnerf.runtime.parallel import Workers
 
 TRANSMITTANCE_MIN = 1e-3
 TOLERANCE = 2 * TRANSMITTANCE_MIN
@@ -49,7 +49,9 @@ def sphere_field(grid: int, workers: Workers) -> wn.Field:
     step = 2.0 / (grid - 1)
     work = make_workload("random", grid, 1, math.ceil(4.0 / step), scene="sphere")
     return wn.Field(
+        model=work.warp_model(),
         grid=work.voxel_grid(workers),
+        weights=work.weights(workers),
         free=work.free_cells(workers),
         steps=Steps(near=0.0, far=1e30, step=step, transmittance_min=TRANSMITTANCE_MIN),
         background=work.background,
@@ -101,6 +103,8 @@ class TorchFrame:
         grid, steps = field.grid, field.steps
         if grid.contraction != "none":
             raise SystemExit("rendering: the field must not be contracted; train a bounded scene.")
+        if field.model.name != "rgb":
+            raise SystemExit("rendering: the field must be of the model rgb; train with it.")
         self.choices = choices
         centre, half = 0.5 * (grid.box_min + grid.box_max), 0.5 * (grid.box_max - grid.box_min)
         values = grid.values.numpy().reshape(*grid.size, 4).copy()
@@ -181,7 +185,7 @@ def fastest(field: wn.Field, camera: wn.Camera, threads: int) -> TorchFrame:
 
 def main() -> None:
     parser = options(__doc__)
-    parser.add_argument("--field", type=Path, help="a trained field of a bounded scene")
+    parser.add_argument("--field", type=Path, help="a trained field of a bounded scene, model rgb")
     parser.add_argument("--grid", type=int, default=160, help="nodes per axis, without --field")
     parser.add_argument("--pixels", type=int, default=800, help="along each edge")
     parser.add_argument("--threads", type=int, nargs="+", default=default_threads())
@@ -248,7 +252,9 @@ def count_samples(field: wn.Field, camera: wn.Camera) -> int:
     """What warpnerf samples in a frame."""
     origins, directions = camera_rays(camera, field.workers)
     rays = render_rays(
+        field.model,
         field.grid,
+        field.weights,
         field.free,
         field.steps,
         origins,

@@ -10,7 +10,7 @@ Measured, on a number of threads at once:
     peak      fused multiply-adds on vectors in registers: operations a second, two for each
     cached    a sample of warpnerf's step on a grid that lies in a core's own caches
 
-Derived for a workload, in seconds:
+Derived for a workload of the model rgb, in seconds:
 
     arithmetic  its samples times the operations of one, at peak. They are counted as the formulas
                 need them, in OPERATIONS; shuffles, loads, stores, addresses and what depends on the
@@ -36,7 +36,7 @@ from candidates.warpnerf_step import WarpStep
 from measuring import Stopwatch, default_threads, options
 from workload import Workload, make_workload
 
-from warpnerf.parallel import Workers
+from warpnerf.runtime.parallel import Workers
 
 OPERATIONS = {
     "place a sample: distance, position, box test, cell, fraction, shares of columns": 38,
@@ -212,11 +212,13 @@ def needs(work: Workload) -> Needs:
     lowest = np.minimum(((q[needed] + 1.0) * (0.5 * (nodes - 1))).astype(np.int64), nodes - 2)
     base = (lowest[:, 0] * nodes[1] + lowest[:, 1]) * nodes[2] + lowest[:, 2]
     group = np.repeat(np.arange(len(needed)) // SHARING, needed.sum(axis=1))
-    n_lines = -(-math.prod(nodes) * 16 // LINE)
+    node_bytes = work.values.shape[3] * 4  # a power of two
+    n_lines = -(-math.prod(nodes) * node_bytes // LINE)
     touched = np.zeros((group.max(initial=0) + 1, n_lines), bool)
     for column in (0, nodes[2], nodes[1] * nodes[2], (nodes[1] + 1) * nodes[2]):
         for node in (base + column, base + column + 1):
-            touched[group, node * 16 // LINE] = True
+            for byte in range(0, node_bytes, LINE):
+                touched[group, (node * node_bytes + byte) // LINE] = True
     return Needs(
         n_samples=len(base),
         lines=int(touched.any(axis=0).sum()),

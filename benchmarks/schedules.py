@@ -10,19 +10,18 @@ is not rays and their gradient; writes benchmarks/results/schedules_<device>.jso
 
 from __future__ import annotations
 
-import time
 from dataclasses import asdict, replace
-from functools import partial
 from unittest import mock
 
-from measuring import machine, options, write_record
+from measuring import add_model, machine, options, write_record
 from training import Clock, path_of
+from turns import take_turns
 
 import warpnerf as wn
 from warpnerf.config import ACCUMULATE_AT
-from warpnerf.parallel import Workers
-from warpnerf.render import TrainingPass
-from warpnerf.training import Trainer
+from warpnerf.rendering.render import TrainingPass
+from warpnerf.runtime.parallel import Workers
+from warpnerf.training.trainer import Trainer
 
 SCHEDULES = {
     "1 step": wn.OptimConfig(accumulate_at=()),
@@ -33,19 +32,22 @@ SCHEDULES = {
 """What is compared, by the steps of an update: what ``auto`` takes for one kind of scene or other,
 and updates of a step each."""
 
-TURN_SECONDS = 0.4
-
 
 def main() -> None:
     parser = options(__doc__)
-    parser.add_argument("scenes", nargs="*", default=["builtin:room"], help="builtin:room, folders")
+    known = "builtin:room, builtin:room-sparse, folders"
+    parser.add_argument("scenes", nargs="*", default=["builtin:room"], help=known)
     parser.add_argument("--time-limit", type=float, default=25.0, help="seconds each")
     parser.add_argument("--steps", type=int, default=100_000, help="at most so many steps, from 2")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--downscale", type=int, default=1)
+    add_model(parser)
     arguments = parser.parse_args()
     config = wn.TrainConfig(
-        steps=arguments.steps, time_limit=arguments.time_limit, device=arguments.device
+        model=arguments.model,
+        steps=arguments.steps,
+        time_limit=arguments.time_limit,
+        device=arguments.device,
     )
     print("scene           seed  schedule            seconds   PSNR  steps  besides rays")
     rows = []
@@ -62,6 +64,7 @@ def main() -> None:
                 )
     record = {
         "machine": machine(arguments.device, Workers(arguments.device).count),
+        "model": arguments.model,
         "time_limit": arguments.time_limit,
         "steps": arguments.steps,
         "downscale": arguments.downscale,
@@ -73,27 +76,17 @@ def main() -> None:
 
 def race(scene: wn.Scene, config: wn.TrainConfig) -> dict[str, dict[str, float]]:
     """Train by each of the schedules, in turns."""
-    trainers: dict[str, Trainer] = {}
-    paused_at: dict[str, float] = {}
-    for name, optim in SCHEDULES.items():
-        trainers[name] = Trainer(scene, replace(config, optim=optim))
-        trainers[name].update()  # compiles; its clock starts after it
-        paused_at[name] = time.perf_counter()
-    seconds, rays = dict.fromkeys(trainers, 0.0), dict.fromkeys(trainers, 0.0)
+    trainers = {
+        name: Trainer(scene, replace(config, optim=optim)) for name, optim in SCHEDULES.items()
+    }
+    rays = dict.fromkeys(trainers, 0.0)
     clock = Clock(Workers(config.device).device.is_cuda)
-    n_rounds = 0
+
+    def note(name: str, seconds: float) -> None:
+        rays[name] += clock.seconds.pop("rays", 0.0)
+
     with mock.patch.object(TrainingPass, "run", clock.timing("rays", TrainingPass.run)):
-        while waiting := [name for name in trainers if trainers[name].fraction < 1.0]:
-            n_rounds += 1
-            for name in waiting[:: 1 if n_rounds % 2 else -1]:
-                trainer, rays_before = trainers[name], clock.seconds["rays"]
-                begin = time.perf_counter()
-                assert trainer._started is not None
-                trainer._started += begin - paused_at[name]
-                trainer.run(stop=partial(_is_past, begin + TURN_SECONDS))
-                paused_at[name] = time.perf_counter()
-                seconds[name] += paused_at[name] - begin
-                rays[name] += clock.seconds["rays"] - rays_before
+        seconds = take_turns(trainers, note)
     return {
         name: {
             "seconds": seconds[name],
@@ -103,10 +96,6 @@ def race(scene: wn.Scene, config: wn.TrainConfig) -> dict[str, dict[str, float]]
         }
         for name, trainer in trainers.items()
     }
-
-
-def _is_past(until: float) -> bool:
-    return time.perf_counter() > until
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ from candidates.warpnerf_step import WarpStep
 from measuring import Stopwatch, machine, median_interval, options, show, write_record
 from throughput import make_cases
 
-from warpnerf.parallel import Workers
+from warpnerf.runtime.parallel import Workers
 
 CHAINS = 1_200_000
 """Rounds of multiply-adds of a control: some 4 ms, of which the launch is a few hundredths."""
@@ -89,7 +89,7 @@ def main() -> None:
         controls[threads] = partial(workers.launch_owned, roofline.peak, threads, CHAINS, out)
         controls[threads]()
     cases = []
-    print(f"{'':38s}one thread, ms       {several} threads, ms        times as fast      rounds")
+    print(f"{'':48s}one thread, ms       {several} threads, ms        times as fast      rounds")
     for case in make_cases(args.grids):
         work = case.workload(args.rays, args.steps)
         steps = {threads: WarpStep(work, threads, "cpu").step for threads in (1, several)}
@@ -117,10 +117,10 @@ def main() -> None:
 def print_row(name: str, figures: dict[str, Any] | None) -> None:
     """One line."""
     if figures is None:
-        print(f"{name:38s}no round without somebody else on the cores", flush=True)
+        print(f"{name:48s}no round without somebody else on the cores", flush=True)
         return
     print(
-        f"{name:38s}{show(figures['one_ms'], 1):21s}{show(figures['several_ms'], 1):21s}"
+        f"{name:48s}{show(figures['one_ms'], 1):21s}{show(figures['several_ms'], 1):21s}"
         f"{show(figures['times_as_fast'], 2):19s}{figures['rounds']}",
         flush=True,
     )

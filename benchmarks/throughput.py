@@ -2,10 +2,12 @@
 
     python benchmarks/throughput.py
 
-4096 rays x 256 steps, 4 channels: march, composite, squared error, adjoint scaled by distance, and
-a gradient of the grid that is zeroed, added up and ready to be used. warpnerf against eager torch,
-torch.compile, numba, Taichi and Dr.Jit where installed (`pip install ".[bench]"`), each on one and
-two threads; candidates/ holds them. A case is one workload:
+4096 rays x 256 steps: march, composite, squared error, adjoint scaled by distance, and a gradient
+of the grid, and of the network where there is one, that is zeroed, added up and ready to be used.
+warpnerf against eager torch, torch.compile, numba, Taichi and Dr.Jit where installed
+(`pip install ".[bench]"`), each on one and two threads; candidates/ holds them. The models are
+those of warpnerf, as they are by default: `features` works out the colour of samples of a weight
+above 1e-4 only, whoever runs it. A case is one workload:
 
     random   single pixels of random cameras around the box, two thirds of the steps in it
     patches  8 x 8 neighbouring pixels of each camera
@@ -45,7 +47,7 @@ from measuring import (
     write_record,
 )
 from plotting import plot_throughput
-from workload import Rays, Scene, Workload, make_workload
+from workload import MODELS, ModelName, Rays, Scene, Workload, make_workload
 
 TOLERANCE = 1e-4
 """Of the largest value: by how much candidates may differ from the first."""
@@ -61,27 +63,41 @@ class Case:
     grid: int
     scene: Scene = "dense"
     scaled: bool = True
+    model: ModelName = "rgb"
 
     def __str__(self) -> str:
         """In words."""
         scaling = "scaled" if self.scaled else "not scaled"
-        return f"{self.rays} rays, {self.grid}^3, {self.scene}, {scaling}"
+        return f"{self.model}, {self.rays} rays, {self.grid}^3, {self.scene}, {scaling}"
 
     def workload(self, n_rays: int, n_steps: int) -> Workload:
         """Make it."""
         return make_workload(
-            self.rays, self.grid, n_rays, n_steps, scene=self.scene, scaled=self.scaled
+            self.rays,
+            self.grid,
+            n_rays,
+            n_steps,
+            scene=self.scene,
+            scaled=self.scaled,
+            model=self.model,
         )
 
 
 def make_cases(grids: Sequence[int]) -> list[Case]:
-    """Every grid once, and on the last everything else once."""
+    """Of rgb every grid once, and on the last everything else once; there the other models too."""
     last = grids[-1]
+    scenes: tuple[Scene, ...] = ("dense", "sphere")
     return [
         *(Case("random", grid) for grid in grids),
         Case("patches", last),
         Case("random", last, scene="sphere"),
         Case("random", last, scaled=False),
+        *(
+            Case("random", last, scene=scene, model=model)
+            for model in MODELS
+            if model != "rgb"
+            for scene in scenes
+        ),
     ]
 
 
@@ -92,7 +108,8 @@ def check(runs: dict[tuple[str, int], Candidate]) -> dict[str, dict[str, float]]
         runs: By name and number of threads.
 
     Returns:
-        For each, the greatest differences in colours and gradient, as shares of the largest value.
+        For each, the greatest differences in colours, gradient and the network's, if there is one,
+        as shares of the largest value.
 
     Raises:
         SystemExit: One does not compute the same.
@@ -103,6 +120,9 @@ def check(runs: dict[tuple[str, int], Candidate]) -> dict[str, dict[str, float]]
         run.step()
         run.step()  # a gradient that is not zeroed would show
         found = {"rgb": run.rgb(), "gradient": run.gradient()}
+        network = run.network_gradient() if hasattr(run, "network_gradient") else np.zeros(0)
+        if network.size:
+            found["network"] = network
         expected = expected or {what: values.copy() for what, values in found.items()}
         by_value = differences[f"{name}, {threads} threads"] = {}
         for what, values in found.items():
@@ -205,7 +225,6 @@ def compare_threads(
 
 def run_case(
     case: Case,
-    found: dict[str, Load],
     args: argparse.Namespace,
     machines: dict[int, roofline.Machine],
 ) -> dict[str, Any]:
@@ -213,6 +232,9 @@ def run_case(
     work = case.workload(args.rays, args.steps)
     needed = roofline.needs(work)
     print(f"\n{case}: {needed.n_samples} samples")
+    found, missing = wanted(case.model, args)
+    if case.model != "rgb" and missing:
+        print(f"  left out: {'; '.join(f'{name}, {reason}' for name, reason in missing.items())}")
     runs = {(n, t): load(work, t, args.device) for n, load in found.items() for t in args.threads}
     differences = check(runs)
     calls = {key: run.step for key, run in runs.items()}
@@ -229,7 +251,7 @@ def run_case(
         }
         if threads in several:
             row |= compare_threads(seconds, threads)
-        if threads in machines:
+        if threads in machines and case.model == "rgb":  # whose operations are counted
             bound = roofline.bounds(work, needed, machines[threads])
             row["bounds_ms"] = {key: 1e3 * value for key, value in asdict(bound).items()}
             row["least_ms"] = 1e3 * bound.least
@@ -239,9 +261,17 @@ def run_case(
         "name": str(case),
         **asdict(case),
         **asdict(needed),
+        "left_out": missing,
         "differences": differences,
         "rows": rows,
     }
+
+
+def wanted(model: ModelName, args: argparse.Namespace) -> tuple[dict[str, Load], dict[str, str]]:
+    """Who takes part with a model, and why the others do not."""
+    found, missing = candidates.find(args.device, model)
+    missing |= {name: "not wanted" for name in args.without if found.pop(name, None)}
+    return found, missing
 
 
 def print_row(row: dict[str, Any]) -> None:
@@ -265,29 +295,33 @@ def print_row(row: dict[str, Any]) -> None:
 
 def print_summary(records: list[dict[str, Any]]) -> None:
     """The medians again, all cases under each other; and how far warpnerf is from the bounds."""
-    names = list(records[0]["rows"][0]["candidates"])
+    names = list(dict.fromkeys(name for r in records for name in r["rows"][0]["candidates"]))
     print("\nmedian ms of warpnerf, and how many times as long the others take\n")
-    print(f"{'':38s}threads" + "".join(f"{name:>15s}" for name in names))
+    print(f"{'':48s}threads" + "".join(f"{name:>15s}" for name in names))
     for record in records:
         for row in record["rows"]:
-            line = f"{record['name']:38s}{row['threads']:7d}"
-            for name, figures in row["candidates"].items():
-                if name == OURS:
+            line = f"{record['name']:48s}{row['threads']:7d}"
+            for name in names:
+                figures = row["candidates"].get(name)
+                if figures is None:
+                    line += f"{'-':>15s}"
+                elif name == OURS:
                     line += f"{figures['ms']['median']:15.1f}"
                 else:
                     line += f"{figures['over_warpnerf']['median']:15.2f}"
             print(line)
-    if "bounds_ms" not in records[0]["rows"][0]:
+    records = [record for record in records if "bounds_ms" in record["rows"][0]]
+    if not records:
         return
     print("\nwarpnerf beside what the machine could do (see roofline.py), ms\n")
     columns = ("arithmetic", "traffic", "walk", "cached")
     head = "".join(f"{column:>12s}" for column in ("warpnerf", *columns, "over bound"))
-    print(f"{'':38s}threads{head}")
+    print(f"{'':48s}threads{head}")
     for record in records:
         for row in record["rows"]:
             ours = row["candidates"][OURS]["ms"]["median"]
             print(
-                f"{record['name']:38s}{row['threads']:7d}{ours:12.1f}"
+                f"{record['name']:48s}{row['threads']:7d}{ours:12.1f}"
                 + "".join(f"{row['bounds_ms'][column]:12.1f}" for column in columns)
                 + f"{ours / row['least_ms']:12.1f}"
             )
@@ -327,6 +361,7 @@ def main() -> None:
     parser.add_argument(
         "--threads", type=int, nargs="+", default=default_threads(), help="CPU threads, from 1 up"
     )
+    parser.add_argument("--models", nargs="+", default=list(MODELS), choices=list(MODELS))
     parser.add_argument(
         "--without", nargs="+", default=[], choices=list(candidates.MODULES)[1:], metavar="NAME"
     )
@@ -338,8 +373,7 @@ def main() -> None:
     if on_cuda:
         args.threads = [1]
 
-    found, missing = candidates.find(args.device)
-    missing |= {name: "not wanted" for name in args.without if found.pop(name, None)}
+    found, missing = wanted("rgb", args)
     print(
         f"{args.rays} rays x {args.steps} steps, {args.rounds} rounds; median [95 % interval]\n"
         f"compared: {', '.join(found)}"
@@ -351,7 +385,8 @@ def main() -> None:
         print(roofline.describe(measured))
     records = []
     for case in make_cases(args.grids):
-        records.append(run_case(case, found, args, machines))
+        if case.model in args.models:
+            records.append(run_case(case, args, machines))
         gc.collect()
     print_summary(records)
     record = {

@@ -19,14 +19,14 @@ from typing import Any
 from unittest import mock
 
 import warp as wp
-from measuring import machine, options, write_record
+from measuring import add_model, machine, options, write_record
 
 import warpnerf as wn
-from warpnerf import training
-from warpnerf.parallel import Workers
-from warpnerf.rays import PixelSampler
-from warpnerf.render import TrainingPass
-from warpnerf.training import Trainer
+from warpnerf.rendering.rays import PixelSampler
+from warpnerf.rendering.render import TrainingPass
+from warpnerf.runtime.parallel import Workers
+from warpnerf.training import trainer as training
+from warpnerf.training.trainer import Trainer
 
 PARTS: dict[str, list[tuple[Any, str]]] = {
     "rays": [(TrainingPass, "run")],
@@ -73,13 +73,18 @@ class Clock:
 
 def main() -> None:
     parser = options(__doc__)
-    parser.add_argument("scenes", nargs="*", default=["builtin:room"], help="builtin:room, folders")
+    known = "builtin:room, builtin:room-sparse, folders"
+    parser.add_argument("scenes", nargs="*", default=["builtin:room"], help=known)
     parser.add_argument("--time-limit", type=float, default=36.0, help="seconds each")
     parser.add_argument("--steps", type=int, default=100_000, help="at most so many steps")
     parser.add_argument("--downscale", type=int, default=1)
+    add_model(parser)
     arguments = parser.parse_args()
     config = wn.TrainConfig(
-        steps=arguments.steps, time_limit=arguments.time_limit, device=arguments.device
+        model=arguments.model,
+        steps=arguments.steps,
+        time_limit=arguments.time_limit,
+        device=arguments.device,
     )
     names = ["rest", *PARTS]
     print(f"{'scene':14}  steps  samples/ray  {'  '.join(f'{name:>10}' for name in names)}")
@@ -92,6 +97,7 @@ def main() -> None:
         )
     record = {
         "machine": machine(arguments.device, Workers(arguments.device).count),
+        "model": arguments.model,
         "time_limit": arguments.time_limit,
         "steps": arguments.steps,
         "downscale": arguments.downscale,

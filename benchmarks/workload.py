@@ -5,18 +5,20 @@ Nothing here is measured; measuring.py keeps the time.
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 import warp as wp
-from warpnerf_kernels.types import real, vec3, vec4
+from warpnerf_kernels.base.types import real, vec3, vector
 
-from warpnerf.grid import FreeCells, VoxelGrid
-from warpnerf.parallel import Workers
-from warpnerf.rays import RayBatch
-from warpnerf.render import Steps
+from warpnerf.model import models
+from warpnerf.model.grid import FreeCells, VoxelGrid
+from warpnerf.rendering.rays import RayBatch
+from warpnerf.rendering.render import Steps
+from warpnerf.runtime.parallel import Workers
 
 BOX = np.ones(3)
 """The box is [-1, 1]^3."""
@@ -41,6 +43,38 @@ ALPHA_MIN = 1e-2
 
 Rays = Literal["inside", "random", "patches"]
 Scene = Literal["dense", "sphere"]
+ModelName = Literal["rgb", "sh", "deferred", "features"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Model:
+    """What makes colours of features."""
+
+    n_features: int
+    """Numbers of a node besides the density."""
+    n_values: int
+    """Numbers of a node in memory, a power of two: density, features, padding."""
+    degree: int = 0
+    """Of the spherical harmonics of `sh`."""
+    n_inputs: int = 0
+    """Of the network; 0 for no network."""
+    n_hidden: int = 2
+    """Its hidden layers."""
+    width: int = 32
+    """Of each."""
+    n_frequencies: int = 0
+    """Of the encoding of directions, 3 + 6 n numbers."""
+    threshold: float = 0.0
+    """`features` gives a sample a colour where its weight is above this."""
+
+
+MODELS: dict[ModelName, Model] = {
+    "rgb": Model(n_features=3, n_values=4),
+    "sh": Model(n_features=27, n_values=32, degree=2),
+    "deferred": Model(n_features=7, n_values=8, n_inputs=7 + 9, n_frequencies=1),
+    "features": Model(n_features=12, n_values=16, n_inputs=9 + 27, n_frequencies=4, threshold=1e-4),
+}
+"""As they are by default; `features` is residual."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -48,7 +82,7 @@ class Workload:
     """Rays through a grid and what they should see, as arrays that every candidate loads."""
 
     values: np.ndarray
-    """[X, Y, Z, 4] float32 raw density, raw rgb."""
+    """[X, Y, Z, n_values] float32 raw density, raw features (of rgb: raw rgb), zeros."""
     free: np.ndarray
     """[MX, MY, MZ] uint8, over the box: cells from each to the nearest needing samples, diagonal
     neighbours being one apart; 0 there. Nobody has to look: free cells hold no density."""
@@ -68,6 +102,9 @@ class Workload:
     """rgb in [0, 1]."""
     content_distance: float = 1.0
     """Scene units; most rays have samples on both sides of it."""
+    model: ModelName = "rgb"
+    network: tuple[np.ndarray, ...] = ()
+    """Of models that have one: weights [inputs, outputs] and biases [outputs] float32, in turn."""
 
     @property
     def skips(self) -> bool:
@@ -77,6 +114,23 @@ class Workload:
     def voxel_grid(self, workers: Workers) -> VoxelGrid:
         """The grid as warpnerf takes it."""
         return voxel_grid(self.values, workers)
+
+    def warp_model(self) -> models.Model:
+        """The model as warpnerf takes it."""
+        return models.model_of(self.model)
+
+    def weights(self, workers: Workers) -> wp.array:
+        """The network as warpnerf takes it: one array, of whose last layer's four columns one is
+        padding.
+        """
+        arrays = list(self.network)
+        arrays[-2:] = (
+            np.pad(array, [*[(0, 0)] * (array.ndim - 1), (0, 1)]) for array in arrays[-2:]
+        )
+        flat = np.concatenate([np.zeros(0, np.float32), *(array.ravel() for array in arrays)])
+        if len(flat) != models.n_weights(self.warp_model()):
+            raise SystemExit(f"workload: its network is not the one that {self.model} has.")
+        return wp.array(flat, dtype=real, device=workers.device)
 
     def free_cells(self, workers: Workers) -> FreeCells:
         """The free cells as warpnerf takes them."""
@@ -115,10 +169,11 @@ class Workload:
 
 
 def voxel_grid(values: np.ndarray, workers: Workers) -> VoxelGrid:
-    """Raw values [X, Y, Z, 4] over the box as warpnerf takes them."""
-    size = values.shape[:3]
+    """Raw values [X, Y, Z, n_values] over the box as warpnerf takes them."""
+    size, n_values = values.shape[:3], values.shape[3]
+    nodes = values.reshape(-1, n_values)
     return VoxelGrid(
-        values=wp.array(values.reshape(-1, 4), dtype=vec4, device=workers.device),
+        values=wp.array(nodes, dtype=vector(n_values), device=workers.device),
         size=(size[0], size[1], size[2]),
         box_min=-BOX,
         box_max=BOX,
@@ -134,6 +189,7 @@ def make_workload(
     *,
     scene: Scene = "dense",
     scaled: bool = True,
+    model: ModelName = "rgb",
     seed: int = 0,
 ) -> Workload:
     """Rays through a grid^3 of raw values.
@@ -147,6 +203,7 @@ def make_workload(
         n_steps: Steps along each.
         scene: dense: standard normal raw values everywhere. sphere: a solid sphere in empty space.
         scaled: Whether gradients are scaled by distance.
+        model: What makes colours of features.
         seed: Of all that is random.
     """
     rng = np.random.default_rng(seed)
@@ -172,20 +229,38 @@ def make_workload(
     t = (np.arange(n_steps) + 0.5) * step
     q = origins[:, :, None].astype(float) + t[:, None] * directions[:, :, None]
     clear = (np.abs(np.abs(q) - 1.0) > 1e-5).all(axis=(1, 2, 3))
-    values = rng.normal(size=(grid, grid, grid, 4)).astype(np.float32)
+    chosen = MODELS[model]
+    values = np.zeros((grid, grid, grid, chosen.n_values), np.float32)
+    used = values[..., : 1 + chosen.n_features]
+    used[...] = rng.normal(size=used.shape)
     free = np.zeros((1, 1, 1), np.uint8)
     if scene == "sphere":
         values[..., 0] = np.where(_in_sphere(grid), SPHERE_DENSITY + values[..., 0], EMPTY_DENSITY)
-        free = free_distances(values, step)
+        free = free_distances(np.ascontiguousarray(values[..., :4]), step)
+    target_rgb = rng.uniform(size=(n_rays, 3)).astype(np.float32)
     return Workload(
         values=values,
         free=free,
         origins=origins[clear].reshape(-1, 3)[:n_rays],
         directions=directions[clear].reshape(-1, 3)[:n_rays],
-        target_rgb=rng.uniform(size=(n_rays, 3)).astype(np.float32),
+        target_rgb=target_rgb,
         n_steps=n_steps,
         step=step,
         scaled=scaled,
+        model=model,
+        network=_network(chosen, rng),
+    )
+
+
+def _network(model: Model, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+    """Random weights and biases, in turn, that keep numbers at about their size."""
+    if not model.n_inputs:
+        return ()
+    sizes = [model.n_inputs, *[model.width] * model.n_hidden, 3]
+    return tuple(
+        array.astype(np.float32)
+        for a, b in itertools.pairwise(sizes)
+        for array in (math.sqrt(2.0 / a) * rng.normal(size=(a, b)), 0.1 * rng.normal(size=b))
     )
 
 

@@ -10,16 +10,26 @@ import reference
 import torch
 import warp as wp
 from numpy.typing import NDArray
-from warpnerf_kernels import precision, tiles
+from warpnerf_kernels.base import precision, tiles
 
-from warpnerf.adjoint import AdjointLaunch, gradient_struct
-from warpnerf.grid import CONTRACTIONS, free_struct, grid_struct
-from warpnerf.parallel import Workers
-from warpnerf.render import JACOBIANS, SCALINGS, Steps
+from warpnerf.model.grid import box_struct, density_struct, free_struct, grid_struct
+from warpnerf.model.models import Model, Rgb
+from warpnerf.rendering.adjoint import AdjointLaunch, gradient_struct
+from warpnerf.rendering.rays import rays_struct
+from warpnerf.rendering.render import (
+    Steps,
+    scene_struct,
+    scratch_struct,
+    seen_struct,
+    variant_of,
+)
+from warpnerf.runtime.parallel import Workers
 
 Float64 = NDArray[np.float64]
 
 N_SEEDS = 20
+
+RGB = reference.RgbHead()
 
 
 def none_free() -> NDArray[np.uint8]:
@@ -31,7 +41,7 @@ def none_free() -> NDArray[np.uint8]:
 class Problem:
     """Rays through a grid."""
 
-    raw: Float64  # [X, Y, Z, 4]
+    raw: Float64  # [X, Y, Z, n_floats]
     box_min: Float64  # [3]
     box_max: Float64  # [3]
     origins: Float64  # [n_rays, 3]
@@ -49,6 +59,8 @@ class Problem:
     density_shift: float = 0.3
     density_scale: float = 1.0
     free: NDArray[np.uint8] = field(default_factory=none_free)  # [MX, MY, MZ] distances, cells
+    model: Model = field(default_factory=Rgb)
+    weights: Float64 = field(default_factory=lambda: np.zeros(0))  # [n_weights]
 
     @property
     def n_rays(self) -> int:
@@ -111,8 +123,8 @@ class Kernels:
         self.alone = self.workers if self.device.is_cuda else Workers(device, 1)
         self.packed = packed
         self.precision = name
-        self.render = precision.load(name, "render")
-        self.types = precision.load(name, "types")
+        self.assembly = precision.load(name, "launch.assembly")
+        self.types = precision.load(name, "base.types")
         self.dtype = np.float64 if name == "float64" else np.float32
 
     def module(self, name: str) -> Any:
@@ -129,98 +141,114 @@ class Kernels:
 
     def grid(self, p: Problem) -> Any:
         """The problem's grid as kernels take it."""
-        return grid_struct(
-            self.types,
-            self.array(p.raw.reshape(-1, 4), self.types.vec4),
-            (p.raw.shape[0], p.raw.shape[1], p.raw.shape[2]),
-            p.box_min,
-            p.box_max,
-            p.border,
-            p.density_shift,
-            p.density_scale,
-        )
+        n_floats = p.raw.shape[3]
+        values = self.array(p.raw.reshape(-1, n_floats), self.types.vector(n_floats))
+        size = (p.raw.shape[0], p.raw.shape[1], p.raw.shape[2])
+        return grid_struct(self.module("fields.dense"), values, size, p.border)
 
-    def _scene(self, p: Problem) -> tuple[Any, ...]:
+    def box(self, p: Problem) -> Any:
+        """Its box likewise."""
+        return box_struct(self.types, p.box_min, p.box_max, p.border)
+
+    def density(self, p: Problem) -> Any:
+        """And what its densities mean."""
+        return density_struct(self.types, p.density_shift, p.density_scale)
+
+    def march(self, p: Problem) -> Any:
+        """And how it is marched."""
+        return p.steps.struct(self.module("sampling.steps"))
+
+    def scene(self, p: Problem, workers: Workers | None = None) -> Any:
+        """What rays are marched through."""
         distance = wp.array(p.free.ravel(), dtype=wp.uint8, device=self.device)
         size = (p.free.shape[0], p.free.shape[1], p.free.shape[2])
-        free = free_struct(self.types, distance, size, p.border)
-        return self.grid(p), free, p.steps.struct(self.types)
+        return scene_struct(
+            p.model,
+            self.precision,
+            box=self.box(p),
+            free=free_struct(self.types, distance, size, p.border),
+            steps=p.steps,
+            grid=self.grid(p),
+            density=self.density(p),
+            weights=self.array(p.weights),
+            workers=workers or self.workers,
+        )
 
-    def _rays(self, p: Problem) -> tuple[wp.array, ...]:
+    def rays(self, p: Problem) -> Any:
+        """The rays."""
         vec3 = self.types.vec3
-        return (
+        return rays_struct(
+            self.assembly,
             self.array(p.origins, vec3),
             self.array(p.directions, vec3),
             self.array(p.offsets),
             self.array(p.background, vec3),
+            self.array(p.content_distance),
         )
 
     def variant(self, p: Problem, scaling: str = "none", jacobian: str = "none") -> Any:
-        return self.render.Variant(
-            CONTRACTIONS[p.contraction], SCALINGS[scaling], JACOBIANS[jacobian], self.packed
-        )
+        return variant_of(p.model, self.precision, p.contraction, scaling, jacobian, self.packed)
 
-    def scratch(self, variant: Any, capacity: int) -> tuple[int, wp.array]:
-        """Room for `capacity` samples or packs of a ray; of packs there must be one."""
-        capacity = 0 if self.device.is_cuda else max(capacity, int(self.packed))
-        kept = wp.empty(
-            self.workers.count * capacity,
-            dtype=self.render.kept_type(variant),
-            device=self.device,
-        )
-        return capacity, kept
+    def scratch(self, variant: Any, capacity: int, workers: Workers | None = None) -> Any:
+        """Room for `capacity` packs of each worker, of which there must be one."""
+        return scratch_struct(variant, max(capacity, 1), workers or self.workers, self.assembly)
 
-    def _forward(self, p: Problem) -> tuple[wp.array, ...]:
-        n = p.n_rays
-        out = (
-            self.zeros(n, self.types.vec3),
-            self.zeros(n),
-            self.zeros(n),
-            self.zeros(n, wp.int32),
-        )
+    def seen(self, p: Problem) -> Any:
+        """What the forward launch writes."""
         variant = self.variant(p)
+        seen = seen_struct(variant, p.n_rays, self.workers, self.assembly)
         self.workers.launch_owned(
-            self.render.render_forward_kernel(variant),
-            n,
-            *self._scene(p),
-            *self._rays(p),
-            *self.scratch(variant, 0),
-            *out,
+            self.assembly.render_forward_kernel(variant),
+            -(-p.n_rays // variant.batch),
+            p.n_rays,
+            self.scene(p),
+            self.rays(p),
+            self.scratch(variant, 0),
+            seen,
         )
-        return out
+        return seen
 
     def forward(self, p: Problem) -> Rendered:
         """Render."""
-        rgb, transmittance, depth, n_samples = self._forward(p)
+        seen = self.seen(p)
         return Rendered(
-            rgb=rgb.numpy(),
-            opacity=1.0 - transmittance.numpy(),
-            depth=depth.numpy(),
-            n_samples=n_samples.numpy(),
+            rgb=seen.rgb.numpy(),
+            opacity=1.0 - seen.transmittance.numpy(),
+            depth=seen.depth.numpy(),
+            n_samples=seen.n_samples.numpy(),
         )
 
     def backward(self, p: Problem, scaling: str = "none", jacobian: str = "none") -> Float64:
-        """The gradient [X, Y, Z, 4] of the outputs' product with the problem's adjoints."""
-        gradient = self.no_gradient(p.raw.shape)
+        """The gradient [X, Y, Z, n_floats] of the outputs' product with the problem's adjoints."""
+        gradient = self.no_gradient(p)
         self.add_backward(p, gradient, scaling, jacobian)
         return found_gradient(gradient).reshape(p.raw.shape)
+
+    def both_backward(
+        self, p: Problem, scaling: str = "none", jacobian: str = "none"
+    ) -> tuple[Float64, Float64]:
+        """That, and the gradient of the weights."""
+        gradient = self.no_gradient(p)
+        self.add_backward(p, gradient, scaling, jacobian)
+        weights = gradient.weights.numpy().sum(axis=0)
+        return found_gradient(gradient).reshape(p.raw.shape), weights
 
     def add_backward(
         self, p: Problem, gradient: Any, scaling: str = "none", jacobian: str = "none"
     ) -> None:
         """Add that to a kernel's Gradient."""
         variant = self.variant(p, scaling, jacobian)
-        self.adjoint(p, self.render.render_backward_kernel(variant), variant).run(
+        launch = self.adjoint(p, self.assembly.render_backward_kernel(variant), variant)
+        launch.run(
             p.n_rays,
             gradient,
-            *self._scene(p),
-            *self._rays(p),
-            self.array(p.content_distance),
-            *self._forward(p),
+            self.scene(p, launch.workers),
+            self.rays(p),
+            self.seen(p),
             self.array(p.adj_rgb, self.types.vec3),
             self.array(p.adj_opacity),
             self.array(p.adj_depth),
-            *self.scratch(variant, 0),
+            self.scratch(variant, 0, launch.workers),
         )
 
     def adjoint(self, p: Problem, kernel: wp.Kernel, variant: Any) -> AdjointLaunch:
@@ -229,38 +257,52 @@ class Kernels:
         most = p.steps.most(math.inf if p.contraction != "none" else length)
         return AdjointLaunch(kernel, variant, most, p.n_rays, self.workers)
 
-    def no_gradient(self, size: tuple[int, ...], flag: int = 0) -> Any:
-        """A kernel's Gradient of a grid [X, Y, Z, ...], zero, all tiles flagged alike."""
-        n_nodes = math.prod(size[:3])
-        values = self.zeros(n_nodes, self.types.vec4)
-        n_tiles = -(-n_nodes // tiles.TILE)
-        touched = wp.full(n_tiles, flag, dtype=wp.uint8, device=self.device)
-        return gradient_struct(self.types, values, touched)
+    def no_gradient(self, p: Problem) -> Any:
+        """A kernel's Gradient for a problem, zero."""
+        n_nodes, n_floats = math.prod(p.raw.shape[:3]), p.raw.shape[3]
+        return self.gradient(n_nodes, n_floats, n_weights=len(p.weights))
+
+    def gradient(self, n_nodes: int, n_floats: int, *, n_weights: int = 0, flag: int = 0) -> Any:
+        """A kernel's Gradient, zero, all tiles flagged alike."""
+        touched = wp.full(-(-n_nodes // tiles.TILE), flag, dtype=wp.uint8, device=self.device)
+        return gradient_struct(
+            self.types,
+            self.zeros(n_nodes, self.types.vector(n_floats)),
+            touched,
+            self.zeros((self.workers.count, n_weights)),
+        )
 
     def train(
         self, p: Problem, scaling: str = "none", jacobian: str = "none", capacity: int = 64
     ) -> tuple[Float64, Float64]:
-        """Squared errors [n_rays], and the gradient [X, Y, Z, 4] of their mean."""
+        """Squared errors [n_rays], and the gradient [X, Y, Z, n_floats] of their mean."""
+        return self.both_train(p, scaling, jacobian, capacity)[:2]
+
+    def both_train(
+        self, p: Problem, scaling: str = "none", jacobian: str = "none", capacity: int = 64
+    ) -> tuple[Float64, Float64, Float64]:
+        """That, and the gradient of the weights."""
         error, n_samples = self.zeros(p.n_rays), self.zeros(p.n_rays, wp.int32)
-        gradient = self.no_gradient(p.raw.shape)
+        gradient = self.no_gradient(p)
         variant = self.variant(p, scaling, jacobian)
-        self.adjoint(p, self.render.render_train_kernel(variant), variant).run(
+        launch = self.adjoint(p, self.assembly.render_train_kernel(variant), variant)
+        launch.run(
             p.n_rays,
             gradient,
-            *self._scene(p),
-            *self._rays(p),
-            self.array(p.content_distance),
+            self.scene(p, launch.workers),
+            self.rays(p),
             self.array(p.target, self.types.vec3),
             1.0 / p.n_rays,
-            *self.scratch(variant, capacity),
+            self.scratch(variant, capacity, launch.workers),
             error,
             n_samples,
         )
-        return error.numpy(), found_gradient(gradient).reshape(p.raw.shape)
+        found = found_gradient(gradient).reshape(p.raw.shape)
+        return error.numpy(), found, gradient.weights.numpy().sum(axis=0)
 
 
 def found_gradient(gradient: Any) -> Float64:
-    """What a kernel has added [n_nodes, 4]; every tile that holds some must be flagged."""
+    """What a kernel has added [n_nodes, n_floats]; every tile that holds some must be flagged."""
     values = gradient.values.numpy()
     flags = np.pad(gradient.touched.numpy(), (0, 1))
     tile = np.flatnonzero(values.any(axis=1)) // tiles.TILE
@@ -269,7 +311,11 @@ def found_gradient(gradient: Any) -> Float64:
 
 
 def oracle(
-    p: Problem, raw: torch.Tensor, scaling: str = "none", jacobian: str = "none"
+    p: Problem,
+    raw: torch.Tensor,
+    scaling: str = "none",
+    jacobian: str = "none",
+    head: reference.Head = RGB,
 ) -> reference.Rendering:
     """The same problem in the reference, raw a tensor that may want a gradient."""
     n_steps = 1
@@ -299,6 +345,7 @@ def oracle(
         scaling=scaling,
         content_distance=content.expand(p.n_rays),
         jacobian=jacobian,
+        head=head,
     )
 
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import warp as wp
 from drive import Kernels
-from warpnerf_kernels import precision
+from warpnerf_kernels.base import precision
 
 
 def of(kernels: Kernels) -> SimpleNamespace:
@@ -15,12 +15,13 @@ def of(kernels: Kernels) -> SimpleNamespace:
 
 @cache
 def _of(name: str) -> SimpleNamespace:
-    types = precision.load(name, "types")
-    interp = precision.load(name, "interp")
-    activation = precision.load(name, "activation")
-    contraction = precision.load(name, "contraction")
-    gradscale = precision.load(name, "gradscale")
-    real, vec3, vec4, Gradient = types.real, types.vec3, types.vec4, types.Gradient
+    types = precision.load(name, "base.types")
+    interp = precision.load(name, "fields.interp")
+    activation = precision.load(name, "base.activation")
+    contraction = precision.load(name, "space.contraction")
+    gradscale = precision.load(name, "volume.gradscale")
+    real, vec3, vec4 = types.real, types.vec3, types.vec4
+    Gradient = types.gradient_type(4)
 
     @wp.kernel(module="unique", enable_backward=False)
     def gather_points(

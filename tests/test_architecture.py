@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-KERNELS = sorted((ROOT / "kernels" / "warpnerf_kernels").glob("*.py"))
+KERNELS = sorted((ROOT / "kernels" / "warpnerf_kernels").rglob("*.py"))
 PACKAGE = sorted((ROOT / "warpnerf").rglob("*.py"))
 ORACLE = sorted((ROOT / "tests" / "reference").glob("*.py"))
 
@@ -61,7 +61,9 @@ def roots(path: Path) -> set[str]:
 
 def test_there_is_something_to_look_at() -> None:
     assert len(KERNELS) > 10 and len(PACKAGE) > 15 and len(ORACLE) > 4
-    assert "warpnerf_kernels.types" in set(imports(ROOT / "kernels/warpnerf_kernels/render.py"))
+    assert "warpnerf_kernels.base.types" in set(
+        imports(ROOT / "kernels/warpnerf_kernels/launch/assembly.py")
+    )
     assert "torch" in roots(ROOT / "warpnerf/torch.py")
 
 
@@ -81,7 +83,7 @@ def test_device_code_imports_itself_by_relative_names(path: Path) -> None:
 
 
 TORCH = ROOT / "warpnerf" / "torch.py"
-LPIPS = ROOT / "warpnerf" / "lpips.py"
+LPIPS = ROOT / "warpnerf" / "evaluation" / "lpips.py"
 """A network with weights of others: torch is imported inside its functions, when it is used."""
 
 
@@ -91,7 +93,7 @@ def test_the_package_knows_no_tests_and_torch_in_two_files_only(path: Path) -> N
     assert "torch" not in roots(path) or path in (TORCH, LPIPS)
     if path != TORCH:
         outside = set(imports(path, inside_functions=False))
-        assert not outside & {"torch", "warpnerf.torch", "warpnerf.lpips"}
+        assert not outside & {"torch", "warpnerf.torch", "warpnerf.evaluation.lpips"}
 
 
 @pytest.mark.parametrize("path", ORACLE, ids=lambda path: path.name)
@@ -119,49 +121,161 @@ def test_no_circle_of_imports() -> None:
     assert done == set(known)
 
 
-FLOORS = [
-    {"types"},
-    {"tiles"},
-    {"interp", "activation", "contraction", "march", "gradscale", "loss"},
-    {"integral", "vectors"},
-    {"packs", "order"},
-    {"parcels"},
-    {"integral_packed"},
-    {"render", "regularize", "adam", "occupancy", "camera", "precision", "probe"},
-]
+def layers_of(document: str) -> dict[str, int]:
+    """The table under "Layers" in ARCHITECTURE.md: the number of the layer of each name in it."""
+    section = document.split("\n## Layers\n")[1].split("\n## ")[0]
+    layers: dict[str, int] = {}
+    for row in re.findall(r"^\|[^|\n]*\| *`[^|\n]*\|", section, re.MULTILINE):
+        number, names = row.strip("|").split("|")
+        assert int(number) == len(set(layers.values())) + 1, f"layer {number} is out of order"
+        for name in re.findall(r"`([^`]+)`", names):
+            assert name not in layers, f"{name} is in two layers"
+            layers[name] = int(number)
+    return layers
 
 
-def test_floors_of_device_code() -> None:
-    floor = {name: level for level, names in enumerate(FLOORS) for name in names}
-    for path in KERNELS:
-        if path.stem == "__init__":
-            continue
-        for name in imports(path):
-            below = name.removeprefix("warpnerf_kernels.")
-            if below in floor and below != path.stem:
-                assert floor[below] <= floor[path.stem], f"{path.stem} imports {below}"
+def layer_of(module: str, layers: dict[str, int]) -> int | None:
+    """A module's own layer, or else that of the nearest folder around it that has one: `a.b.*`."""
+    if module in layers:
+        return layers[module]
+    while module:
+        if f"{module}.*" in layers:
+            return layers[f"{module}.*"]
+        module = module.rpartition(".")[0]
+    return None
+
+
+LAYERS = layers_of((ROOT / "ARCHITECTURE.md").read_text())
+
+
+def test_layers_are_read_as_they_are_written() -> None:
+    table = "\n## Layers\n\n| | names | |\n|---|---|---|\n"
+    table += "| 1 | `a.base.*`, `a` | x |\n| 2 | `a.*` | y |\n\n## Next\n| 3 | `b` | |\n"
+    layers = layers_of(table)
+    assert layers == {"a.base.*": 1, "a": 1, "a.*": 2}
+    assert layer_of("a", layers) == layer_of("a.base", layers) == layer_of("a.base.x", layers) == 1
+    assert layer_of("a.other.x", layers) == 2
+    assert layer_of("b", layers) is None and layer_of("ab.x", layers) is None
+    with pytest.raises(AssertionError, match="two layers"):
+        layers_of(table.replace("`a.*`", "`a.*`, `a`"))
+
+
+def test_layers_list_every_module_and_nothing_else() -> None:
+    known = modules()
+    unlisted = [module for module in known if layer_of(module, LAYERS) is None]
+    assert not unlisted, f"list these in ARCHITECTURE.md, under Layers: {unlisted}"
+    stale = [name for name in LAYERS if name.removesuffix(".*") not in known]
+    assert not stale, f"ARCHITECTURE.md lists layers of what does not exist: {stale}"
+    assert len(set(LAYERS.values())) > 10
+
+
+@pytest.mark.parametrize("path", (*KERNELS, *PACKAGE), ids=module_of)
+def test_imports_point_down_or_stay_within_a_layer(path: Path) -> None:
+    known = modules()
+    own = layer_of(module_of(path), LAYERS)
+    assert own is not None
+    for name in sorted(set(imports(path)) & set(known)):
+        below = layer_of(name, LAYERS)
+        assert below is not None and below <= own, (
+            f"{module_of(path)} is in layer {own} and imports {name} of layer {below}"
+        )
+
+
+def forward_of(name: str, names: list[str]) -> str | None:
+    """What a function is the adjoint of: adj_x of x, x_backward of x_forward."""
+    if name.startswith("adj_"):
+        return name.removeprefix("adj_")
+    if "_backward" in name:
+        return name.replace("_backward", "_forward")
+    inner = name.replace("_adj_", "_", 1)  # pack_adj_x of pack_x; others only contain the word
+    return inner if inner != name and inner in names else None
+
+
+def adjoints(source: str) -> list[tuple[str, bool]]:
+    """All adjoints in a module, and whether each stands directly below its forward function.
+
+    Vector forms and native functions are functions like others: adj_x_pack stands below x_pack.
+    Overloads follow each other, and x_slope may stand between x and adj_x. Functions inside
+    functions are looked at, too, except inside an adjoint.
+    """
+    found: list[tuple[str, bool]] = []
+
+    def look(scope: ast.AST) -> None:
+        children = list(ast.iter_child_nodes(scope))
+        names = [child.name for child in children if isinstance(child, ast.FunctionDef)]
+        above: list[str] = []  # functions so far, overloads as one
+        for child in children:
+            if not isinstance(child, ast.FunctionDef):
+                look(child)
+                continue
+            forward = forward_of(child.name, names)
+            if forward is None:
+                look(child)
+            elif above[-1:] != [child.name]:
+                before = above[:-1] if above[-1:] == [f"{forward}_slope"] else above
+                found.append((child.name, before[-1:] == [forward]))
+            if above[-1:] != [child.name]:
+                above.append(child.name)
+
+    look(ast.parse(source))
+    return found
+
+
+def stubs(*names: str) -> str:
+    return "".join(f"def {name}(): ...\n" for name in names)
+
+
+def test_a_misplaced_adjoint_is_seen() -> None:
+    def right(*names: str) -> list[bool]:
+        return [in_place for _, in_place in adjoints(stubs(*names))]
+
+    assert right("x", "adj_x", "x_pack", "adj_x_pack", "pack_x", "pack_adj_x") == [True] * 3
+    assert right("x", "x_slope", "adj_x") == right("x", "x", "adj_x", "adj_x") == [True]
+    assert right("x_forward_kernel", "x_backward_kernel") == [True]
+    assert right("x", "y", "adj_x") == right("adj_x", "x") == right("adj_x") == [False]
+    assert right("x", "x_pack", "adj_x", "adj_x_pack") == [False, False]
+    assert right("pack_x", "y", "pack_adj_x") == [False]
+    assert right("x", "begin_adj_walk") == []
+    inside = "class Part:\n    def make():\n        def x(): ...\n"
+    assert adjoints(inside + "        def adj_x(): ...\n") == [("adj_x", True)]
+    assert adjoints(inside + "        y = 1\n    def adj_x(): ...\n") == [("adj_x", False)]
+    native = '@wp.func_native("code")\ndef x(): ...\n' * 2
+    assert adjoints(native + native.replace("x()", "adj_x()")) == [("adj_x", True)]
 
 
 def test_every_adjoint_stands_below_its_forward() -> None:
-    """`adj_x` follows `x`, `x_backward` follows `x_forward`; a slope may stand between."""
-    adjoints = 0
+    seen = []
     for path in KERNELS:
-        tree = ast.parse(path.read_text())
-        names = [node.name for node in tree.body if isinstance(node, ast.FunctionDef)]
-        for index, name in enumerate(names):
-            forward = None
-            if name.startswith("adj_"):
-                forward = name.removeprefix("adj_")
-            elif "_backward" in name:
-                forward = name.replace("_backward", "_forward")
-            if forward is None:
-                continue
-            adjoints += 1
-            before = names[index - 1]
-            if before == f"{forward}_slope":
-                before = names[index - 2]
-            assert before == forward, f"{path.name}: {name} does not stand below {forward}"
-    assert adjoints >= 8
+        for name, in_place in adjoints(path.read_text()):
+            assert in_place, f"{path.name}: {name} does not stand directly below what it belongs to"
+            seen.append(name)
+    assert len(seen) >= 10 and {"adj_gather", "adj_composite", "render_backward_kernel"} <= {*seen}
+
+
+DOCUMENTS = [ROOT / "kernels/README.md", ROOT / "benchmarks/README.md"]
+DOCUMENTS += sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+
+
+def anchors(document: Path) -> set[str]:
+    """What links may name after #, as GitHub makes it of headings."""
+    headings = re.findall(r"^#+ (.*)$", document.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_documents_name_what_exists(document: Path) -> None:
+    """Links, their anchors, and Python files, as much of their path as is written."""
+    text = document.read_text()
+    for link, anchor in re.findall(r"\]\(([^)#]*)#?([^)]*)\)", text):
+        if "://" in link:
+            continue
+        target = document.parent / link if link else document
+        assert target.exists(), f"link to {link}"
+        assert not anchor or anchor in anchors(target), f"link to {link}#{anchor}"
+    folders = ("kernels", "warpnerf", "tests", "benchmarks")
+    files = [f"/{p.relative_to(ROOT)}" for folder in folders for p in (ROOT / folder).rglob("*.py")]
+    for named in set(re.findall(r"[\w/]+\.py\b", text)):
+        assert any(file.endswith(f"/{named}") for file in files), f"{named} does not exist"
 
 
 def test_gradients_are_host_words_and_adjoints_device_words() -> None:
@@ -172,8 +286,10 @@ def test_gradients_are_host_words_and_adjoints_device_words() -> None:
 
 
 def test_one_marching_loop() -> None:
-    """Both passes take their samples from next_sample; nothing else asks where a step begins."""
-    source = (ROOT / "kernels/warpnerf_kernels/integral.py").read_text()
-    for node in ast.parse(source).body:
-        if isinstance(node, ast.FunctionDef) and "step_length(" in ast.unparse(node):
-            assert node.name == "next_sample"
+    """Both passes take their samples from next_sample; nothing else asks where a step lies."""
+    asking = []
+    for path in KERNELS:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef) and "interval_of(" in ast.unparse(node):
+                asking.append(node.name)
+    assert asking == ["traversal", "next_sample"]  # which is a function of the former

@@ -15,12 +15,11 @@ import torch
 import warp as wp
 from PIL import Image
 from tiny_scenes import camera_at, picture, ring
-from warpnerf_kernels.types import vec4
 from watched_command import assert_refused, assert_trained, command, make_scene, train
 
 import warpnerf as wn
 from warpnerf.checks import InputError
-from warpnerf.memory import usable_memory
+from warpnerf.runtime.memory import usable_memory
 from warpnerf.torch import render_rays, scale_gradient
 
 pytestmark = pytest.mark.usefixtures("compiled_kernels")
@@ -181,7 +180,7 @@ def test_62_NaN_in_a_grid(tmp_path: Path, value: float) -> None:
     field = wn.load_field(outcome.run / "field.safetensors", threads=1)
     values = field.grid.values.numpy()
     values[10, 2] = value
-    bad = replace(field.grid, values=wp.array(values, dtype=vec4, device="cpu"))
+    bad = replace(field.grid, values=wp.array(values, dtype=field.grid.values.dtype, device="cpu"))
     (tmp_path / "bad").mkdir()
     shutil.copy(outcome.run / "config.json", tmp_path / "bad")
     wn.save_field(tmp_path / "bad/field.safetensors", replace(field, grid=bad))
@@ -372,7 +371,9 @@ needs_limits = pytest.mark.skipif(
 @needs_limits
 def test_72_out_of_memory_for_the_grid(tmp_path: Path) -> None:
     scene = make_scene(tmp_path)
-    prelude = leaving(200, "import warp, warpnerf.run, warpnerf.parallel as p; p.Workers()")
+    prelude = leaving(
+        200, "import warp, warpnerf.training.run, warpnerf.runtime.parallel as p; p.Workers()"
+    )
     outcome = train(scene, "--voxels", "60000000", folder=tmp_path, prelude=prelude)
     assert_refused(outcome, "fewer")
 
@@ -381,7 +382,7 @@ def test_72_out_of_memory_for_the_grid(tmp_path: Path) -> None:
 def test_72_out_of_memory_for_an_image(tmp_path: Path) -> None:
     scene = make_scene(tmp_path)
     Image.new("RGB", (8000, 6000)).save(scene / "images/000.png")
-    prelude = leaving(100, "import warpnerf.data, warpnerf.evaluation")
+    prelude = leaving(100, "import warpnerf.scenes.load, warpnerf.evaluation.evaluate")
     outcome = train(scene, folder=tmp_path, prelude=prelude)
     assert_refused(outcome, "out of memory", "--downscale")
 

@@ -14,6 +14,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "benchmarks"))
 
+import against  # noqa: E402
 import candidates  # noqa: E402
 import roofline  # noqa: E402
 import threads  # noqa: E402
@@ -47,16 +48,14 @@ def is_interval(figures):
 
 
 def test_gradient_scaling(tmp_path):
-    options = ("--pairs", "2", "--repeats", "1", "--grid", "8")
+    options = ("--pairs", "2", "--repeats", "1", "--grid", "8", "--models", "rgb", "deferred")
     record, _ = run("gradient_scaling.py", tmp_path / "record.json", *options)
     assert record["n_samples"] == 300_000
     assert record["grid"] == 8
-    assert [result["name"] for result in record["results"]] == [
-        "render_backward",
-        "render_train",
-        "control",
-        "torch backward",
-        "operation alone",
+    ours = ["render_backward", "render_train", "control"]
+    assert [(result["model"], result["name"]) for result in record["results"]] == [
+        *(("rgb", name) for name in (*ours, "torch backward", "operation alone")),
+        *(("deferred", name) for name in ours),
     ]
     for result in record["results"]:
         assert result["pairs"] == 2
@@ -69,7 +68,7 @@ def test_gradient_scaling(tmp_path):
 
 def test_throughput(tmp_path):
     options = ("--grids", "8", "12", "--rays", "64", "--steps", "16", "--rounds", "2")
-    options += ("--threads", "1", "2", "--without", "torch.compile")
+    options += ("--threads", "1", "2", "--without", "torch.compile", "--models", "rgb")
     record, printed = run("throughput.py", tmp_path / "record.json", *options)
     compared = {"warpnerf", "torch"} | (
         set(candidates.MODULES) - {"torch.compile"} - set(record["left_out"])
@@ -113,6 +112,92 @@ def test_throughput(tmp_path):
     assert plot.exists() or "no plot: matplotlib is not installed" in printed
 
 
+def test_throughput_of_other_models(tmp_path):
+    options = ("--grids", "8", "--rays", "64", "--steps", "16", "--rounds", "2", "--threads", "1")
+    options += ("--without", "torch.compile", "numba", "--models", "sh", "deferred", "features")
+    record, printed = run("throughput.py", tmp_path / "record.json", *options)
+    assert [(case["model"], case["scene"]) for case in record["cases"]] == [
+        (model, scene) for model in ("sh", "deferred", "features") for scene in ("dense", "sphere")
+    ]
+    assert "drjit, is not written for it" in printed
+    for case in record["cases"]:
+        assert set(case["left_out"]) == {"torch.compile", "numba", "taichi", "drjit"}
+        (row,) = case["rows"]
+        assert set(row["candidates"]) == {"warpnerf", "torch"}
+        assert "bounds_ms" not in row  # only rgb's operations are counted
+        for differences in case["differences"].values():
+            compared = {"rgb", "gradient", *(["network"] if case["model"] != "sh" else [])}
+            assert set(differences) == compared
+            assert max(differences.values()) < 1e-4
+
+
+def test_against(tmp_path):
+    """This tree against itself."""
+    options = (str(ROOT), "--grids", "8", "--rays", "64", "--steps", "16", "--threads", "2")
+    options += ("--starts", "2", "--rounds", "2", "--models", "rgb", "deferred")
+    record, printed = run("against.py", tmp_path / "record.json", *options)
+    assert [row["model"] for row in record["rows"]] == ["rgb"] * 4 + ["deferred"] * 2
+    assert record["commits"]["here"] == record["commits"]["there"]
+    for row in record["rows"]:
+        assert row["name"] in printed
+        assert row["differences"] == {"rgb": 0.0, "gradient": 0.0}
+        assert len(row["ratio_by_start"]) == 2
+        for key in ("here_ms", "there_ms", "ratio", "ratio_of_cores"):
+            assert is_interval(row[key])
+
+
+def test_against_refuses_what_computes_something_else():
+    class Answers:
+        def __init__(self, rgb):
+            self._rgb = rgb
+
+        def ask(self, name, path):
+            assert name == "results"
+            np.savez(path, rgb=self._rgb, gradient=np.ones(3))
+
+    found = against.compare(Answers(np.ones(3)), Answers(np.ones(3)))
+    assert found == {"rgb": 0.0, "gradient": 0.0}
+    with pytest.raises(SystemExit, match="the trees differ in rgb by"):
+        against.compare(Answers(np.ones(3)), Answers(np.array([1.0, 1.0, 1.1])))
+
+
+def test_models(tmp_path):
+    options = ("builtin:room-sparse", "--downscale", "16", "--steps", "12", "--rounds", "2")
+    options += ("--threads", "1", "2", "--models", "deferred")
+    record, printed = run("models.py", tmp_path / "record.json", *options)
+    rows = record["rows"]
+    assert [(row["threads"], row["model"]) for row in rows] == [
+        (threads, model) for threads in (1, 2) for model in ("rgb", "deferred")
+    ]
+    for row in rows:
+        assert row["steps_an_update"] == 16 and row["samples_per_ray"] > 1
+        for key in ("step_ms", "rays_ms", "drawing_ms", "Adam_ms", "smoothing_ms", "over_rgb"):
+            assert is_interval(row[key])
+        parts = sum(row[f"{part}_ms"]["median"] for part in ("rays", "drawing", "Adam"))
+        assert parts < 1.5 * row["step_ms"]["median"]
+        assert f"{row['over_rgb']['median']:.2f}" in printed
+        if row["model"] == "rgb":
+            assert row["over_rgb"]["low"] == row["over_rgb"]["high"] == 1.0
+
+
+def test_heads(tmp_path):
+    options = ("builtin:room-sparse", "--downscale", "8", "--time-limit", "2", "--points", "3")
+    options += ("--models", "rgb", "deferred", "--seeds", "0", "1")
+    record, printed = run("heads.py", tmp_path / "record.json", *options)
+    rows = record["rows"]
+    assert [(row["seed"], row["model"]) for row in rows] == [
+        (seed, model) for seed in (0, 1) for model in ("rgb", "deferred")
+    ]
+    for row in rows:
+        seconds = [point["seconds"] for point in row["curve"]]
+        assert 1 <= len(seconds) <= 3 and seconds == sorted(seconds)
+        assert seconds[-1] > 1.9  # the others' turns do not count
+        assert all(5 < point["psnr"] < 50 and 0 < point["ssim"] < 1 for point in row["curve"])
+        assert f"{row['curve'][-1]['psnr']:.2f}" in printed
+    plot = tmp_path / "record.png"
+    assert plot.exists() == (f"plot: {plot}" in printed)
+
+
 def test_apart_does_the_same_work(on_cpu):
     work = workload.make_workload("random", 8, 65, 16)
     apart = throughput.Apart(work, 2, "cpu")
@@ -149,20 +234,21 @@ def test_rendering(tmp_path):
 
 
 def test_training(tmp_path):
-    options = ("builtin:room", "--downscale", "16", "--steps", "30")
+    options = ("builtin:room-sparse", "--downscale", "16", "--steps", "30", "--model", "sh")
     record, printed = run("training.py", tmp_path / "record.json", *options)
-    row = record["scenes"]["builtin:room"]
+    row = record["scenes"]["builtin:room-sparse"]
     parts = ["rays", "drawing", "Adam", "smoothing", "free space", "growing", "reports", "rest"]
     assert all(f"{100 * row[part]:.1f} %" in printed for part in parts)
     assert abs(sum(row[part] for part in parts) - 1) < 1e-9
     assert all(row[part] > 0 for part in parts if part != "free space")  # not in so few steps
     assert row["steps"] == 30 and row["samples_per_ray"] > 1
+    assert record["model"] == "sh"
 
 
 def test_threads(tmp_path):
     options = ("--grids", "8", "12", "--rays", "64", "--steps", "16", "--rounds", "8")
     record, printed = run("threads.py", tmp_path / "record.json", *options)
-    assert len(record["cases"]) == 5
+    assert len(record["cases"]) == 5 + 6
     for case in record["cases"]:
         assert case["name"] in printed
         assert case["all"]["rounds"] == 8
@@ -180,13 +266,14 @@ def test_a_round_counts_where_nobody_else_had_the_cores():
 
 
 def test_footprint(tmp_path):
-    options = ("builtin:room", "--downscale", "8", "--steps", "30", "--starts", "2")
+    options = ("builtin:room-sparse", "--downscale", "8", "--steps", "30", "--starts", "2")
     record, printed = run("footprint.py", tmp_path / "record.json", *options)
     assert record["cold_seconds"] > 0
     assert is_interval(record["cached_seconds"])
     memory = record["memory"]
     assert memory["steps"] == 30
-    assert memory["arrays_bytes"] == 64 * math.prod(memory["grid"])
+    assert record["model"] == "deferred"
+    assert memory["arrays_bytes"] == 4 * 4 * 8 * math.prod(memory["grid"])
     if memory["peak_bytes"] is None:
         assert "is not there to tell" in printed
     else:
@@ -195,7 +282,8 @@ def test_footprint(tmp_path):
 
 
 def test_schedules(tmp_path):
-    options = ("builtin:room", "--downscale", "8", "--seeds", "1", "2", "--time-limit", "1.5")
+    scene = ("builtin:room-sparse", "--downscale", "8")
+    options = (*scene, "--seeds", "1", "2", "--time-limit", "1.5")
     record, printed = run("schedules.py", tmp_path / "record.json", *options)
     rows = record["rows"]
     assert [row["seed"] for row in rows] == [1] * 4 + [2] * 4
@@ -207,25 +295,42 @@ def test_schedules(tmp_path):
 
 
 def test_ray_order(tmp_path, on_cpu):
-    options = ("builtin:room", "--downscale", "16", "--steps", "4", "--threads", "2")
+    options = ("builtin:room-sparse", "--downscale", "16", "--steps", "4", "--threads", "2")
     record, printed = run("ray_order.py", tmp_path / "record.json", *options, "--rounds", "2")
-    row = record["scenes"]["builtin:room"]
+    row = record["scenes"]["builtin:room-sparse"]
     assert list(row) == [f"2 threads, {steps} steps" for steps in (1, 4, 16)]
     assert all(is_interval(found) for found in row.values())
-    assert printed.count("builtin:room") == 3
+    assert printed.count("builtin:room-sparse") == 3
 
 
-def test_compiled_torch_agrees():
+@pytest.mark.parametrize("model", ["rgb", "features"])
+def test_compiled_torch_agrees(model):
     """Apart from the rest, for it takes long to compile."""
-    load = candidates.find("cpu")[0].get("torch.compile")
+    found, missing = candidates.find("cpu", model)
+    load = found.get("torch.compile")
     if load is None:
-        assert candidates.find("cpu")[1]["torch.compile"] == "there is no C++ compiler"
+        assert missing["torch.compile"] == "there is no C++ compiler"
         return
-    work = workload.make_workload("random", 8, 16, 12, scene="sphere")
+    work = workload.make_workload("random", 8, 16, 12, scene="sphere", model=model)
     differences = throughput.check(
         {("warpnerf", 2): WarpStep(work, 2, "cpu"), ("torch.compile", 1): load(work, 1, "cpu")}
     )
     assert set(differences) == {"warpnerf, 2 threads", "torch.compile, 1 threads"}
+
+
+@pytest.mark.parametrize("model", ["sh", "deferred", "features"])
+def test_numba_agrees(model):
+    """Likewise."""
+    found, missing = candidates.find("cpu", model)
+    load = found.get("numba")
+    if load is None:
+        assert missing["numba"] == "numba is not installed"
+        return
+    work = workload.make_workload("random", 8, 48, 24, scene="sphere", model=model)
+    throughput.check(
+        {("warpnerf", 1): WarpStep(work, 1, "cpu")}
+        | {("numba", threads): load(work, threads, "cpu") for threads in (1, 2)}
+    )
 
 
 class Wrong:
@@ -292,9 +397,11 @@ def test_patches_are_neighbouring_pixels_of_one_camera():
     assert (work.origins[0] != work.origins[64]).any()
 
 
-def test_needs_counts_lines():
+@pytest.mark.parametrize("model", ["rgb", "deferred", "sh"])
+def test_needs_counts_lines(model):
     """Against sets of lines, sample by sample."""
-    work = workload.make_workload("random", 9, 130, 20, scene="sphere")
+    work = workload.make_workload("random", 9, 130, 20, scene="sphere", model=model)
+    n_bytes = 4 * work.values.shape[3]
     q, needed = work.positions()
     groups = {}
     for ray, step in np.argwhere(needed):
@@ -302,7 +409,8 @@ def test_needs_counts_lines():
         lines = groups.setdefault(ray // 64, set())
         for corner in np.ndindex(2, 2, 2):
             x, y, z = np.array([i, j, k]) + corner
-            lines.add(((x * 9 + y) * 9 + z) * 16 // 64)
+            begin = ((x * 9 + y) * 9 + z) * n_bytes
+            lines.update(byte // 64 for byte in range(begin, begin + n_bytes))
     needs = roofline.needs(work)
     assert needs.n_samples == needed.sum() > 100
     assert needs.lines == len(set().union(*groups.values()))

@@ -9,8 +9,8 @@ import pytest
 from tiny_fields import tiny_field
 from tiny_scenes import camera_at, ring
 
-from warpnerf.camera import Camera
 from warpnerf.checks import InputError
+from warpnerf.scenes.camera import Camera
 
 POSE = ring(1)[0]
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +16,11 @@ from safetensors.numpy import load_file, save_file
 from tiny_fields import assert_same_state, tiny_field, tiny_state
 from tiny_scenes import camera_at, ring
 
-from warpnerf import checkpoint
-from warpnerf.checkpoint import (
+from warpnerf.checks import InputError
+from warpnerf.config import Contraction, GridConfig, MarchConfig, OptimConfig, TrainConfig
+from warpnerf.model.models import Deferred, Features, Model, Rgb, SphericalHarmonics, n_weights
+from warpnerf.training import checkpoint
+from warpnerf.training.checkpoint import (
     DamagedFileError,
     load_checkpoint,
     load_field,
@@ -22,8 +28,6 @@ from warpnerf.checkpoint import (
     save_field,
     write_atomically,
 )
-from warpnerf.checks import InputError
-from warpnerf.config import GridConfig, MarchConfig, OptimConfig, TrainConfig
 
 
 @pytest.fixture
@@ -43,14 +47,23 @@ def rewrite(path: Path, header: Any = None, **tensors: np.ndarray) -> None:
     save_file(contents, path, metadata={"header": text, "sha256": digest})
 
 
-@pytest.mark.parametrize("contraction", ["none", "linf", "l2"])
-def test_it_comes_back_bit_for_bit(tmp_path: Path, contraction: str) -> None:
-    field = tiny_field(contraction=contraction)
+MODELS = [Rgb(), SphericalHarmonics(degree=1), Deferred(), Features(width=16, hidden_layers=1)]
+
+
+@pytest.mark.parametrize(
+    ("contraction", "model"),
+    [*((c, Rgb()) for c in ("none", "linf", "l2")), *(("none", model) for model in MODELS[1:])],
+    ids=["none", "linf", "l2", *(model.name for model in MODELS[1:])],
+)
+def test_it_comes_back_bit_for_bit(tmp_path: Path, contraction: Contraction, model: Model) -> None:
+    field = tiny_field(contraction=contraction, model=model)
     path = tmp_path / "field.safetensors"
     save_field(path, field)
     back = load_field(path, threads=1)
     np.testing.assert_array_equal(back.grid.values.numpy(), field.grid.values.numpy())
+    np.testing.assert_array_equal(back.weights.numpy(), field.weights.numpy())
     np.testing.assert_array_equal(back.free.distance.numpy(), field.free.distance.numpy())
+    assert back.model == model
     assert (back.steps, back.background) == (field.steps, field.background)
     camera = camera_at(ring(3)[1])
     seen, expected = back.render(camera), field.render(camera)
@@ -137,13 +150,18 @@ EVERYTHING_SET = TrainConfig(
     threads=3,
     device="cuda:1",
     checkpoint_every=0.7,
+    model=Features(features=9, frequencies=2, width=16, hidden_layers=1, threshold=1e-3 / 3.0),
     grid=GridConfig(voxels=1000, grow_at=(0.1, 0.2, 1.0 / 3.0)),
     march=MarchConfig(far=1e9 / 3.0, jitter=False),
     optim=OptimConfig(epsilon=1e-300),
 )
 
 
-@pytest.mark.parametrize("config", [TrainConfig(), EVERYTHING_SET], ids=["defaults", "all set"])
+@pytest.mark.parametrize(
+    "config",
+    [TrainConfig(), EVERYTHING_SET, *(TrainConfig(model=model) for model in MODELS)],
+    ids=["defaults", "all set", *(model.name for model in MODELS)],
+)
 def test_a_training_comes_back_bit_for_bit(tmp_path: Path, config: TrainConfig) -> None:
     state = tiny_state(300, config)
     save_checkpoint(tmp_path / "training", state)
@@ -170,7 +188,8 @@ def test_metadata_tell_what_a_file_is(tmp_path: Path) -> None:
     with safe_open(tmp_path / "training", framework="numpy") as file:
         metadata = file.metadata()
     header = json.loads(metadata["header"])
-    assert header["format"] == "warpnerf-training-5"
+    assert header["format"] == "warpnerf-training-6"
+    assert header["model"]["name"] == header["training"]["config"]["model"]["name"] == "deferred"
     assert header["training"]["progress"]["step"] == 3
     assert header["training"]["config"]["grid"]["voxels"] == TrainConfig().grid.voxels
     assert len(metadata["sha256"]) == 64
@@ -195,10 +214,35 @@ def test_a_short_write_is_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert (tmp_path / "file").read_bytes() == b"abcdefghijk"
 
 
+N_WEIGHTS = n_weights(Deferred())
+
+
+def in_model(old: str, new: str) -> Callable[[str], str]:
+    """Replace a text in the header where it says which model the field has, and nowhere else."""
+
+    def change(text: str) -> str:
+        before, model, after = re.split(r'("model": {[^{}]*}, "steps")', text)
+        assert old in model
+        return before + model.replace(old, new) + after
+
+    return change
+
+
+def in_config(old: str, new: str) -> Callable[[str], str]:
+    """The same where it says which model was asked for."""
+
+    def change(text: str) -> str:
+        before, model, after = re.split(r'("model": {[^{}]*}, "occupancy_every")', text)
+        assert old in model
+        return before + model.replace(old, new) + after
+
+    return change
+
+
 @pytest.mark.parametrize(
     ("header", "tensors", "says"),
     [
-        (lambda text: text.replace("training-5", "training-6"), {}, "training-6"),
+        (lambda text: text.replace("training-6", "training-7"), {}, "training-7"),
         (lambda text: text[:-1], {}, "header"),
         (lambda text: "[" * 100_000, {}, "header"),
         (lambda text: "[]", {}, "header"),
@@ -211,11 +255,24 @@ def test_a_short_write_is_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         (lambda text: text.replace('"updates": 5', '"updates": 6'), {}, "6 updates"),
         (lambda text: text.replace('"seed": 0', '"seed": -1'), {}, "seed"),
         (lambda text: text.replace('"step": 5', '"step": "five"'), {}, "step"),
+        (in_model('"deferred"', '"dreams"'), {}, "dreams"),
+        (in_model('"specular": 4', '"specular": 5'), {}, "rendered"),  # as many floats
+        (in_model('"width": 32', '"width": 16'), {}, "rendered"),
+        (in_model('"width": 32', '"width": 33'), {}, "model.width"),
+        (in_model('"width": 32', '"width": 32.0'), {}, "'width'"),
+        (in_model('"width": 32', '"breadth": 32'), {}, "'breadth'"),
+        (in_config('"frequencies": 1', '"frequencies": 2'), {}, "another model"),
         (None, {"extra": np.zeros(3, np.float32)}, "extra"),
-        (None, {"moments": np.zeros((5, 6, 6, 4), np.uint32)}, "'moments'"),
-        (None, {"moments": np.zeros((5, 6, 7, 4), np.float32)}, "'moments'"),
-        (None, {"moments": np.full((5, 6, 7, 4), 0x7F800000, np.uint32)}, "'moments'"),
-        (None, {"moments": np.full((5, 6, 7, 4), 0x0000FF00, np.uint32)}, "'moments'"),
+        (None, {"moments": np.zeros((210, 8), np.uint32)}, "moments"),
+        (None, {"values.moments": np.zeros((180, 8), np.uint32)}, "'values.moments'"),
+        (None, {"values.moments": np.zeros((210, 8), np.float32)}, "'values.moments'"),
+        (None, {"values.moments": np.full((210, 8), 0x7F800000, np.uint32)}, "'values.moments'"),
+        (None, {"values.moments": np.full((210, 8), 0x0000FF00, np.uint32)}, "'values.moments'"),
+        (None, {"weights.mean": np.zeros(7, np.float32)}, "'weights.mean'"),
+        (None, {"weights.square": np.full(N_WEIGHTS, np.inf, np.float32)}, "'weights.square'"),
+        (None, {"weights": np.zeros(N_WEIGHTS + 1, np.float32)}, "rendered"),
+        (None, {"weights": np.zeros(N_WEIGHTS, np.uint32)}, "rendered"),
+        (None, {"weights": np.full(N_WEIGHTS, np.nan, np.float32)}, "rendered"),
         (None, {"values": np.zeros((5, 6, 7, 3), np.float32)}, "values"),
         (None, {"free_distance": np.zeros((0, 2, 2), np.uint8)}, "rendered"),
     ],
@@ -229,6 +286,160 @@ def test_a_forged_training_is_refused(
     with pytest.raises(InputError, match=r"training\.safetensors") as caught:
         load_checkpoint(path)
     assert says in str(caught.value)
+
+
+OLD_FIELD = {
+    "background": [0.1, 0.6, 0.9],
+    "border": 0.0,
+    "box_max": [1.0, 1.0, 1.0],
+    "box_min": [-1.0, -1.0, -1.0],
+    "contraction": "none",
+    "density_scale": 2.0,
+    "density_shift": -0.5,
+    "format": "warpnerf-field-1",
+    "steps": {
+        "far": 30.0,
+        "growth": 0.0,
+        "n_linear": 0,
+        "near": 0.1,
+        "step": 0.05,
+        "transmittance_min": 0.001,
+    },
+}
+"""A field's header as the version before wrote it, which had one model and did not name it."""
+
+OLD_TRAINING = OLD_FIELD | {
+    "format": "warpnerf-training-5",
+    "training": {
+        "config": {
+            "alpha_min": 0.01,
+            "background": "auto",
+            "checkpoint_every": 300.0,
+            "content_distance": "auto",
+            "device": "cpu",
+            "grid": {
+                "alpha_init": 0.001,
+                "border": 0.2,
+                "contraction": "auto",
+                "grow_at": [0.3, 0.4, 0.5, 0.6],
+                "voxels": 4096000,
+            },
+            "jacobian": "none",
+            "march": {
+                "far": None,
+                "growth": 0.02,
+                "jitter": True,
+                "near": 0.0,
+                "step_voxels": 1.0,
+                "transmittance_min": 0.001,
+            },
+            "occupancy_every": 100,
+            "optim": {
+                "accumulate_at": "auto",
+                "beta1": 0.9,
+                "beta2": 0.99,
+                "decay": 0.07,
+                "epsilon": 1e-08,
+                "learning_rate_density": 0.5,
+                "learning_rate_rgb": 0.2,
+                "tv_density": 3e-09,
+                "tv_every": 8,
+                "tv_rgb": 3e-10,
+            },
+            "rays_per_step": 4096,
+            "scaling": "clamped",
+            "seed": 0,
+            "steps": 4000,
+            "threads": 1,
+            "time_limit": None,
+        },
+        "content_distance": 0.6666666666666666,
+        "grown": 2,
+        "progress": {
+            "fraction": 0.25,
+            "loss": 0.1,
+            "occupied": 0.75,
+            "psnr": 10.0,
+            "samples_per_ray": 12.5,
+            "seconds": 0.3333333333333333,
+            "size": [5, 6, 7],
+            "step": 5,
+        },
+        "reach": 3.141592653589793,
+        "scene_digest": "of a scene",
+        "updates": 5,
+    },
+}
+"""And a training's."""
+
+
+def write_old(path: Path, header: dict[str, Any], **tensors: np.ndarray) -> None:
+    """A file as the version before wrote it, whose digest is the SHA-256 over all of it."""
+    text = json.dumps(header, sort_keys=True)
+    digest = hashlib.sha256(text.encode())
+    for name in sorted(tensors):
+        digest.update(f"{name}{tensors[name].dtype}{tensors[name].shape}".encode())
+        digest.update(tensors[name].tobytes())
+    save_file(tensors, path, metadata={"header": text, "sha256": digest.hexdigest()})
+
+
+def test_files_of_the_version_before_hold_the_model_rgb(tmp_path: Path, file: Path) -> None:
+    """Values and moments, bit for bit, and a configuration to go on with."""
+    expected = tiny_state(5, TrainConfig(threads=1, model="rgb"))
+    grid, free = expected.field.grid, expected.field.free
+    values = grid.values.numpy().reshape(5, 6, 7, 4)
+    moments = expected.optimiser["values"]["moments"].numpy().reshape(5, 6, 7, 4)
+    distance = free.distance.numpy().reshape(free.size)
+    path = tmp_path / "old.safetensors"
+    write_old(path, OLD_TRAINING, values=values, moments=moments, free_distance=distance)
+    back = load_checkpoint(path)
+    assert_same_state(back, expected)
+    assert back.config.model == Rgb()
+    camera = camera_at(ring(3)[1])
+    seen = expected.field.render(camera).rgb
+    np.testing.assert_array_equal(load_field(path, threads=1).render(camera).rgb, seen)
+    write_old(path, OLD_FIELD, values=values, free_distance=distance)
+    field = load_field(path, threads=1)
+    assert field.model == Rgb()
+    np.testing.assert_array_equal(field.grid.values.numpy(), grid.values.numpy())
+    np.testing.assert_array_equal(field.render(camera).rgb, seen)
+
+
+@pytest.mark.parametrize(
+    ("header", "names"),
+    [
+        (OLD_TRAINING, ("values", "free_distance")),
+        (OLD_TRAINING, ("values", "free_distance", "values.moments", "moments")),
+        (OLD_FIELD, ("values", "free_distance", "moments")),
+    ],
+)
+def test_tensors_that_the_version_before_did_not_write_are_refused(
+    header: dict[str, Any], names: tuple[str, ...], tmp_path: Path
+) -> None:
+    state = tiny_state(5, TrainConfig(threads=1, model="rgb"))
+    given = {
+        "values": state.field.grid.values.numpy().reshape(5, 6, 7, 4),
+        "free_distance": state.field.free.distance.numpy().reshape(state.field.free.size),
+        "moments": state.optimiser["values"]["moments"].numpy().reshape(5, 6, 7, 4),
+        "values.moments": state.optimiser["values"]["moments"].numpy(),
+    }
+    path = tmp_path / "old.safetensors"
+    write_old(path, header, **{name: given[name] for name in names})
+    with pytest.raises(DamagedFileError, match=r"old\.safetensors is damaged"):
+        load_field(path, threads=1)
+
+
+@pytest.mark.parametrize("kind", ["warpnerf-training-4", "warpnerf-training-1", "warpnerf-field-0"])
+def test_formats_before_that_are_refused_in_one_sentence(kind: str, tmp_path: Path) -> None:
+    path = tmp_path / "old.safetensors"
+    write_old(path, OLD_TRAINING | {"format": kind}, values=np.zeros((5, 6, 7, 4), np.float32))
+    for load in (load_field, load_checkpoint):
+        with pytest.raises(InputError) as caught:
+            load(path)
+        said = str(caught.value)
+        assert said.startswith(f"{path} has format {kind!r}, but this version reads ")
+        assert said.endswith("or train again.") and "\n" not in said
+        assert not isinstance(caught.value, DamagedFileError)
 
 
 def test_a_key_given_twice_is_refused(file: Path) -> None:
@@ -246,7 +457,7 @@ def test_a_key_given_twice_is_refused(file: Path) -> None:
 
 def test_another_version_is_not_called_damage(file: Path) -> None:
     """Else a newer checkpoint would be passed over for an older one, and in the end removed."""
-    rewrite(file, lambda text: text.replace("field-1", "field-9"))
+    rewrite(file, lambda text: text.replace("field-2", "field-9"))
     with pytest.raises(InputError, match="field-9") as caught:
         load_field(file)
     assert not isinstance(caught.value, DamagedFileError)

@@ -17,10 +17,10 @@ from PIL import Image
 from tiny_fields import assert_same_state
 from tiny_scenes import picture, save, write_transforms
 
-from warpnerf.checkpoint import load_checkpoint
-from warpnerf.run import Run
+from warpnerf.training.checkpoint import load_checkpoint
+from warpnerf.training.run import Run
 
-TINY = ("builtin:room", "--downscale", "8", "--threads", "1")
+TINY = ("builtin:room-sparse", "--downscale", "8", "--threads", "1")
 
 
 def start(*arguments: str | Path) -> subprocess.Popen[str]:
@@ -77,14 +77,16 @@ def test_training_leaves_a_whole_run(trained: tuple[Path, str]) -> None:
         "field.safetensors",
         "metrics.json",
         "test",
+        "test.png",
     }
+    assert out.splitlines()[-1] == f"look at {folder / 'test.png'}"
     metrics = json.loads((folder / "metrics.json").read_text())
     assert len(list((folder / "test").glob("*.png"))) == len(metrics["images"])
     reports = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
     assert reports[-1]["step"] == 30
     assert reports[-1]["fraction"] == 1.0
     config = json.loads((folder / "config.json").read_text())
-    assert (config["scene"], config["downscale"]) == ("builtin:room", 8)
+    assert (config["scene"], config["downscale"]) == ("builtin:room-sparse", 8)
 
 
 def test_eval_repeats_the_figures(trained: tuple[Path, str], tmp_path: Path) -> None:
@@ -345,14 +347,15 @@ def test_a_new_run_wants_scene_and_output(tmp_path: Path) -> None:
 
 SPOIL = """
 import sys
-from warpnerf import cli, training
-update = training.Trainer.update
+from warpnerf.cli import main
+from warpnerf.training import trainer
+update = trainer.Trainer.update
 def spoiled(self):
     update(self)
     if self.steps_done == int(sys.argv[1]):
         self.grid.values.fill_(float("nan"))
-training.Trainer.update = spoiled
-sys.exit(cli.main(sys.argv[2:]))
+trainer.Trainer.update = spoiled
+sys.exit(main.main(sys.argv[2:]))
 """
 
 

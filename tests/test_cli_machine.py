@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
-from warpnerf import verify as checks
-from warpnerf.cli import main
-from warpnerf.verify import Result
+from warpnerf.cli.main import main
+from warpnerf.evaluation import verify as checks
+from warpnerf.evaluation.verify import Result
 
 WITHOUT_TORCH = """
 import sys
@@ -22,14 +22,21 @@ class Finder:
         if name == "torch":
             raise ImportError("torch is not installed")
 sys.meta_path.insert(0, Finder())
-from warpnerf.cli import main
+from warpnerf.cli.main import main
+from warpnerf.evaluation import verify
+if FEWER:
+    verify.VIEW_DEPENDENT = ()
 sys.exit(main(sys.argv[1:]))
 """
 
 
-def test_check_needs_neither_torch_nor_the_tests(tmp_path: Path, on_cpu: None) -> None:
+@pytest.mark.parametrize(
+    "fewer", [pytest.param(True, id="rgb"), pytest.param(False, id="all", marks=pytest.mark.slow)]
+)
+def test_check_needs_neither_torch_nor_the_tests(fewer: bool, tmp_path: Path, on_cpu: None) -> None:
+    program = WITHOUT_TORCH.replace("FEWER", str(fewer))
     done = subprocess.run(
-        [sys.executable, "-c", WITHOUT_TORCH, "check", "--threads", "2", "--json", "c.json"],
+        [sys.executable, "-c", program, "check", "--threads", "2", "--json", "c.json"],
         cwd=tmp_path,
         env=os.environ,
         capture_output=True,

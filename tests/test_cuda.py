@@ -4,9 +4,13 @@ from pathlib import Path
 
 import pytest
 import warp as wp
-from warpnerf_kernels import contraction, gradscale, precision
+from warpnerf_kernels.base import precision
 
-NAMES = ["interp", "regularize", "occupancy", "camera"]
+from warpnerf.model.models import Deferred, Features, Model, Rgb, SphericalHarmonics
+from warpnerf.rendering.render import variant_of
+
+SHARED = ["sampling.occupancy", "space.camera"]
+"""Modules of the kernels that all models share."""
 
 
 def compiled(module: wp.Module, folder: Path) -> str:
@@ -14,21 +18,43 @@ def compiled(module: wp.Module, folder: Path) -> str:
     return "".join(path.read_text() for path in folder.glob("*.ptx"))
 
 
-@pytest.mark.parametrize("name", ["float32", "float64"])
-def test_every_kernel_compiles_for_cuda(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["float32", pytest.param("float64", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("model", "contractions"),
+    [
+        pytest.param(Rgb(), ("none",), id="rgb"),
+        pytest.param(Rgb(), ("linf", "l2"), id="rgb, folded", marks=pytest.mark.slow),
+        pytest.param(SphericalHarmonics(degree=1), ("none",), id="sh", marks=pytest.mark.slow),
+        pytest.param(Deferred(), ("linf",), id="deferred"),
+        pytest.param(Features(), ("none",), id="features", marks=pytest.mark.slow),
+    ],
+)
+def test_every_kernel_compiles_for_cuda(
+    model: Model, contractions: tuple[str, ...], name: str, tmp_path: Path
+) -> None:
     wp.init()
-    render = precision.load(name, "render")
-    names = [*NAMES, "adam"] if name == "float32" else NAMES  # it packs what is in float32
-    modules = [wp.get_module(precision.load(name, module).__name__) for module in names]
-    for folded in (contraction.NONE, contraction.LINF, contraction.L2):
-        variant = render.Variant(
-            folded, gradscale.CLAMPED, gradscale.JACOBIAN_DENSITY, packed=False
-        )
-        modules += [
-            render.render_forward_kernel(variant).module,
-            render.render_backward_kernel(variant).module,
-            render.render_train_kernel(variant).module,
+    assembly = precision.load(name, "launch.assembly")
+    n, variation = model.n_floats, precision.load(name, "optim.total_variation")
+    kernels = [
+        variation.total_variation_forward_kernel(n),
+        variation.total_variation_backward_kernel(n),
+        precision.load(name, "fields.dense").resample_kernel(n),
+        precision.load(name, "sampling.occupancy").find_highest_kernel(n),
+        precision.load(name, "launch.probe").probe(n).read_forward,
+        precision.load(name, "launch.probe").probe(n).read_backward,
+    ]
+    if name == "float32":  # it packs what is in float32
+        adam = precision.load(name, "optim.adam")
+        kernels += [adam.adam_kernel(n), adam.resample_moments_kernel(n), adam.adam_weights]
+    for contraction in contractions:
+        variant = variant_of(model, name, contraction, "clamped", "density", packed=False)  # type: ignore[arg-type]
+        kernels += [
+            assembly.render_forward_kernel(variant),
+            assembly.render_backward_kernel(variant),
+            assembly.render_train_kernel(variant),
         ]
+    modules = [kernel.module for kernel in kernels]
+    if isinstance(model, Rgb):
+        modules += [wp.get_module(precision.load(name, module).__name__) for module in SHARED]
     for number, module in enumerate(modules):
-        folder = tmp_path / str(number)
-        assert ".entry" in compiled(module, folder)
+        assert ".entry" in compiled(module, tmp_path / str(number))

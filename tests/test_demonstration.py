@@ -11,15 +11,15 @@ import pytest
 from PIL import Image
 from tiny_fields import tiny_field
 
-from warpnerf import demonstration
-from warpnerf.camera import Camera
 from warpnerf.checks import InputError
 from warpnerf.config import Scaling
-from warpnerf.data.room import first_hit, photograph
-from warpnerf.demonstration import BACK, CAMERAS, SCALINGS, comparison_picture, demo
-from warpnerf.field import Field
-from warpnerf.flight import backing_away
-from warpnerf.pictures import depth_colours
+from warpnerf.media import demonstration
+from warpnerf.media.camera_path import backing_away
+from warpnerf.media.demonstration import BACK, CAMERAS, SCALINGS, comparison_picture, demo
+from warpnerf.media.pictures import depth_colours
+from warpnerf.rendering.field import Field
+from warpnerf.scenes.builtin.room import first_hit, photograph
+from warpnerf.scenes.camera import Camera
 
 
 @pytest.fixture
@@ -67,7 +67,7 @@ def test_it_trains_both_and_shows_them(tiny: None, tmp_path: Path) -> None:
 
 
 def test_the_first_row_of_the_picture_is_the_truth(tiny: None) -> None:
-    scene = demonstration.load_scene("builtin:room", downscale=8)
+    scene = demonstration.load_scene("builtin:room-sparse", downscale=8)
     row = {"psnr": 1.0, "ssim": 0.5, "depth_error": 1.0, "near_density": 0.1}
     fields: dict[Scaling, Field] = {"none": tiny_field(), "clamped": tiny_field(density=0.0)}
     picture = comparison_picture(scene, fields, {"none": row, "clamped": row}, 4.0)
@@ -94,7 +94,7 @@ def test_the_first_row_of_the_picture_is_the_truth(tiny: None) -> None:
 
 
 def test_there_is_room_behind_the_cameras_that_are_backed_away_from() -> None:
-    scene = demonstration.load_scene("builtin:room", downscale=8)
+    scene = demonstration.load_scene("builtin:room-sparse", downscale=8)
     cameras: dict[str, Camera] = {view.name: view.camera for view in scene.views}
     for name in CAMERAS:
         camera = cameras[name]

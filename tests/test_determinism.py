@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from warpnerf.camera import Camera
 from warpnerf.config import GridConfig, TrainConfig
-from warpnerf.scene import Scene, View
-from warpnerf.training import train
+from warpnerf.scenes.camera import Camera
+from warpnerf.scenes.scene import Scene, View
+from warpnerf.training.trainer import train
 
 N_RUNS = 20
 
@@ -54,6 +54,7 @@ def small_scene() -> Scene:
 
 
 def trained(threads: int, seed: int = 0, **changes: Any) -> Any:
+    """All that is learned, as one row of numbers."""
     config = TrainConfig(
         steps=12,
         rays_per_step=300,
@@ -64,23 +65,28 @@ def trained(threads: int, seed: int = 0, **changes: Any) -> Any:
         grid=GridConfig(voxels=6000, grow_at=(0.3, 0.6)),
         **changes,
     )
-    return train(small_scene(), config).field.grid.values.numpy()
+    field = train(small_scene(), config).field
+    return np.concatenate([field.grid.values.numpy().ravel(), field.weights.numpy()])
 
 
-@pytest.mark.parametrize("threads", [1, 2, 3])
-def test_training_under_load_gives_the_same_bits(threads: int, on_cpu: None) -> None:
-    alone = trained(threads)
+@pytest.mark.parametrize(
+    ("model", "threads"),
+    [("deferred", 1), ("deferred", 2), ("deferred", 3), ("rgb", 2), ("features", 2)],
+)
+def test_training_under_load_gives_the_same_bits(model: str, threads: int, on_cpu: None) -> None:
+    alone = trained(threads, model=model)
     assert np.isfinite(alone).all() and alone.std() > 0.01
     with loaded_cpu():
-        for _ in range(N_RUNS if threads == 2 else 3):
-            assert np.array_equal(trained(threads), alone)
+        for _ in range(N_RUNS if (model, threads) == ("deferred", 2) else 3):
+            assert np.array_equal(trained(threads, model=model), alone)
 
 
 def test_another_seed_gives_another_field(on_cpu: None) -> None:
     assert not np.array_equal(trained(2, seed=1), trained(2, seed=0))
 
 
-def test_threads_agree_within_rounding(on_cpu: None) -> None:
+@pytest.mark.parametrize("model", ["rgb", "deferred", "features"])
+def test_threads_agree_within_rounding(model: str, on_cpu: None) -> None:
     """Over one step and no growth; later Adam's division makes small differences large."""
 
     def once(threads: int) -> Any:
@@ -88,6 +94,7 @@ def test_threads_agree_within_rounding(on_cpu: None) -> None:
             steps=1,
             rays_per_step=300,
             threads=threads,
+            model=model,  # type: ignore[arg-type]
             grid=GridConfig(voxels=6000, grow_at=()),
         )
         return train(small_scene(), config).field.grid.values.numpy()

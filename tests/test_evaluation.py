@@ -10,12 +10,12 @@ import pytest
 from tiny_fields import tiny_field
 from tiny_scenes import camera_at, ring
 
-from warpnerf import evaluation
-from warpnerf.camera import Camera
 from warpnerf.checks import InputError
-from warpnerf.evaluation import evaluate
-from warpnerf.field import Field
-from warpnerf.scene import Scene, View
+from warpnerf.evaluation import evaluate as evaluate_module
+from warpnerf.evaluation.evaluate import evaluate
+from warpnerf.rendering.field import Field
+from warpnerf.scenes.camera import Camera
+from warpnerf.scenes.scene import Scene, View
 
 SIZE = {"width": 16, "height": 12, "fx": 14.0, "fy": 14.0, "cx": 8.0, "cy": 6.0}
 
@@ -78,7 +78,7 @@ def test_json_has_the_promised_form() -> None:
 def test_what_is_not_installed_or_given_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     field = tiny_field()
     scene = scene_of(field, depth=False)
-    monkeypatch.setattr(evaluation, "has_flip", lambda: False)
+    monkeypatch.setattr(evaluate_module, "has_flip", lambda: False)
     result = evaluate(field, scene)
     assert list(result.mean) == ["psnr", "ssim"]
     assert "FLIP" not in str(result)

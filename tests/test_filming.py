@@ -12,10 +12,10 @@ from tiny_fields import tiny_field
 from tiny_scenes import camera_at, ring, tiny_scene
 
 from warpnerf.checks import InputError
-from warpnerf.field import Rendering
-from warpnerf.filming import depth_range, render_stills, render_video
-from warpnerf.flight import camera_path
-from warpnerf.pictures import colour_and_depth
+from warpnerf.media.camera_path import camera_path
+from warpnerf.media.filming import depth_range, render_stills, render_video
+from warpnerf.media.pictures import colour_and_depth
+from warpnerf.rendering.field import Rendering
 
 SIZE = (24, 18)
 
@@ -76,7 +76,7 @@ def test_depths_span_what_is_seen() -> None:
         (100.0, 254.0, 1.0, (100.0, 260.0)),
         (0.0321, 0.0321, 0.6, (0.032, 0.033)),
         (2.0, 2.0, 1.0, (2.0, 2.1)),
-        (0.31, 7.25, 1.0, (0.3, 7.3)),
+        (0.31, 7.25, 1.0, (0.31, 7.3)),
     ],
 )
 def test_depths_are_rounded_outward(
@@ -84,6 +84,18 @@ def test_depths_are_rounded_outward(
 ) -> None:
     wall: Any = Wall(near, far, opacity)
     assert depth_range(wall, path()) == expected
+
+
+def test_few_far_samples_do_not_stretch_the_range() -> None:
+    class Hole(Wall):
+        def render(self, camera: Any) -> Rendering:
+            seen = super().render(camera)
+            seen.depth[0, 0] = 1e4 * seen.opacity[0, 0]
+            seen.depth[-1], seen.opacity[-1] = 0.0, 0.1  # what is not opaque does not count
+            return seen
+
+    wall: Any = Hole(3.0, 5.0, 1.0)
+    assert depth_range(wall, path()) == (3.0, 4.9)
 
 
 def test_where_nothing_is_seen_depths_are_made_up() -> None:

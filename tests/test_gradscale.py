@@ -9,7 +9,7 @@ import reference
 import torch
 from drive import N_SEEDS, Kernels
 
-from warpnerf.render import JACOBIANS, SCALINGS
+from warpnerf.rendering.render import JACOBIANS, SCALINGS
 
 
 def scale(kernels: Kernels, t: Any, content: Any, det: Any, scaling: str, jacobian: str) -> Any:

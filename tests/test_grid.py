@@ -9,12 +9,12 @@ import pytest
 import reference
 import torch
 import warp as wp
-from warpnerf_kernels.types import vec4
+from warpnerf_kernels.base.types import vec4
 
 from warpnerf.checks import InputError
-from warpnerf.grid import FreeCells, VoxelGrid, grid_size, require_memory
-from warpnerf.parallel import Workers
-from warpnerf.render import Steps
+from warpnerf.model.grid import FreeCells, VoxelGrid, grid_size, require_memory
+from warpnerf.rendering.render import Steps
+from warpnerf.runtime.parallel import Workers
 
 MARCH = Steps(near=0.0, far=10.0, step=0.05).struct()
 BOX_MIN, BOX_MAX = np.array([-1.0, 0.5, 2.0]), np.array([1.4, 2.0, 4.5])
@@ -86,13 +86,15 @@ def test_grid_size_makes_cubes() -> None:
 
 
 def test_a_grid_larger_than_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("warpnerf.grid.usable_memory", lambda: 48 * 10**3)
+    monkeypatch.setattr("warpnerf.model.grid.usable_memory", lambda: 48 * 10**3)
     cpu = wp.get_device("cpu")
-    require_memory((10, 10, 10), cpu)
-    with pytest.raises(InputError, match=r"grid\.voxels: a grid of .* use fewer voxels"):
-        require_memory((10, 10, 11), cpu)
+    require_memory((10, 10, 10), 4, cpu)
+    require_memory((5, 10, 10), 8, cpu)
+    for size, n_floats in (((10, 10, 11), 4), ((5, 10, 11), 8)):
+        with pytest.raises(InputError, match=r"grid\.voxels: a grid of .* use fewer voxels"):
+            require_memory(size, n_floats, cpu)
     with pytest.raises(InputError, match=r"grid\.voxels must give fewer than \d+ nodes"):
-        require_memory((20000, 20000, 20000), cpu)
+        require_memory((20000, 20000, 20000), 4, cpu)
 
 
 def test_free_cells_of_a_grid(workers: Workers) -> None:

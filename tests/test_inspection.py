@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from tiny_scenes import look_at, ring, save, write_blender, write_transforms
 
-from warpnerf import inspection
 from warpnerf.checks import InputError
 from warpnerf.config import GridConfig, OptimConfig, TrainConfig
-from warpnerf.data import load_scene
-from warpnerf.inspection import Inspection, inspect
+from warpnerf.evaluation import inspection
+from warpnerf.evaluation.inspection import Inspection, inspect
+from warpnerf.scenes.load import load_scene
 
 
 def scene_with(folder: Path, poses: list[np.ndarray]) -> Path:
@@ -103,8 +103,9 @@ def test_a_scaling_that_does_nothing_is_said(
     assert (says or "") in found
 
 
-def test_the_built_in_room_is_in_order() -> None:
-    found = inspect("builtin:room", downscale=8)
+@pytest.mark.parametrize("name", ["builtin:room", "builtin:room-sparse"])
+def test_the_built_in_scenes_are_in_order(name: str) -> None:
+    found = inspect(name, downscale=8)
     assert found.oddities == ()
     assert found.focus is None  # its cameras look everywhere, and it knows its distances
 

@@ -8,12 +8,16 @@ import reference
 import torch
 import warp as wp
 from drive import N_SEEDS, Kernels
-from warpnerf_kernels.tiles import STRETCH, TILE
+from warpnerf_kernels.base.tiles import STRETCH, TILE
 
-RATE = np.array([0.2, 0.1, 0.05, 0.02])
+RATES = np.array([0.2, 0.1, 0.05, 0.02, 0.3, 0.01, 0.15, 0.07])
+"""Of the first numbers of a node."""
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-4
 MEAN_BIT, SQUARE_BIT = 2.0**-7, 2.0**-8
 """What the last bit of a moment may be worth, of the moment."""
+
+
+each_n_floats = pytest.mark.parametrize("n_floats", [4, 8])
 
 
 @pytest.fixture(scope="module")
@@ -45,19 +49,23 @@ def step(
     betas: tuple[float, float] = (BETA1, BETA2),
     n_nodes: int | None = None,
 ) -> tuple[Any, Any, Any]:
-    """What is left of the gradient, and the new values and moments, all [n_nodes, 4]."""
-    vec4, adam = kernels.types.vec4, kernels.module("adam")
-    gradient = kernels.no_gradient((1, 1, len(adj)), flag=1)
+    """What is left of the gradient, and the new values and moments, all [n_nodes, n_floats]."""
+    n_floats, adam = adj.shape[1], kernels.module("optim.adam")
+    node, moments_type = kernels.types.vector(n_floats), adam.moments_type(n_floats)
+    gradient = kernels.gradient(*adj.shape, flag=1)
     gradient.values.assign(adj)
     if flags is not None:
         gradient.touched.assign(np.asarray(flags, np.uint8))
-    arrays = kernels.array(values, vec4), wp.array(moments, dtype=adam.uint4, device=kernels.device)
+    arrays = (
+        kernels.array(values, node),
+        wp.array(moments, dtype=moments_type, device=kernels.device),
+    )
     kernels.workers.launch(
-        adam.adam_step,
+        adam.adam_kernel(n_floats),
         -(-(n_nodes or len(values)) // span),
         span,
         number,
-        vec4(*RATE),
+        node(*RATES[:n_floats]),
         *betas,
         EPSILON,
         *(1.0 / (1.0 - beta**number) for beta in betas),
@@ -68,14 +76,16 @@ def step(
     return gradient.values.numpy(), values, moments
 
 
-def test_against_the_oracle_skipping_exact_zeros(kernels: Kernels) -> None:
+@each_n_floats
+def test_against_the_oracle_skipping_exact_zeros(n_floats: int, kernels: Kernels) -> None:
+    shape = (30, n_floats)
     for seed in range(N_SEEDS):
         rng = np.random.default_rng(seed)
-        values = rng.normal(size=(30, 4)).astype(np.float32)
-        moments = np.zeros((30, 4), np.uint32)
+        values = rng.normal(size=shape).astype(np.float32)
+        moments = np.zeros(shape, np.uint32)
         for number in range(1, 6):
-            adj = rng.normal(size=(30, 4)) * 10.0 ** rng.uniform(-7, 0, size=(30, 4))
-            adj[rng.uniform(size=(30, 4)) < 0.3] = 0.0
+            adj = rng.normal(size=shape) * 10.0 ** rng.uniform(-7, 0, size=shape)
+            adj[rng.uniform(size=shape) < 0.3] = 0.0
             adj[:3] = 0.0  # whole nodes as well
             adj = adj.astype(np.float32)
             before = values, moments
@@ -83,7 +93,7 @@ def test_against_the_oracle_skipping_exact_zeros(kernels: Kernels) -> None:
             assert not after.any()
             tensors = [torch.tensor(a.astype(float)) for a in (before[0], *decoded(before[1]), adj)]
             value, mean, square = reference.adam(
-                *tensors, number, torch.tensor(RATE), BETA1, BETA2, EPSILON
+                *tensors, number, torch.tensor(RATES[:n_floats]), BETA1, BETA2, EPSILON
             )
             still = adj == 0.0
             assert still.any() and not still.all()
@@ -97,11 +107,12 @@ def test_against_the_oracle_skipping_exact_zeros(kernels: Kernels) -> None:
                 assert (np.abs(new - exact.numpy()) <= bit * np.abs(exact.numpy())).all()
 
 
-def test_nothing_behind_the_last_node_is_touched(kernels: Kernels) -> None:
+@each_n_floats
+def test_nothing_behind_the_last_node_is_touched(n_floats: int, kernels: Kernels) -> None:
     rng = np.random.default_rng(5)
     for n in (29, 30, 31):  # in tiles of four
-        adj, values = rng.normal(size=(2, 32, 4)).astype(np.float32)
-        moments = encoded(rng.normal(size=(32, 4)), rng.uniform(size=(32, 4)))
+        adj, values = rng.normal(size=(2, 32, n_floats)).astype(np.float32)
+        moments = encoded(rng.normal(size=(32, n_floats)), rng.uniform(size=(32, n_floats)))
         expected = step(kernels, 1, adj, values, moments)[1:]
         found = step(kernels, 1, adj, values, moments, n_nodes=n)[1:]
         for new, exact, old in zip(found, expected, (values, moments), strict=True):
@@ -152,20 +163,21 @@ def test_many_steps_end_where_full_precision_does(kernels: Kernels) -> None:
                 *exact,
                 exact[0] - torch.tensor(goal - noise),
                 number,
-                torch.tensor(RATE),
+                torch.tensor(RATES[:4]),
                 BETA1,
                 BETA2,
                 EPSILON,
             )
         )
     off = np.abs(values - exact[0].numpy())
-    assert (off.mean(axis=0) < 0.05 * RATE).all() and off.mean() > 1e-5  # moments do matter
+    assert (off.mean(axis=0) < 0.05 * RATES[:4]).all() and off.mean() > 1e-5  # moments do matter
 
 
-def test_tiles_that_are_not_flagged_are_passed_over(kernels: Kernels) -> None:
+@each_n_floats
+def test_tiles_that_are_not_flagged_are_passed_over(n_floats: int, kernels: Kernels) -> None:
     rng = np.random.default_rng(4)
-    adj, values = rng.normal(size=(2, 100, 4)).astype(np.float32)
-    moments = encoded(rng.normal(size=(100, 4)), rng.uniform(size=(100, 4)))
+    adj, values = rng.normal(size=(2, 100, n_floats)).astype(np.float32)
+    moments = encoded(rng.normal(size=(100, n_floats)), rng.uniform(size=(100, n_floats)))
     for every in (5, 10):  # eight tiles after a flagged one hold another, or none
         flags = np.arange(100 // TILE) % every == 2
         # The first node of the next tile may have been added to as well.
@@ -181,20 +193,24 @@ def test_tiles_that_are_not_flagged_are_passed_over(kernels: Kernels) -> None:
 
 
 @pytest.mark.parametrize("other_size", [(9, 7, 12), (4, 3, 2)])
-def test_moments_on_another_grid(other_size: tuple[int, int, int], kernels: Kernels) -> None:
+@each_n_floats
+def test_moments_on_another_grid(
+    n_floats: int, other_size: tuple[int, int, int], kernels: Kernels
+) -> None:
     """Read trilinearly, and rounded to the nearest; outside of the grid, off its nearest face."""
     rng = np.random.default_rng(2)
-    size, adam = (5, 4, 6), kernels.module("adam")
+    size, adam = (5, 4, 6), kernels.module("optim.adam")
+    moments_type = adam.moments_type(n_floats)
     spread = 10.0 ** rng.uniform(-12, 3, size=(2, *size, 1))
-    mean, square = spread * rng.normal(size=(2, *size, 4))
+    mean, square = spread * rng.normal(size=(2, *size, n_floats))
     moments = encoded(mean, np.abs(square))
     scale, offset = (np.array(size) - 1.2) / (np.array(other_size) - 1), np.array([0.3, -0.1, 0.1])
     n_other = int(np.prod(other_size))
-    out = wp.zeros(n_other, dtype=adam.uint4, device=kernels.device)
+    out = wp.zeros(n_other, dtype=moments_type, device=kernels.device)
     kernels.workers.launch(
-        adam.resample_moments,
+        adam.resample_moments_kernel(n_floats),
         n_other,
-        wp.array(moments.reshape(-1, 4), dtype=adam.uint4, device=kernels.device),
+        wp.array(moments.reshape(-1, n_floats), dtype=moments_type, device=kernels.device),
         wp.vec3i(*size),
         kernels.types.vec3(*scale),
         kernels.types.vec3(*offset),
@@ -204,7 +220,7 @@ def test_moments_on_another_grid(other_size: tuple[int, int, int], kernels: Kern
     u = np.stack(np.indices(other_size), axis=-1) * scale + offset
     assert (u.max((0, 1, 2)) > np.array(size) - 1).any() and u.min() < 0
     u = torch.tensor(np.clip(u, 0, np.array(size) - 1))
-    found = decoded(out.numpy().reshape(*other_size, 4))
+    found = decoded(out.numpy().reshape(*other_size, n_floats))
     for new, old, bit in zip(found, decoded(moments), (MEAN_BIT, SQUARE_BIT), strict=True):
         exact = reference.trilinear(torch.tensor(old), u).numpy()
         most = reference.trilinear(torch.tensor(np.abs(old)), u).numpy()

@@ -12,8 +12,8 @@ from types import SimpleNamespace
 import pytest
 import warp as wp
 
-from warpnerf import kernel_cache
-from warpnerf.kernel_cache import SUMS, DamagedKernelError, _seal, _verify
+from warpnerf.runtime import kernel_cache
+from warpnerf.runtime.kernel_cache import SUMS, DamagedKernelError, _seal, _verify
 
 CODE, META, SOURCE = "a.cpu.o", "a.meta", "a.cpp"
 

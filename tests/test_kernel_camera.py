@@ -9,7 +9,7 @@ import reference
 import warp as wp
 from drive import Kernels, unit
 
-from warpnerf.parallel import NODES
+from warpnerf.runtime.parallel import NODES
 
 LENSES: list[dict[str, float]] = [
     {},
@@ -34,7 +34,7 @@ def pose(seed: int) -> Any:
 
 
 def view(kernels: Kernels, c2w: Any, lens: dict[str, float], **changes: Any) -> Any:
-    types, view = kernels.types, kernels.module("camera").View()
+    types, view = kernels.types, kernels.module("space.camera").View()
     view.rotation = types.mat33(*c2w[:, :3].ravel())
     view.position = types.vec3(*c2w[:, 3])
     view.focal = types.vec2(FX, FY)
@@ -52,7 +52,7 @@ def rays(kernels: Kernels, c2w: Any, lens: dict[str, float]) -> tuple[Any, Any]:
     n, vec3 = WIDTH * HEIGHT, kernels.types.vec3
     origins, directions = kernels.zeros(n, vec3), kernels.zeros(n, vec3)
     kernels.workers.launch(
-        kernels.module("camera").camera_rays, n, view(kernels, c2w, lens), origins, directions
+        kernels.module("space.camera").camera_rays, n, view(kernels, c2w, lens), origins, directions
     )
     shape = (HEIGHT, WIDTH, 3)
     return origins.numpy().reshape(shape), directions.numpy().reshape(shape)
@@ -106,7 +106,7 @@ def draw(
     chunk: int = NODES,
 ) -> dict[str, Any]:
     """Pixels of three views; the red and green of each pixel say which one it is."""
-    types, camera = kernels.types, kernels.module("camera")
+    types, camera = kernels.types, kernels.module("space.camera")
     views, pixels = [], []
     for number in range(3):
         first = number * WIDTH * HEIGHT

@@ -1,5 +1,6 @@
 """Trilinear gather, its transpose, and resampling."""
 
+import math
 from typing import Any
 
 import drive_kernels
@@ -9,7 +10,7 @@ import reference
 import torch
 import warp as wp
 from drive import N_SEEDS, Kernels, assert_close, directional_differences
-from warpnerf_kernels.tiles import TILE
+from warpnerf_kernels.base.tiles import TILE
 
 
 def problem(seed: int) -> tuple[Any, Any, Any]:
@@ -37,7 +38,7 @@ def gather(kernels: Kernels, values: Any, u: Any) -> Any:
 
 def adj_gather(kernels: Kernels, shape: Any, u: Any, adj: Any) -> Any:
     types, n = kernels.types, len(u)
-    gradient = kernels.no_gradient(shape)
+    gradient = kernels.gradient(math.prod(shape[:3]), 4)
     kernels.alone.launch(
         drive_kernels.of(kernels).scatter_points,
         n,
@@ -100,7 +101,7 @@ def test_only_tiles_around_the_point_are_flagged(kernels64: Kernels) -> None:
     types, size = kernels64.types, (6, 5, 40)
     for seed in range(N_SEEDS):
         u = np.random.default_rng(seed).uniform(size=(1, 3)) * (np.array(size) - 1)
-        gradient = kernels64.no_gradient(size)
+        gradient = kernels64.gradient(math.prod(size), 4)
         kernels64.alone.launch(
             drive_kernels.of(kernels64).scatter_points,
             1,

@@ -18,8 +18,8 @@ from drive import (
     unbounded,
 )
 
-from warpnerf.grid import CONTRACTIONS
-from warpnerf.render import Steps
+from warpnerf.model.grid import CONTRACTIONS
+from warpnerf.rendering.render import Steps
 
 FAR = 8
 
@@ -43,7 +43,7 @@ def spread(kernels: Kernels, occupied: Any, span: int = 1) -> Any:
     for axis in range(3):
         out = wp.empty_like(distance)
         kernels.workers.launch(
-            kernels.module("occupancy").spread_distance,
+            kernels.module("sampling.occupancy").spread_distance,
             occupied.size // span,
             span,
             wp.vec3i(*occupied.shape),
@@ -145,7 +145,7 @@ def marked_by(
     alpha_min: float,
     span: int,
 ) -> Any:
-    occupancy, grid = kernels.module("occupancy"), kernels.grid(p)
+    occupancy, grid = kernels.module("sampling.occupancy"), kernels.grid(p)
 
     def launch(kernel: wp.Kernel, shape: tuple[int, ...], *arguments: Any) -> Any:
         out = kernels.zeros(int(np.prod(shape)))
@@ -153,7 +153,9 @@ def marked_by(
         return out
 
     x, y, _ = p.raw.shape[:3]
-    highest = launch(occupancy.find_highest, (x, y, cells[2]), grid, cells[2])
+    highest = launch(
+        occupancy.find_highest_kernel(p.raw.shape[3]), (x, y, cells[2]), grid, cells[2]
+    )
     join = occupancy.join_highest
     highest = launch(join, (x, *cells[1:]), y, cells[1], cells[2], highest)
     highest = launch(join, cells, x, cells[0], cells[1] * cells[2], highest)
@@ -162,10 +164,11 @@ def marked_by(
         occupancy.mark_occupied,
         highest.size // span,
         span,
-        grid,
+        kernels.box(p),
+        kernels.density(p),
         highest,
         wp.vec3i(*cells),
-        steps.struct(kernels.types),
+        steps.struct(kernels.module("sampling.steps")),
         CONTRACTIONS[p.contraction],
         alpha_min,
         out,

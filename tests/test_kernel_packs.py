@@ -16,7 +16,7 @@ from drive import (
 )
 from test_kernel_render import VARIANTS, Path, each_path, early, jittered, masked, rng_of
 
-from warpnerf.render import Steps
+from warpnerf.rendering.render import Steps
 
 
 def rounding(p: Problem) -> float:

@@ -2,25 +2,33 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 import reference
 import torch
 from drive import N_SEEDS, assert_close
 
-from warpnerf.parallel import Workers
-from warpnerf.trial import TrialKernels
+from warpnerf.evaluation.gradient_check import TrialKernels, make_trial, of_model
+from warpnerf.model.models import Deferred, Model, Rgb
+from warpnerf.runtime.parallel import Workers
 
 
-def test_gather_and_its_transpose_against_the_oracle(device: str) -> None:
+@pytest.mark.parametrize("model", [Rgb(), Deferred()], ids=lambda model: model.name)
+def test_gather_and_its_transpose_against_the_oracle(model: Model, device: str) -> None:
     kernels = TrialKernels("float64", Workers(device, 2))
     for seed in range(N_SEEDS):
         rng = np.random.default_rng(seed)
-        size = tuple(int(n) for n in rng.integers(2, 7, size=3))
-        values, out = rng.normal(size=(*size, 4)), rng.normal(size=(40, 4))
-        points = rng.uniform(size=(40, 3)) * (np.array(size) - 1)
-        points[0], points[1] = 0.0, np.array(size) - 1
+        size = rng.integers(2, 7, size=3)
+        values = rng.normal(size=(*size, model.n_floats))
+        out = rng.normal(size=(40, model.n_floats))
+        points = rng.uniform(-1.0, 1.0, size=(40, 3))  # of the box
+        points[0], points[1] = -1.0, 1.0
         grid = torch.tensor(values, requires_grad=True)
-        expected = reference.trilinear(grid, torch.tensor(points))
+        u = torch.tensor(0.5 * (points + 1.0) * (size - 1))
+        expected = reference.trilinear(grid, u)
         assert_close(kernels.gather(values, points), expected.detach(), 1e-14)
         (gradient,) = torch.autograd.grad(expected, grid, torch.tensor(out))
-        assert_close(kernels.scatter(size, points, out), gradient, 1e-14)
+        trial = replace(of_model(make_trial(0), model), raw=values)
+        assert_close(kernels.scatter(trial, points, out), gradient, 1e-14)

@@ -5,7 +5,14 @@ from typing import Any
 import numpy as np
 import pytest
 import warp as wp
-from warpnerf_kernels.tiles import AHEAD, GROUP, but_first, first_of, tiles_ahead, touched_tiles
+from warpnerf_kernels.base.tiles import (
+    AHEAD,
+    GROUP,
+    but_first,
+    first_of,
+    tiles_ahead,
+    touched_tiles,
+)
 
 
 @wp.kernel(enable_backward=False)

@@ -11,7 +11,7 @@ import torch
 from safetensors.torch import save_file
 
 from warpnerf.checks import InputError
-from warpnerf.lpips import NETWORKS, Lpips
+from warpnerf.evaluation.lpips import NETWORKS, Lpips
 
 # By lpips 0.1.4 with torchvision 0.29.2 and torch 2.13.0, of the images and weights below.
 PUBLISHED = {"AlexNet": (0.8114847540, 0.0065288777), "VGG-16": (3.4377155304, 0.3839409947)}

@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 from tiny_scenes import write_transforms
 
-from warpnerf import memory
 from warpnerf.checks import InputError
-from warpnerf.data import assemble, load_scene
+from warpnerf.runtime import memory
+from warpnerf.scenes import assemble
+from warpnerf.scenes.load import load_scene
 
 GIB = 2**30
 
@@ -65,7 +66,7 @@ def test_a_container_s_share_of_the_cores_counts(
 @pytest.mark.skipif(sys.platform == "win32", reason="no such limit there")
 def test_the_limit_of_the_process_counts() -> None:
     code = (
-        "import resource; from warpnerf.memory import usable_memory\n"
+        "import resource; from warpnerf.runtime.memory import usable_memory\n"
         f"resource.setrlimit(resource.RLIMIT_AS, ({GIB}, resource.RLIM_INFINITY))\n"
         "print(usable_memory())"
     )

@@ -8,7 +8,7 @@ from flip_evaluator import evaluate
 from skimage.metrics import structural_similarity
 
 from warpnerf.checks import InputError
-from warpnerf.metrics import flip, has_flip, psnr, ssim
+from warpnerf.evaluation.metrics import flip, has_flip, psnr, ssim
 
 
 def images(seed: int, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
@@ -80,6 +80,6 @@ def test_flip_is_that_of_its_package() -> None:
 
 
 def test_flip_without_its_package_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("warpnerf.metrics.has_flip", lambda: False)
+    monkeypatch.setattr("warpnerf.evaluation.metrics.has_flip", lambda: False)
     with pytest.raises(InputError, match="pip install flip-evaluator"):
         flip(np.zeros((12, 12, 3)), np.zeros((12, 12, 3)))

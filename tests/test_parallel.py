@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import warp as wp
 from drive import Kernels, make_problem
-from warpnerf_kernels.meeting import meet
+from warpnerf_kernels.cpu.barrier import meet
 
 from warpnerf.checks import InputError
-from warpnerf.parallel import NODES, RAYS, Packed, Thread, Workers
+from warpnerf.runtime.parallel import NODES, RAYS, Packed, Thread, Workers
 
 
 @wp.kernel(enable_backward=False)
@@ -143,7 +143,7 @@ def test_workers_meet(threads: int, on_cpu: None) -> None:
         numbers = wp.zeros(threads, dtype=wp.int32, device="cpu")
         sums = wp.zeros((threads, 50), dtype=wp.int32, device="cpu")
         workers.launch_owned(
-            add_up_together, threads, 50, workers.meeting, numbers, sums, packed=packed
+            add_up_together, threads, 50, workers.barrier, numbers, sums, packed=packed
         )
         assert (sums.numpy() == expected).all()
 
@@ -157,7 +157,7 @@ def test_nobody_waits_for_who_does_not_come(
     sums = wp.zeros((3, 1), dtype=wp.int32, device="cpu")
 
     def launch() -> None:
-        workers.launch_owned(add_up_together, 3, 1, workers.meeting, numbers, sums, packed=packed)
+        workers.launch_owned(add_up_together, 3, 1, workers.barrier, numbers, sums, packed=packed)
 
     launch()
     start = Packed.launch
@@ -182,7 +182,7 @@ def test_interrupted_anywhere(on_cpu: None) -> None:
     workers, packed = Workers("cpu", 3), Packed()
     numbers = wp.zeros(3, dtype=wp.int32, device="cpu")
     sums = wp.zeros((3, 1), dtype=wp.int32, device="cpu")
-    arguments = (add_up_together, 3, 1, workers.meeting, numbers, sums)
+    arguments = (add_up_together, 3, 1, workers.barrier, numbers, sums)
     workers.launch_owned(*arguments, packed=packed)
     before = signal.signal(signal.SIGALRM, signal.default_int_handler)
     interrupted = 0
@@ -209,7 +209,7 @@ def test_an_interrupt_is_interrupted(monkeypatch: pytest.MonkeyPatch, on_cpu: No
     workers, packed = Workers("cpu", 2), Packed()
     numbers = wp.zeros(2, dtype=wp.int32, device="cpu")
     sums = wp.zeros((2, 1), dtype=wp.int32, device="cpu")
-    arguments = (add_up_together, 2, 1, workers.meeting, numbers, sums)
+    arguments = (add_up_together, 2, 1, workers.barrier, numbers, sums)
     workers.launch_owned(*arguments, packed=packed)
     start, came, go_on = Packed.launch, threading.Event(), threading.Event()
 
@@ -242,7 +242,7 @@ def test_launches_from_several_threads_take_turns(on_cpu: None) -> None:
     def launch(n: int) -> np.ndarray:
         numbers = wp.zeros(3, dtype=wp.int32, device="cpu")
         sums = wp.zeros((3, n), dtype=wp.int32, device="cpu")
-        workers.launch_owned(add_up_together, 3, n, workers.meeting, numbers, sums)
+        workers.launch_owned(add_up_together, 3, n, workers.barrier, numbers, sums)
         return sums.numpy()
 
     launch(1)

@@ -7,8 +7,7 @@ from pathlib import Path
 import imageio.v3 as iio
 import numpy as np
 
-from warpnerf.field import Rendering
-from warpnerf.pictures import (
+from warpnerf.media.pictures import (
     colour_and_depth,
     comparison,
     depth_colours,
@@ -16,6 +15,7 @@ from warpnerf.pictures import (
     picture_files,
     write_png,
 )
+from warpnerf.rendering.field import Rendering
 
 
 def test_png_keeps_pixels_and_clips(tmp_path: Path) -> None:
@@ -70,7 +70,23 @@ def test_different_depths_have_different_colours() -> None:
     assert distance[~np.eye(50, dtype=bool)].min() > 0.01
 
 
-def test_comparison_shows_three_panels() -> None:
+def test_over_a_wide_range_equal_steps_of_disparity_look_equal() -> None:
+    disparity = np.linspace(1.0 / 2.0, 1.0 / 40.0, 17)
+    rgb = depth_colours(1.0 / disparity[None], 2.0, 40.0)
+    np.testing.assert_allclose(rgb, depth_colours(np.linspace(0.0, 1.0, 17)[None], 0.0, 1.0))
+    beyond = depth_colours(np.array([[0.0, 1.0, 2.0, 40.0, 1e9, np.inf]]), 2.0, 40.0)[0]
+    np.testing.assert_array_equal(beyond[:3], np.repeat(beyond[2:3], 3, axis=0))
+    np.testing.assert_array_equal(beyond[3:], np.repeat(beyond[3:4], 3, axis=0))
+
+
+def test_over_a_narrow_range_or_from_zero_equal_steps_of_depth_look_equal() -> None:
+    expected = depth_colours(np.array([[0.0, 0.25, 1.0]]), 0.0, 1.0)
+    for near, far in ((2.0, 10.0), (0.0, 100.0)):
+        depth = near + (far - near) * np.array([[0.0, 0.25, 1.0]])
+        np.testing.assert_allclose(depth_colours(depth, near, far), expected)
+
+
+def test_comparison_shows_three_panels_above_the_legend() -> None:
     height, width = 6, 5
     rng = np.random.default_rng(0)
     truth, rgb = rng.random((height, width, 3)), rng.random((height, width, 3))
@@ -78,11 +94,16 @@ def test_comparison_shows_three_panels() -> None:
     opacity[0] = 0.0
     depth = np.full((height, width), 2.0) * opacity
     image = comparison(truth, Rendering(rgb=rgb, depth=depth, opacity=opacity), 0.0, 4.0)
-    np.testing.assert_array_equal(image[:, :width], truth)
-    assert any((image[:, i : i + width] == rgb).all() for i in range(width, image.shape[1] - width))
-    last = image[:, -width:]
-    np.testing.assert_array_equal(last[0], 1.0)
-    np.testing.assert_allclose(last[1:], depth_colours(depth, 0.0, 4.0)[1:])
+    assert image.dtype == np.uint8
+    truth, rgb = (np.round(255 * panel) for panel in (truth, rgb))
+    panels = image[:height]
+    np.testing.assert_array_equal(panels[:, :width], truth)
+    shifts = range(width, image.shape[1] - width)
+    assert any((panels[:, i : i + width] == rgb).all() for i in shifts)
+    last = panels[:, -width:]
+    np.testing.assert_array_equal(last[0], 255)
+    np.testing.assert_array_equal(last[1:], np.round(255 * depth_colours(depth, 0.0, 4.0))[1:])
+    np.testing.assert_array_equal(image[height:], depth_legend(image.shape[1], 0.0, 4.0))
 
 
 def test_colour_stands_left_of_depth_above_the_legend() -> None:
@@ -104,7 +125,22 @@ def test_the_legend_holds_all_colours_and_says_the_range() -> None:
     assert (legend != depth_legend(600, 1.0, 4.0)).any()
     assert (legend != depth_legend(600, 2.0, 3.0)).any()
     for width in (1, 8, 30, 3000):
-        assert depth_legend(width, 0.0, 1.0).shape[1] == width
+        for near in (0.0, 0.01):
+            assert depth_legend(width, near, 1.0).shape[1] == width
+
+
+def test_the_legend_of_a_wide_range_says_depths_between() -> None:
+    legend = depth_legend(600, 2.0, 40.0).astype(int)
+    bar = legend[legend.shape[0] // 3]
+    colours = np.round(255 * depth_colours(np.array([[2.0, 5.0, 10.0, 20.0, 40.0]]), 2.0, 40.0)[0])
+    at = [int(np.abs(bar - colour).sum(axis=1).argmin()) for colour in colours]
+    assert np.abs(bar[at] - colours).sum(axis=1).max() < 12
+    height = depth_legend(600, 2.0, 9.0).shape[0]
+    ticks = np.flatnonzero((legend[height * 3 // 4 + 1] < 128).all(axis=1))
+    middle = ticks[(ticks > at[0] + 9) & (ticks < at[-1] - 9)]
+    for place in at[1:3]:  # of 5 and 10
+        assert np.abs(middle - place).min() <= 2
+    assert (legend[height + 2 :] < 128).any()
 
 
 def test_every_view_gets_a_picture_of_its_own() -> None:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from test_determinism import small_scene
 
-from warpnerf.parallel import Workers
-from warpnerf.rays import PixelSampler, RayBatch
+from warpnerf.rendering.rays import PixelSampler, RayBatch
+from warpnerf.runtime.parallel import Workers
 
 N_RAYS = 64
 

@@ -14,11 +14,11 @@ import pytest
 from test_determinism import small_scene
 from tiny_fields import assert_same_state, tiny_state
 
-from warpnerf import checkpoint
 from warpnerf.checks import InputError
 from warpnerf.config import TrainConfig
-from warpnerf.run import Run
-from warpnerf.state import Progress, TrainingState
+from warpnerf.training import checkpoint
+from warpnerf.training.run import Run
+from warpnerf.training.state import Progress, TrainingState
 
 CALLS = ("open", "write", "fsync", "close", "replace", "unlink", "mkdir", "rmdir")
 """The system calls, by their names in ``os``, that a save may make."""

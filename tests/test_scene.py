@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from tiny_scenes import camera_at, look_at, picture, ring
 
-from warpnerf.camera import Camera
 from warpnerf.checks import InputError
-from warpnerf.scene import (
+from warpnerf.scenes.camera import Camera
+from warpnerf.scenes.scene import (
     UNBOUNDED_BOX_SHARE,
     Scene,
     View,

@@ -9,8 +9,8 @@ import pytest
 from test_determinism import small_scene
 
 from warpnerf.config import MarchConfig, OptimConfig, TrainConfig
-from warpnerf.scene import Scene, View
-from warpnerf.state import differences, scene_digest
+from warpnerf.scenes.scene import Scene, View
+from warpnerf.training.state import differences, scene_digest
 
 
 def with_view(scene: Scene, index: int, view: View) -> Scene:

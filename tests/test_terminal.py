@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from warpnerf.terminal import print_table, table_text
+from warpnerf.runtime.terminal import print_table, table_text
 
 ROWS = [["short", "1.0", ""], ["[red]long name", "23.5", "ok"]]
 TEXT = """\

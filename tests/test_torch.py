@@ -10,7 +10,7 @@ from drive import N_SEEDS, Problem, assert_close, make_problem, oracle, oracle_g
 from torch import Tensor
 
 from warpnerf.checks import InputError
-from warpnerf.render import Steps
+from warpnerf.rendering.render import Steps
 from warpnerf.torch import render_rays, scale_gradient
 
 

@@ -11,14 +11,25 @@ from typing import Any
 import numpy as np
 import pytest
 
-from warpnerf import verify as checks
 from warpnerf.checks import InputError
-from warpnerf.parallel import Workers
-from warpnerf.trial import TrialKernels
-from warpnerf.verify import Result, relative_error, report, verify
+from warpnerf.evaluation import verify as checks
+from warpnerf.evaluation.gradient_check import Found, TrialKernels
+from warpnerf.evaluation.verify import Result, relative_error, report, verify
+from warpnerf.model.models import Deferred, Model
+from warpnerf.runtime.parallel import Workers
 
 
-def test_all_pass_here(device: str) -> None:
+@pytest.mark.parametrize(
+    "view_dependent",
+    [
+        pytest.param((Deferred(),), id="some"),
+        pytest.param(checks.VIEW_DEPENDENT, id="all", marks=pytest.mark.slow),
+    ],
+)
+def test_all_pass_here(
+    view_dependent: tuple[Model, ...], monkeypatch: pytest.MonkeyPatch, device: str
+) -> None:
+    monkeypatch.setattr(checks, "VIEW_DEPENDENT", view_dependent)
     begun: list[str] = []
     ended: list[Result] = []
     results = verify(device, 2, begun.append, ended.append)
@@ -41,8 +52,26 @@ def failing(device: str, *words: str) -> set[str]:
 Spoil = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
+def multiplied(found: Any, factor: float) -> Any:
+    """A gradient, or an array."""
+    if isinstance(found, Found):
+        return Found(values=factor * found.values, weights=factor * found.weights)
+    return factor * found
+
+
 def times(factor: float) -> Spoil:
-    return lambda method: lambda *given, **named: factor * method(*given, **named)
+    return lambda method: lambda *given, **named: multiplied(method(*given, **named), factor)
+
+
+def weights_times(factor: float) -> Spoil:
+    def spoil(method: Callable[..., Any]) -> Callable[..., Any]:
+        def gradient(*given: Any, **named: Any) -> Found:
+            found = method(*given, **named)
+            return Found(values=found.values, weights=factor * found.weights)
+
+        return gradient
+
+    return spoil
 
 
 def without_scaling(method: Callable[..., Any]) -> Callable[..., Any]:
@@ -66,7 +95,7 @@ def brighter_when_scaled(method: Callable[..., Any]) -> Callable[..., Any]:
 def sum_for_mean(method: Callable[..., Any]) -> Callable[..., Any]:
     def train(self: TrialKernels, trial: Any, scaling: str = "none") -> Any:
         error, gradient = method(self, trial, scaling)
-        return error, trial.n_rays * gradient
+        return error, multiplied(gradient, trial.n_rays)
 
     return train
 
@@ -83,6 +112,11 @@ def coarse_when_packed(method: Callable[..., Any]) -> Callable[..., Any]:
     ("method", "spoil", "words"),
     [
         ("gradient", times(1.0 + 1e-6), ["central differences"]),
+        ("gradient", weights_times(1.0 + 1e-5), ["differences, deferred"]),
+        pytest.param(
+            *("gradient", weights_times(1.0 + 1e-5), ["differences, features"]),
+            marks=pytest.mark.slow,
+        ),
         ("scatter", times(1.0 + 1e-5), ["gather"]),
         ("gradient", without_scaling, ["s(t)", "t = 0"]),
         ("gradient", never_above_one, ["beyond", "its own s(t)"]),
@@ -99,6 +133,8 @@ def test_each_can_fail(
     device: str,
     on_cpu: None,
 ) -> None:
+    if not any("features" in word for word in words):
+        monkeypatch.setattr(checks, "VIEW_DEPENDENT", (Deferred(),))
     assert failing(device, *words) == set()
     monkeypatch.setattr(TrialKernels, method, spoil(getattr(TrialKernels, method)))
     spoilt = failing(device, *words)
@@ -125,6 +161,7 @@ def test_a_check_that_cannot_run_fails_and_says_why(
     def broken(*given: Any) -> Any:
         raise RuntimeError("does not compile\nat all")
 
+    monkeypatch.setattr(checks, "VIEW_DEPENDENT", (Deferred(),))
     monkeypatch.setattr(TrialKernels, "see", broken)
     monkeypatch.setattr(TrialKernels, "train", broken)
     monkeypatch.setattr(checks, "_trained_twice", lambda threads: 0.0)

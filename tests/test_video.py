@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from warpnerf.checks import InputError
-from warpnerf.video import video_file, write_video
+from warpnerf.media.video import video_file, write_video
 
 NAMES = ("film.mp4", "film.gif", "film")
 COLOURS = ((220, 30, 30), (30, 200, 40), (40, 60, 210))

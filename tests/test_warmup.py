@@ -8,25 +8,38 @@ import pytest
 from test_determinism import small_scene
 
 from warpnerf.config import GridConfig, OptimConfig, TrainConfig
-from warpnerf.training import Trainer
-from warpnerf.warmup import rendering_kernels, training_kernels, warm_up
+from warpnerf.model.models import Deferred, Features, Model, Rgb
+from warpnerf.training.trainer import Trainer
+from warpnerf.training.warmup import rendering_kernels, training_kernels, warm_up
 
 
-@pytest.mark.parametrize("contraction", ["none", "linf"])
-@pytest.mark.parametrize("scaling", ["none", "quadratic", "clamped"])
-def test_a_training_loads_no_other_kernels(contraction: Any, scaling: Any, device: str) -> None:
+@pytest.mark.parametrize(
+    ("contraction", "scaling", "model"),
+    [
+        ("none", "none", Deferred()),
+        ("none", "quadratic", Deferred()),
+        ("none", "clamped", Deferred()),
+        ("linf", "clamped", Deferred()),
+        ("none", "clamped", Rgb()),
+        ("none", "clamped", Features()),
+    ],
+)
+def test_a_training_loads_no_other_kernels(
+    contraction: Any, scaling: Any, model: Model, device: str
+) -> None:
     config = TrainConfig(
         steps=206,
         rays_per_step=64,
         scaling=scaling,
         device=device,
+        model=model,
         grid=GridConfig(voxels=600, grow_at=(0.5,), contraction=contraction),
         optim=OptimConfig(accumulate_at=()),
     )
     trainer = Trainer(small_scene(), config)
     assert not trainer.workers._loaded  # a scene is described before anything is compiled
     where = trainer.workers.device
-    needed = training_kernels(contraction, scaling, "none", where)
+    needed = training_kernels(model, contraction, scaling, "none", where)
     trainer.update()
     assert trainer.workers._loaded == set(needed)
     trainer.run()
@@ -34,7 +47,7 @@ def test_a_training_loads_no_other_kernels(contraction: Any, scaling: Any, devic
     modules = {kernel.module for kernel in needed}
     assert {kernel.module for kernel in trainer.workers._loaded} == modules
     trainer.field().render(small_scene().cameras[0])
-    modules |= {kernel.module for kernel in rendering_kernels(contraction, where)}
+    modules |= {kernel.module for kernel in rendering_kernels(model, contraction, where)}
     assert {kernel.module for kernel in trainer.workers._loaded} == modules
 
 

@@ -6,25 +6,33 @@ import math
 
 import numpy as np
 import warp as wp
-from warpnerf_kernels.adam import uint4
-from warpnerf_kernels.types import vec4
+from warpnerf_kernels.base.types import vector
 
-from warpnerf.config import TrainConfig
-from warpnerf.field import Field
-from warpnerf.grid import FreeCells, VoxelGrid
-from warpnerf.parallel import Workers
-from warpnerf.render import Steps
-from warpnerf.state import Progress, TrainingState
+from warpnerf.config import Contraction, TrainConfig
+from warpnerf.model.grid import FreeCells, VoxelGrid
+from warpnerf.model.models import Model, Rgb, n_weights
+from warpnerf.model.parameters import parameters_of
+from warpnerf.rendering.field import Field
+from warpnerf.rendering.render import Steps
+from warpnerf.runtime.parallel import Workers
+from warpnerf.training.optim import first_states
+from warpnerf.training.state import Progress, TrainingState
+
+RGB = Rgb()
 
 
-def tiny_field(*, density: float = 3.0, contraction: str = "none") -> Field:
+def tiny_field(
+    *, density: float = 3.0, contraction: Contraction = "none", model: Model = RGB
+) -> Field:
     """Random colours in the box [-1, 1]^3 of 5 x 6 x 7 nodes, over a background that is no gray."""
     workers = Workers("cpu", 1)
     size = (5, 6, 7)
-    values = np.random.default_rng(0).normal(size=(math.prod(size), 4)).astype(np.float32)
+    rng = np.random.default_rng(0)
+    values = rng.normal(size=(math.prod(size), model.n_floats)).astype(np.float32)
     values[:, 0] += density
+    weights = 0.4 * rng.normal(size=n_weights(model)).astype(np.float32)
     grid = VoxelGrid(
-        values=wp.array(values, dtype=vec4, device=workers.device),
+        values=wp.array(values, dtype=vector(model.n_floats), device=workers.device),
         size=size,
         box_min=np.array([-1.0, -1.0, -1.0]),
         box_max=np.array([1.0, 1.0, 1.0]),
@@ -43,7 +51,9 @@ def tiny_field(*, density: float = 3.0, contraction: str = "none") -> Field:
         transmittance_min=1e-3,
     )
     return Field(
+        model=model,
         grid=grid,
+        weights=wp.array(weights, dtype=wp.float32, device=workers.device),
         free=FreeCells.of(grid, workers, steps.struct(), 1e-3),
         steps=steps,
         background=(0.1, 0.6, 0.9),
@@ -53,9 +63,19 @@ def tiny_field(*, density: float = 3.0, contraction: str = "none") -> Field:
 
 def tiny_state(step: int, config: TrainConfig | None = None) -> TrainingState:
     """A training after so many steps, whose arrays differ from those after any other number."""
-    field = tiny_field(density=float(step))
-    moments = np.random.default_rng(step).normal(size=(math.prod(field.grid.size), 4))
-    moments = moments.astype(np.float32).view(np.uint32) & np.uint32(0xFFFF7FFF)  # all finite
+    config = config or TrainConfig(threads=1)
+    assert isinstance(config.model, Model)
+    field = tiny_field(density=float(step), model=config.model)
+    parameters = parameters_of(field.model, field.grid, field.weights, config.optim)
+    optimiser = first_states(parameters, field.workers)
+    rng = np.random.default_rng(step)
+    for arrays in optimiser.values():
+        for array in arrays.values():
+            shape = array.numpy().shape
+            numbers = rng.normal(size=shape).astype(np.float32)
+            if array.numpy().dtype == np.uint32:  # two in each, all finite
+                numbers = numbers.view(np.uint32) & np.uint32(0xFFFF7FFF)
+            array.assign(numbers)
     progress = Progress(
         step=step,
         fraction=0.25,
@@ -67,7 +87,7 @@ def tiny_state(step: int, config: TrainConfig | None = None) -> TrainingState:
         occupied=0.75,
     )
     return TrainingState(
-        config=config or TrainConfig(threads=1),
+        config=config,
         scene_digest="of a scene",
         content_distance=2.0 / 3.0,
         reach=math.pi,
@@ -75,7 +95,7 @@ def tiny_state(step: int, config: TrainConfig | None = None) -> TrainingState:
         updates=step,
         progress=progress,
         field=field,
-        moments=wp.array(moments, dtype=uint4, device=field.workers.device),
+        optimiser=optimiser,
     )
 
 
@@ -91,6 +111,7 @@ def assert_same_state(state: TrainingState, expected: TrainingState) -> None:
         "progress",
     ):
         assert getattr(state, name) == getattr(expected, name)
+    assert state.field.model == expected.field.model
     grid, other = state.field.grid, expected.field.grid
     for name in ("size", "contraction", "border", "density_shift", "density_scale"):
         assert getattr(grid, name) == getattr(other, name)
@@ -99,11 +120,17 @@ def assert_same_state(state: TrainingState, expected: TrainingState) -> None:
         expected.field.background,
     )
     assert state.field.free.size == expected.field.free.size
+    assert state.optimiser.keys() == expected.optimiser.keys()
+    kept = []
+    for name, arrays in expected.optimiser.items():
+        assert state.optimiser[name].keys() == arrays.keys()
+        kept += [(state.optimiser[name][key], array) for key, array in arrays.items()]
     for array, wanted in (
         (grid.box_min, other.box_min),
         (grid.box_max, other.box_max),
         (grid.values.numpy(), other.values.numpy()),
-        (state.moments.numpy(), expected.moments.numpy()),
+        (state.field.weights.numpy(), expected.field.weights.numpy()),
+        *((array.numpy(), wanted.numpy()) for array, wanted in kept),
         (state.field.free.distance.numpy(), expected.field.free.distance.numpy()),
     ):
         np.testing.assert_array_equal(array.view(np.uint8), wanted.view(np.uint8))

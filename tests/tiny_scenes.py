@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from warpnerf.camera import Camera
-from warpnerf.scene import Scene, View
+from warpnerf.scenes.camera import Camera
+from warpnerf.scenes.scene import Scene, View
 
 DATA = Path(os.environ.get("WARPNERF_DATA", Path(__file__).parents[2] / "shared" / "data"))
 

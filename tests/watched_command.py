@@ -63,7 +63,10 @@ def command(
     found = _listing(folder)
     program = ["-m", "warpnerf"]
     if prelude:
-        program = ["-c", f"{prelude}\nimport sys, warpnerf.cli\nsys.exit(warpnerf.cli.main())"]
+        program = [
+            "-c",
+            f"{prelude}\nimport sys, warpnerf.cli.main\nsys.exit(warpnerf.cli.main.main())",
+        ]
     done = subprocess.run(
         [sys.executable, *program, *map(str, arguments)],
         cwd=folder,

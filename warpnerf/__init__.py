@@ -13,55 +13,66 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from warpnerf.camera import Camera
-    from warpnerf.checkpoint import load_checkpoint, load_field, save_checkpoint, save_field
     from warpnerf.checks import InputError
     from warpnerf.config import PRESETS, GridConfig, MarchConfig, OptimConfig, TrainConfig
-    from warpnerf.data import load_scene
-    from warpnerf.demonstration import Demo, demo
-    from warpnerf.evaluation import Evaluation, evaluate
-    from warpnerf.field import Field, Rendering
-    from warpnerf.filming import render_stills, render_video
-    from warpnerf.flight import camera_path
-    from warpnerf.inspection import Inspection, inspect
-    from warpnerf.plan import plan_picture
-    from warpnerf.scene import Scene, View
-    from warpnerf.state import Progress, TrainingState
-    from warpnerf.training import TrainResult, train
+    from warpnerf.evaluation.evaluate import Evaluation, evaluate
+    from warpnerf.evaluation.inspection import Inspection, inspect
+    from warpnerf.media.camera_path import camera_path
+    from warpnerf.media.demonstration import Demo, demo
+    from warpnerf.media.filming import render_stills, render_video
+    from warpnerf.media.scene_plan import plan_picture
+    from warpnerf.model.models import Deferred, Features, Model, Rgb, SphericalHarmonics
+    from warpnerf.rendering.field import Field, Rendering
+    from warpnerf.scenes.camera import Camera
+    from warpnerf.scenes.load import load_scene
+    from warpnerf.scenes.scene import Scene, View
+    from warpnerf.training.checkpoint import (
+        load_checkpoint,
+        load_field,
+        save_checkpoint,
+        save_field,
+    )
+    from warpnerf.training.state import Progress, TrainingState
+    from warpnerf.training.trainer import TrainResult, train
 
 __version__ = "0.1.0"
 
 _HOMES = {
-    "Camera": "camera",
-    "camera_path": "flight",
-    "load_checkpoint": "checkpoint",
-    "load_field": "checkpoint",
-    "save_checkpoint": "checkpoint",
-    "save_field": "checkpoint",
+    "Camera": "scenes.camera",
+    "camera_path": "media.camera_path",
+    "load_checkpoint": "training.checkpoint",
+    "load_field": "training.checkpoint",
+    "save_checkpoint": "training.checkpoint",
+    "save_field": "training.checkpoint",
     "InputError": "checks",
     "PRESETS": "config",
     "GridConfig": "config",
     "MarchConfig": "config",
     "OptimConfig": "config",
     "TrainConfig": "config",
-    "load_scene": "data",
-    "Demo": "demonstration",
-    "demo": "demonstration",
-    "Evaluation": "evaluation",
-    "evaluate": "evaluation",
-    "Field": "field",
-    "Rendering": "field",
-    "render_stills": "filming",
-    "render_video": "filming",
-    "Inspection": "inspection",
-    "inspect": "inspection",
-    "plan_picture": "plan",
-    "Scene": "scene",
-    "View": "scene",
-    "Progress": "state",
-    "TrainingState": "state",
-    "TrainResult": "training",
-    "train": "training",
+    "Deferred": "model.models",
+    "Features": "model.models",
+    "Model": "model.models",
+    "Rgb": "model.models",
+    "SphericalHarmonics": "model.models",
+    "load_scene": "scenes.load",
+    "Demo": "media.demonstration",
+    "demo": "media.demonstration",
+    "Evaluation": "evaluation.evaluate",
+    "evaluate": "evaluation.evaluate",
+    "Field": "rendering.field",
+    "Rendering": "rendering.field",
+    "render_stills": "media.filming",
+    "render_video": "media.filming",
+    "Inspection": "evaluation.inspection",
+    "inspect": "evaluation.inspection",
+    "plan_picture": "media.scene_plan",
+    "Scene": "scenes.scene",
+    "View": "scenes.scene",
+    "Progress": "training.state",
+    "TrainingState": "training.state",
+    "TrainResult": "training.trainer",
+    "train": "training.trainer",
 }
 
 __all__ = [  # noqa: RUF022 (grouped by home, as above)
@@ -77,6 +88,11 @@ __all__ = [  # noqa: RUF022 (grouped by home, as above)
     "MarchConfig",
     "OptimConfig",
     "TrainConfig",
+    "Deferred",
+    "Features",
+    "Model",
+    "Rgb",
+    "SphericalHarmonics",
     "load_scene",
     "Demo",
     "demo",

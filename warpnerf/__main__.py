@@ -2,7 +2,7 @@
 
 import sys
 
-from warpnerf.cli import main
+from warpnerf.cli.main import main
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from typing import Literal, get_args
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal, get_args
 
 from warpnerf.checks import (
     InputError,
@@ -14,7 +14,9 @@ from warpnerf.checks import (
     require_shares,
     require_whole,
 )
+from warpnerf.model.models import Deferred, Model, model_of, to_json
 
+ModelName = Literal["rgb", "sh", "deferred", "features"]
 Scaling = Literal["none", "quadratic", "clamped"]
 Jacobian = Literal["none", "density", "paper"]
 Contraction = Literal["none", "linf", "l2"]
@@ -33,8 +35,8 @@ where photographs have alpha, updates take more steps, and earlier."""
 MAX_VOXELS = 2**31
 """Nodes are counted in 32 bits."""
 
-TRAINING_BYTES = 48
-"""Memory that a node takes: values, two moments together, and a gradient, 16 each."""
+TRAINING_BYTES = 12
+"""Memory that a number of a node takes: value, two moments together, and gradient, 4 each."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,6 +117,12 @@ class OptimConfig:
     them n^(1/4) times as far."""
     learning_rate_rgb: float = 0.2
     """How far an update of one step moves raw colours, about, at the start; likewise."""
+    learning_rate_sh: float = 0.05
+    """The same of harmonics beyond the first one; likewise."""
+    learning_rate_features: float = 0.2
+    """The same of features that an MLP sees; likewise."""
+    learning_rate_mlp: float = 5e-3
+    """The same of the weights of an MLP; likewise."""
     decay: float = 0.07
     """What is left of the learning rates at the end of training."""
     beta1: float = 0.9
@@ -141,6 +149,9 @@ class OptimConfig:
         """Refuse what cannot be optimised with."""
         require_positive("optim.learning_rate_density", self.learning_rate_density)
         require_positive("optim.learning_rate_rgb", self.learning_rate_rgb)
+        require_positive("optim.learning_rate_sh", self.learning_rate_sh)
+        require_positive("optim.learning_rate_features", self.learning_rate_features)
+        require_positive("optim.learning_rate_mlp", self.learning_rate_mlp)
         require_positive("optim.decay", self.decay)
         require_positive("optim.epsilon", self.epsilon)
         require_at_least("optim.tv_density", self.tv_density, 0.0)
@@ -204,6 +215,9 @@ class TrainConfig:
     """Where to train: cpu, cuda, cuda:1, ..."""
     checkpoint_every: float = 300.0
     """Seconds from one checkpoint to the next, at least; there is one at the end besides."""
+    model: Model = field(default_factory=Deferred)
+    """What the grid holds, and how that becomes colour. A name (rgb, sh, deferred, features) stands
+    for the model of that name as it is configured by default."""
     grid: GridConfig = field(default_factory=GridConfig)
     """The voxel grid."""
     march: MarchConfig = field(default_factory=MarchConfig)
@@ -213,6 +227,10 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         """Refuse what cannot be trained with."""
+        if isinstance(self.model, str):
+            object.__setattr__(self, "model", model_of(self.model))
+        if not isinstance(self.model, Model):
+            raise InputError(f"model must be a name or a model, not {self.model!r}.")
         require_whole("steps", self.steps, 1)
         require_whole("rays_per_step", self.rays_per_step, 1)
         require_whole("occupancy_every", self.occupancy_every, 1)
@@ -251,3 +269,13 @@ PRESETS: dict[str, TrainConfig] = {
     ),
 }
 """Starting points by name; change one with ``dataclasses.replace``."""
+
+
+def config_to_json(config: TrainConfig) -> dict[str, Any]:
+    """All fields, the model's with its name."""
+    return asdict(config) | {"model": to_json(config.model)}
+
+
+def config_from_json(tree: dict[str, Any]) -> dict[str, Any]:
+    """What to decode as a TrainConfig: where no model is named, there was only one, rgb."""
+    return {"model": {"name": "rgb"}} | tree

@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, partial
 from types import ModuleType
 from typing import Any, NamedTuple, get_args
 
 import numpy as np
 import torch
 import warp as wp
-from warpnerf_kernels import contraction, gradscale, precision
+from warpnerf_kernels.base import precision
 
-from warpnerf.adjoint import AdjointLaunch, gradient_struct, n_tiles
 from warpnerf.checks import InputError, require_at_least, require_one_of, require_positive
 from warpnerf.config import MAX_VOXELS, Scaling
-from warpnerf.grid import free_struct, grid_struct
-from warpnerf.parallel import Workers
-from warpnerf.render import SCALINGS, Steps, scratch
+from warpnerf.model.grid import box_struct, density_struct, free_struct, grid_struct
+from warpnerf.model.models import Load, Model, model_of
+from warpnerf.rendering.adjoint import AdjointLaunch, gradient_struct, n_tiles
+from warpnerf.rendering.rays import rays_struct
+from warpnerf.rendering.render import Steps, scene_struct, scratch_struct, variant_of
+from warpnerf.runtime.parallel import Workers
 
 MAX_STEPS = 1e9
 """Steps that a ray can count, from its origin on."""
@@ -133,11 +136,14 @@ def render_rays(
     background: Sequence[float] | torch.Tensor = (1.0, 1.0, 1.0),
     scaling: Scaling = "none",
     content_distance: float | torch.Tensor = 1.0,
+    model: str | Model = "rgb",
+    head: Sequence[torch.Tensor] = (),
 ) -> RenderedRays:
-    """Render rays through a grid of raw values, differentiable with respect to them.
+    """Render rays through a grid of raw values, differentiable with respect to these and the head.
 
     Samples sit at t = near + (k + 1/2) step for every k >= 0 whose point lies in the box and whose
-    t is below far; sigma = softplus(raw density + density_shift), rgb = sigmoid(raw rgb);
+    t is below far; sigma = softplus(raw density + density_shift), and c as the model says, for rgb
+    sigmoid(raw rgb);
 
         rgb = sum_k T_k alpha_k c_k + T_end background,  alpha_k = 1 - exp(-sigma_k step)
 
@@ -145,7 +151,7 @@ def render_rays(
     share is multiplied by its distance scaling. It is then the gradient of no loss: see the paper.
 
     Args:
-        raw: [X, Y, Z, 4] raw density and raw r, g, b at nodes
+        raw: [X, Y, Z, 1 + n_features] raw density and raw features, of rgb raw r, g, b, at nodes
             box_min + index (box_max - box_min) / (size - 1); float32 or float64, CPU or CUDA.
         origins: [n_rays, 3] scene units, on the same device.
         directions: [n_rays, 3] of unit length.
@@ -158,6 +164,10 @@ def render_rays(
         background: [3] or [n_rays, 3], rgb.
         scaling: none, quadratic or clamped.
         content_distance: Where gradients reach full strength, scene units; a number or [n_rays].
+        model: rgb, sh, deferred, features, or a model from ``warpnerf.model.models``.
+        head: The model's MLP, as torch.nn.Linear holds it: weight [outputs, inputs] and bias
+            [outputs] of each layer, in turn. Inputs are channels or features, then the encoded
+            direction. Its gradient is scaled where it passes samples, so for features.
 
     Returns:
         rgb [n_rays, 3], opacity [n_rays] and depth [n_rays], of raw's type and device.
@@ -172,7 +182,11 @@ def render_rays(
         raise InputError(f"far must lie beyond near, not at {far}.")
     if not math.isfinite(density_shift):
         raise InputError(f"density_shift must be finite, not {density_shift}.")
-    _require_grid(raw)
+    if isinstance(model, str):
+        model = model_of(model)
+    _require_grid(raw, model)
+    weights = _packed_head(head, model, raw)
+    raw = torch.nn.functional.pad(raw, (0, model.n_floats - raw.shape[3]))
     corners = _corner("box_min", box_min), _corner("box_max", box_max)
     if not (corners[0] < corners[1]).all():
         raise InputError(
@@ -220,8 +234,9 @@ def render_rays(
         background=behind.reshape(-1, 3).contiguous(),
         scaling=scaling,
         content_distance=content.reshape(-1).contiguous(),
+        model=model,
     )
-    return RenderedRays(*_Render.apply(raw, *rays, call))
+    return RenderedRays(*_Render.apply(raw, weights, *rays, call))
 
 
 class _Call(NamedTuple):
@@ -233,6 +248,7 @@ class _Call(NamedTuple):
     background: torch.Tensor
     scaling: Scaling
     content_distance: torch.Tensor
+    model: Model
 
 
 class _Render(torch.autograd.Function):
@@ -240,69 +256,82 @@ class _Render(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, raw: torch.Tensor, origins: torch.Tensor, directions: torch.Tensor, call: _Call
+        ctx: Any,
+        raw: torch.Tensor,
+        weights: torch.Tensor,
+        origins: torch.Tensor,
+        directions: torch.Tensor,
+        call: _Call,
     ) -> tuple[torch.Tensor, ...]:
-        kernels, types = _device_code(raw)
+        load = _device_code(raw)
+        assembly, types = load("launch.assembly"), load("base.types")
         n = len(origins)
-        rgb, depth = raw.new_empty(n, 3), raw.new_empty(n)
-        transmittance = raw.new_empty(n)
-        n_samples = torch.empty(n, dtype=torch.int32, device=raw.device)
         workers = _workers(str(raw.device))
-        outputs = _array(rgb, types.vec3), _array(transmittance), _array(depth), _array(n_samples)
-        variant = _variant(raw, kernels, "none")
+        variant = _variant(raw, call, "none")
+        seen = assembly.seen_type(variant.parts.head.n_channels)()
+        channels = raw.new_empty(n, variant.parts.head.n_channels)
+        rgb, transmittance, depth = raw.new_empty(n, 3), raw.new_empty(n), raw.new_empty(n)
+        n_samples = torch.empty(n, dtype=torch.int32, device=raw.device)
+        _fill(seen, types, rgb, transmittance, depth, n_samples, channels)
         with _stream(raw):
             workers.launch_owned(
-                kernels.render_forward_kernel(variant),
+                assembly.render_forward_kernel(variant),
+                -(-n // variant.batch),
                 n,
-                *_scene(raw, call, types),
-                *_ray_arrays(raw, origins, directions, call, types),
-                *scratch(kernels, variant, 1, workers),
-                *outputs,
+                _scene(raw, weights, call, workers),
+                _ray_arrays(raw, origins, directions, call),
+                scratch_struct(variant, 1, workers, assembly),
+                seen,
             )
         ctx.call = call
-        ctx.save_for_backward(raw, origins, directions, rgb, transmittance, depth, n_samples)
+        ctx.save_for_backward(
+            raw, weights, origins, directions, rgb, transmittance, depth, n_samples, channels
+        )
         return rgb, 1.0 - transmittance, depth
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        raw, origins, directions, rgb, transmittance, depth, n_samples = ctx.saved_tensors
+        raw, weights, origins, directions, *outputs = ctx.saved_tensors
         call: _Call = ctx.call
-        kernels, types = _device_code(raw)
-        workers = _workers(str(raw.device))
+        load = _device_code(raw)
+        assembly, types = load("launch.assembly"), load("base.types")
         adj_rgb, adj_opacity, adj_depth = (grad.contiguous() for grad in grads)
-        size = (raw.shape[0], raw.shape[1], raw.shape[2])
-        adj_raw = raw.new_zeros(*size, 4)
-        touched = torch.zeros(n_tiles(size), dtype=torch.uint8, device=raw.device)
-        gradient = gradient_struct(
-            types, _array(adj_raw.reshape(-1, 4), types.vec4), _array(touched)
-        )
-        variant = _variant(raw, kernels, call.scaling)
+        variant = _variant(raw, call, call.scaling)
         diagonal = float(np.linalg.norm(call.corners[1] - call.corners[0]))
         launch = AdjointLaunch(
-            kernels.render_backward_kernel(variant),
+            assembly.render_backward_kernel(variant),
             variant,
             call.steps.most(1.01 * diagonal),  # directions may be a little too short
             len(origins),
-            workers,
+            _workers(str(raw.device)),
         )
+        workers = launch.workers
+        n_floats, n_nodes = raw.shape[3], raw.shape[:3].numel()
+        adj_raw = raw.new_zeros(raw.shape)
+        adj_weights = raw.new_zeros(workers.count, len(weights))
+        touched = torch.zeros(n_tiles(n_nodes), dtype=torch.uint8, device=raw.device)
+        gradient = gradient_struct(
+            types,
+            _array(adj_raw.reshape(-1, n_floats), types.vector(n_floats)),
+            _array(touched),
+            _array(adj_weights),
+        )
+        seen = assembly.seen_type(variant.parts.head.n_channels)()
+        _fill(seen, types, *outputs)
         with _stream(raw):
             launch.run(
                 len(origins),
                 gradient,
-                *_scene(raw, call, types),
-                *_ray_arrays(raw, origins, directions, call, types),
-                _array(call.content_distance),
-                _array(rgb, types.vec3),
-                _array(transmittance),
-                _array(depth),
-                _array(n_samples),
+                _scene(raw, weights, call, workers),
+                _ray_arrays(raw, origins, directions, call),
+                seen,
                 _array(adj_rgb, types.vec3),
                 _array(adj_opacity),
                 _array(adj_depth),
-                *scratch(kernels, variant, 1, workers),
+                scratch_struct(variant, 1, workers, assembly),
             )
-        return adj_raw, None, None, None
+        return adj_raw, adj_weights.sum(dim=0), None, None, None
 
 
 @cache
@@ -310,19 +339,28 @@ def _workers(device: str) -> Workers:
     return Workers(device)
 
 
-def _device_code(raw: torch.Tensor) -> tuple[ModuleType, ModuleType]:
-    """Kernels and types in raw's precision."""
-    name = _PRECISIONS[raw.dtype]
-    return precision.load(name, "render"), precision.load(name, "types")
+def _device_code(raw: torch.Tensor) -> Load:
+    """Kernels in raw's precision."""
+    return partial(precision.load, _PRECISIONS[raw.dtype])
 
 
-def _variant(raw: torch.Tensor, kernels: ModuleType, scaling: Scaling) -> Any:
-    return kernels.Variant(
-        contraction.NONE,
-        SCALINGS[scaling],
-        gradscale.JACOBIAN_NONE,
-        packed=raw.dtype == torch.float32 and not raw.is_cuda,
-    )
+def _variant(raw: torch.Tensor, call: _Call, scaling: Scaling) -> Any:
+    name, packed = _PRECISIONS[raw.dtype], raw.dtype == torch.float32 and not raw.is_cuda
+    return variant_of(call.model, name, "none", scaling, "none", packed)
+
+
+def _fill(
+    seen: Any,
+    types: ModuleType,
+    rgb: torch.Tensor,
+    transmittance: torch.Tensor,
+    depth: torch.Tensor,
+    n_samples: torch.Tensor,
+    channels: torch.Tensor,
+) -> None:
+    seen.rgb, seen.transmittance = _array(rgb, types.vec3), _array(transmittance)
+    seen.depth, seen.n_samples = _array(depth), _array(n_samples)
+    seen.channels = _array(channels, types.vector(channels.shape[1]))
 
 
 def _stream(raw: torch.Tensor) -> Any:
@@ -341,41 +379,76 @@ def _array(tensor: torch.Tensor, dtype: Any = None) -> wp.array:
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
 
 
-def _scene(raw: torch.Tensor, call: _Call, types: ModuleType) -> tuple[Any, ...]:
-    """grid, free space and march, as kernels take them."""
-    size = (raw.shape[0], raw.shape[1], raw.shape[2])
-    values = _array(raw.detach().contiguous().reshape(-1, 4), types.vec4)
+def _scene(raw: torch.Tensor, weights: torch.Tensor, call: _Call, workers: Workers) -> Any:
+    """What rays are marched through, as kernels take it."""
+    load = _device_code(raw)
+    types = load("base.types")
+    n_floats, size = raw.shape[3], (raw.shape[0], raw.shape[1], raw.shape[2])
+    values = _array(raw.detach().contiguous().reshape(-1, n_floats), types.vector(n_floats))
     occupied = wp.zeros(1, dtype=wp.uint8, device=values.device)
-    return (
-        grid_struct(types, values, size, *call.corners, 0.0, call.density_shift, 1.0),
-        free_struct(types, occupied, (1, 1, 1), 0.0),
-        call.steps.struct(types),
+    return scene_struct(
+        call.model,
+        _PRECISIONS[raw.dtype],
+        box=box_struct(types, *call.corners, 0.0),
+        free=free_struct(types, occupied, (1, 1, 1), 0.0),
+        steps=call.steps,
+        grid=grid_struct(load("fields.dense"), values, size, 0.0),
+        density=density_struct(types, call.density_shift, 1.0),
+        weights=_array(weights),
+        workers=workers,
     )
 
 
 def _ray_arrays(
-    raw: torch.Tensor,
-    origins: torch.Tensor,
-    directions: torch.Tensor,
-    call: _Call,
-    types: ModuleType,
-) -> tuple[wp.array, ...]:
-    """origins, directions, offsets and background, as kernels take them."""
-    return (
+    raw: torch.Tensor, origins: torch.Tensor, directions: torch.Tensor, call: _Call
+) -> Any:
+    """The rays, as kernels take them."""
+    load = _device_code(raw)
+    types = load("base.types")
+    return rays_struct(
+        load("launch.assembly"),
         _array(origins, types.vec3),
         _array(directions, types.vec3),
         _array(raw.new_full((1,), 0.5)),
         _array(call.background, types.vec3),
+        _array(call.content_distance),
     )
 
 
-def _require_grid(raw: torch.Tensor) -> None:
+def _packed_head(head: Sequence[torch.Tensor], model: Model, raw: torch.Tensor) -> torch.Tensor:
+    """The layers in one tensor, as kernels take them; see ``warpnerf_kernels.heads.mlp``."""
+    layout = model.layout(_device_code(raw))
+    if layout is None:
+        if len(head):
+            raise InputError(f"head must be empty: the model {model.name} has no MLP.")
+        return raw.new_zeros(0)
+    sizes = [layout.n_inputs, *[layout.width] * layout.n_hidden, 3]
+    shapes = [
+        shape for n_in, n_out in itertools.pairwise(sizes) for shape in ((n_out, n_in), (n_out,))
+    ]
+    for number, tensor in enumerate(head):
+        _require_tensor(f"head[{number}]", tensor, raw)
+    found = [tuple(tensor.shape) for tensor in head]
+    if found != shapes:
+        raise InputError(
+            f"head of the model {model.name} must be tensors of shapes {shapes}, weight and bias "
+            f"of each layer in turn, not {found}."
+        )
+    pieces = [
+        tensor.to(raw.dtype).t() if tensor.dim() == 2 else tensor.to(raw.dtype) for tensor in head
+    ]
+    pieces[-2:] = [torch.nn.functional.pad(piece, (0, 1)) for piece in pieces[-2:]]
+    return torch.cat([piece.reshape(-1) for piece in pieces])
+
+
+def _require_grid(raw: torch.Tensor, model: Model) -> None:
     _require_tensor("raw", raw)
     if raw.dtype not in _PRECISIONS:
         raise InputError(f"raw must be float32 or float64, not {raw.dtype}; call raw.float().")
-    if raw.dim() != 4 or raw.shape[3] != 4 or min(raw.shape[:3]) < 2:
+    numbers = 1 + model.n_features
+    if raw.dim() != 4 or raw.shape[3] != numbers or min(raw.shape[:3]) < 2:
         raise InputError(
-            f"raw must be [X, Y, Z, 4] with at least two nodes along each axis, "
+            f"raw must be [X, Y, Z, {numbers}] with at least two nodes along each axis, "
             f"not {list(raw.shape)}."
         )
     if raw.shape[:3].numel() >= MAX_VOXELS:

@@ -1,8 +1,9 @@
 """Ways to do the work that throughput.py compares, one file each, behind one small interface.
 
 The work: march the workload's rays, composite, squared error, adjoint, gradients scaled by
-distance, scattered into the grid's gradient. It is over when that gradient lies in one array and
-what it was made with is ready for the next step: zeroed, if it has to be.
+distance, scattered into the grid's gradient, and added to the network's where there is one. It is
+over when each of these lies in one array and what it was made with is ready for the next step:
+zeroed, if it has to be.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
-from workload import Workload
+from workload import ModelName, Workload
 
 
 class Candidate(Protocol):
@@ -23,7 +24,8 @@ class Candidate(Protocol):
         """Do the work once."""
 
     def gradient(self) -> np.ndarray:
-        """What the last step left, [X, Y, Z, 4]: of the mean over rays of the squared error."""
+        """What the last step left, [X, Y, Z, n_values]: of the mean over rays of the squared
+        error. Models with a network have `network_gradient` too: [n_parameters]."""
 
     def rgb(self) -> np.ndarray:
         """The rays' colours, [n_rays, 3]."""
@@ -42,12 +44,25 @@ MODULES = {
 }
 """Modules of this package. Each has `load`, and `obstacle(device)`: why it cannot run, or None."""
 
+MODULES_OF_OTHERS = {
+    "warpnerf": "warpnerf_step",
+    "torch": "torch_models",
+    "torch.compile": "torch_models_compiled",
+    "numba": "numba_models",
+}
+"""The same, of models besides rgb."""
 
-def find(device: str) -> tuple[dict[str, Load], dict[str, str]]:
-    """What can run on a device, and why the others cannot."""
+
+def find(device: str, model: ModelName = "rgb") -> tuple[dict[str, Load], dict[str, str]]:
+    """What can run a model on a device, and why the others cannot."""
     found: dict[str, Load] = {}
     missing: dict[str, str] = {}
-    for name, module in MODULES.items():
+    modules = MODULES if model == "rgb" else MODULES_OF_OTHERS
+    for name in MODULES:
+        module = modules.get(name)
+        if module is None:
+            missing[name] = "is not written for it"
+            continue
         try:
             candidate = importlib.import_module(f"{__name__}.{module}")
         except ModuleNotFoundError as error:

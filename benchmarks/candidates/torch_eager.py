@@ -70,25 +70,16 @@ class Samples(NamedTuple):
     """Whether all steps are among them, so that packed and padded are the same."""
 
 
-class TorchScene:
-    """A grid over the box: where rays need samples, and what they read there."""
+class TorchSpace:
+    """Where rays need samples: in the box, where it is not free."""
 
-    def __init__(self, values: np.ndarray, free: np.ndarray, split: int, device: str) -> None:
-        """Load the grid.
+    def __init__(self, free: np.ndarray, device: str) -> None:
+        """Load the free cells.
 
         Args:
-            values: As in a Workload.
-            free: Likewise.
-            split: Parts into which samples are cut, so that grid_sample runs in parallel.
+            free: As in a Workload.
             device: As torch names it.
         """
-        self.values = (
-            torch.from_numpy(np.ascontiguousarray(values.transpose(3, 0, 1, 2)))[None]
-            .to(device)
-            .to(memory_format=torch.channels_last_3d)
-        )
-        """[1, 4, X, Y, Z] raw density, raw rgb."""
-        self._split = split
         self._cells = torch.tensor(free.shape, device=device)
         self._occupied = torch.from_numpy((free == 0).ravel()).to(device) if free.any() else None
 
@@ -121,6 +112,28 @@ class TorchScene:
         cell = ((q + 1.0) * (0.5 * self._cells)).long().minimum(self._cells - 1)
         flat = (cell[:, 0] * self._cells[1] + cell[:, 1]) * self._cells[2] + cell[:, 2]
         return self._occupied[flat].nonzero().view(-1)
+
+
+class TorchScene(TorchSpace):
+    """A grid over the box: where rays need samples, and what they read there."""
+
+    def __init__(self, values: np.ndarray, free: np.ndarray, split: int, device: str) -> None:
+        """Load the grid.
+
+        Args:
+            values: As in a Workload.
+            free: Likewise.
+            split: Parts into which samples are cut, so that grid_sample runs in parallel.
+            device: As torch names it.
+        """
+        super().__init__(free, device)
+        self.values = (
+            torch.from_numpy(np.ascontiguousarray(values.transpose(3, 0, 1, 2)))[None]
+            .to(device)
+            .to(memory_format=torch.channels_last_3d)
+        )
+        """[1, 4, X, Y, Z] raw density, raw rgb."""
+        self._split = split
 
     def shade(self, q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Densities [n] and colours [n, 3] at q [n, 3]."""

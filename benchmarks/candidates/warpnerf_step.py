@@ -1,10 +1,11 @@
 """warpnerf: its training pass, and the zeroing that the optimiser does for it in training."""
 
-from __future__ import annotations
+from functools import cache
+from typing import Any
 
 import numpy as np
 import warp as wp
-from warpnerf_kernels.tiles import (
+from warpnerf_kernels.base.tiles import (
     GROUP,
     STRETCH,
     TILE,
@@ -13,11 +14,11 @@ from warpnerf_kernels.tiles import (
     tile_of,
     touched_tiles,
 )
-from warpnerf_kernels.types import Gradient, vec4
-from workload import Workload
+from warpnerf_kernels.base.types import gradient_type
+from workload import MODELS, Workload
 
-from warpnerf.parallel import Packed, Workers
-from warpnerf.render import TrainingPass, render_rays
+from warpnerf.rendering.render import TrainingPass, render_rays
+from warpnerf.runtime.parallel import Packed, Workers
 
 
 @wp.func_native(
@@ -27,29 +28,35 @@ if (count == TILE) memset(values.data + node, 0, TILE * n);  // as long as the c
 else memset(values.data + node, 0, count * n);
 """.replace("TILE", str(TILE))
 )
-def clear_nodes(values: wp.array(dtype=vec4), node: int, count: int):
+def clear_nodes(values: wp.array(dtype=Any), node: int, count: int):
     """Zero some nodes."""
     ...
 
 
-@wp.kernel(enable_backward=False)
-def clear(
-    first: int,
-    span: int,  # nodes per thread
-    gradient: Gradient,  # zeroed
-):
-    """What adam_step has to do with gradients: zero what was touched."""
-    n_nodes = gradient.values.shape[0]
-    start = (first + wp.tid()) * span
-    end = wp.min(start + span, n_nodes)
-    last = tile_of(end - 1) + 1
-    for group in range(tile_of(start), last, wp.static(GROUP)):
-        tiles = touched_tiles(gradient.touched, group, last)
-        while tiles != wp.uint64(0):
-            tile = group + first_of(tiles)
-            node = wp.max(start, tile * wp.static(TILE))
-            clear_nodes(gradient.values, node, wp.min(end, (tile + 1) * wp.static(TILE)) - node)
-            tiles = but_first(tiles)
+@cache
+def clear_kernel(n_floats: int) -> wp.Kernel:
+    """What adam_step has to do with gradients of nodes with so many floats."""
+    Gradient = gradient_type(n_floats)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def clear(
+        first: int,
+        span: int,  # nodes per thread
+        gradient: Gradient,  # zeroed where it was touched
+    ):
+        n_nodes = gradient.values.shape[0]
+        start = (first + wp.tid()) * span
+        end = wp.min(start + span, n_nodes)
+        last = tile_of(end - 1) + 1
+        for group in range(tile_of(start), last, wp.static(GROUP)):
+            tiles = touched_tiles(gradient.touched, group, last)
+            while tiles != wp.uint64(0):
+                tile = group + first_of(tiles)
+                node = wp.max(start, tile * wp.static(TILE))
+                clear_nodes(gradient.values, node, wp.min(end, (tile + 1) * wp.static(TILE)) - node)
+                tiles = but_first(tiles)
+
+    return clear
 
 
 class WarpStep:
@@ -58,15 +65,26 @@ class WarpStep:
     def __init__(self, work: Workload, threads: int, device: str) -> None:
         """Load a workload."""
         self._workers = workers = Workers(device, threads)
+        self._work = work
         self._size = work.values.shape
+        self._model = work.warp_model()
+        self._weights = work.weights(workers)
         self._grid = work.voxel_grid(workers)
+        self._clear = clear_kernel(self._grid.n_floats)
         self._free = work.free_cells(workers)
         self._steps = work.steps()
         self._batch = work.batch(workers)
         self._packed = Packed()
         scaling = "clamped" if work.scaled else "none"
         self._pass = TrainingPass(
-            self._batch.count, self._grid, self._steps, scaling, "none", workers
+            self._batch.count,
+            self._model,
+            self._grid,
+            self._weights,
+            self._steps,
+            scaling,
+            "none",
+            workers,
         )
 
     def step(self) -> None:
@@ -74,19 +92,29 @@ class WarpStep:
         gradients = self._pass.gradients
         span = 1 if self._workers.device.is_cuda else STRETCH
         n = -(-gradients.values.shape[0] // span)
-        self._workers.launch(clear, n, span, gradients.struct, packed=self._packed)
+        self._workers.launch(self._clear, n, span, gradients.struct, packed=self._packed)
         gradients.touched.zero_()
+        gradients.weights.zero_()
         self._pass.run(self._free, self._batch)
 
     def gradient(self) -> np.ndarray:
-        """[X, Y, Z, 4]"""
+        """[X, Y, Z, n_values]"""
         return self._pass.gradients.values.numpy().reshape(self._size)
+
+    def network_gradient(self) -> np.ndarray:
+        """[n_parameters], weights and biases in turn; of all workers together."""
+        weights = self._pass.gradients.weights.numpy().sum(axis=0)[: self._weights.shape[0]]
+        n_outputs = 4 * (MODELS[self._work.model].width + 1) if weights.size else 0
+        before = weights.size - n_outputs
+        return np.concatenate([weights[:before], weights[before:].reshape(-1, 4)[:, :3].ravel()])
 
     def rgb(self) -> np.ndarray:
         """[n_rays, 3]"""
         batch = self._batch
         return render_rays(
+            self._model,
             self._grid,
+            self._weights,
             self._free,
             self._steps,
             batch.origins,
@@ -102,19 +130,20 @@ class WarpStep:
 
     def scratch_bytes(self) -> tuple[int, int]:
         """Of the training pass but the gradient: what a step uses, and what it has room for."""
-        arrays = [*vars(self._pass).values(), self._pass.gradients.touched]
+        gradients = self._pass.gradients
+        arrays = [*vars(self._pass).values(), gradients.touched, gradients.weights]
         used = sum(array.capacity for array in arrays if isinstance(array, wp.array))
-        parcels = self._pass.launch.parcels
-        if parcels is None:
+        deferred = self._pass.launch.deferred
+        if deferred is None:
             return used, used
-        room = used + parcels.contents.capacity + parcels.addressed.capacity
-        contents = parcels.contents.numpy()
-        contents = contents.view(np.uint8).reshape(-1, contents.dtype.itemsize)
-        contents.fill(255)
-        parcels.addressed.fill_(-1)
+        room = used + deferred.records.capacity + deferred.addressed.capacity
+        records = deferred.records.numpy()
+        records = records.view(np.uint8).reshape(-1, records.dtype.itemsize)
+        records.fill(255)
+        deferred.addressed.fill_(-1)
         self.step()
-        used += int((contents != 255).any(axis=1).sum()) * contents.shape[1]
-        used += 4 * int((parcels.addressed.numpy() != -1).sum())
+        used += int((records != 255).any(axis=1).sum()) * records.shape[1]
+        used += 4 * int((deferred.addressed.numpy() != -1).sum())
         return used, room
 
 

@@ -19,10 +19,11 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import order
+import heads
 import packed
-import parcels
 import plain
+import scatter
+import schedule
 from mutant import KERNELS, Mutant
 
 ROOT = Path(__file__).parent.parent.parent
@@ -30,7 +31,7 @@ COPIED = ("kernels", "warpnerf", "tests")
 TIME_LIMIT = 300.0
 """Seconds for the tests of one mutant; one that runs longer never ends, and is noticed as well."""
 
-MUTANTS = (*plain.MUTANTS, *packed.MUTANTS, *parcels.MUTANTS, *order.MUTANTS)
+MUTANTS = (*plain.MUTANTS, *packed.MUTANTS, *scatter.MUTANTS, *schedule.MUTANTS, *heads.MUTANTS)
 
 
 def copy_to(folder: Path) -> None:
@@ -50,7 +51,18 @@ def run_tests(
         "PYTHONDONTWRITEBYTECODE": "1",
         "WARP_CACHE_PATH": str(cache),
     }
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider"]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-x",
+        "-q",
+        "-n0",
+        "-m",
+        "",
+        "-p",
+        "no:cacheprovider",
+    ]
     command += ["--tb=short", *(f"tests/{name}" for name in tests)]
     try:
         done = subprocess.run(

@@ -5,6 +5,7 @@ Everything works for any floating dtype; float64 is what it is meant for.
 
     geometry  contraction and its Jacobian, grid coordinates, distances along a ray
     render    trilinear interpolation, the paper's gradient scaling, integration along rays
+    heads     the models: view encoding, spherical harmonics, networks, what they make of features
     training  photometric loss, total variation, one Adam step
     cameras   rays of a pinhole camera with lens distortion (numpy)
     numeric   directional derivatives by differences, relative error
@@ -20,10 +21,24 @@ from .geometry import (
     normalized_coordinates,
     sample_distances,
 )
+from .heads import (
+    DeferredHead,
+    FeaturesHead,
+    Head,
+    Network,
+    RgbHead,
+    ShHead,
+    mlp,
+    random_network,
+    spherical_harmonics,
+    view_encoding,
+)
 from .numeric import central_difference, relative_error
 from .render import (
     GradientScaler,
+    Light,
     Rendering,
+    attenuate,
     distance_scale,
     integrate,
     occupied,
@@ -34,10 +49,18 @@ from .render import (
 from .training import adam, photometric_loss, total_variation
 
 __all__ = [
+    "DeferredHead",
+    "FeaturesHead",
     "GradientScaler",
+    "Head",
+    "Light",
+    "Network",
     "Rendering",
+    "RgbHead",
     "SampleDistances",
+    "ShHead",
     "adam",
+    "attenuate",
     "central_difference",
     "contract",
     "distance_scale",
@@ -46,15 +69,19 @@ __all__ = [
     "integrate",
     "jacobian_determinant",
     "jacobian_determinant_autograd",
+    "mlp",
     "normalized_coordinates",
     "occupied",
     "photometric_loss",
     "pinhole_rays",
+    "random_network",
     "relative_error",
     "render",
     "sample_distances",
     "softplus",
+    "spherical_harmonics",
     "total_variation",
     "trilinear",
     "undistort",
+    "view_encoding",
 ]

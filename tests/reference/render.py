@@ -12,16 +12,18 @@ from .geometry import (
     normalized_coordinates,
     sample_distances,
 )
+from .heads import Head, RgbHead
 
 SCALINGS = ("none", "quadratic", "clamped")
 JACOBIANS = ("none", "density", "paper")
+RGB = RgbHead()
 
 
 class Rendering(NamedTuple):
     """What `integrate` and `render` return; differentiable, except `kept` and `t`."""
 
     rgb: Tensor
-    """sum_k w_k c_k + T_end background [n_rays, 3]."""
+    """Colour [n_rays, 3]: sum_k w_k c_k + T_end background, or what the head makes of it."""
     opacity: Tensor
     """1 - T_end [n_rays]."""
     depth: Tensor
@@ -34,6 +36,11 @@ class Rendering(NamedTuple):
     """Distance of each candidate [n_rays, n_steps], scene units."""
     kept: Tensor
     """Whether a candidate was integrated [n_rays, n_steps], bool."""
+
+    @property
+    def n_samples(self) -> Tensor:
+        """Samples of each ray that were integrated [n_rays], int64."""
+        return self.kept.sum(dim=1)
 
 
 def softplus(x: Tensor) -> Tensor:
@@ -97,7 +104,7 @@ class GradientScaler(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, sigma: Tensor, colors: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
-        """Pass sigma [...] and colors [..., 3] through; keep scale [...] for the way back."""
+        """Pass sigma [...] and colors [..., C] through; keep scale [...] for the way back."""
         ctx.save_for_backward(scale)
         return sigma.view_as(sigma), colors.view_as(colors)
 
@@ -153,20 +160,27 @@ def distance_scale(
     return (x.clamp_max(1.0) if scaling == "clamped" else x).detach()
 
 
-def integrate(
+class Light(NamedTuple):
+    """What `attenuate` returns; differentiable, except `kept`."""
+
+    weights: Tensor
+    """w_k = T_k alpha_k [n_rays, n_steps]; 0 for dropped samples."""
+    transmittance: Tensor
+    """T_end [n_rays], light that reaches the background."""
+    kept: Tensor
+    """Whether a candidate counts [n_rays, n_steps], bool."""
+
+
+def attenuate(
     sigma: Tensor,
-    colors: Tensor,
-    t: Tensor,
     dt: Tensor,
-    background: Tensor,
     valid: Tensor | None = None,
     transmittance_min: float = 0.0,
-) -> Rendering:
-    """Emission and absorption along each ray.
+) -> Light:
+    """What of each ray's light every sample takes.
 
     alpha_k = 1 - exp(-sigma_k dt_k),  w_k = T_k alpha_k
     T_1 = 1,  T_{k+1} = T_k exp(-sigma_k dt_k)
-    rgb = sum_k w_k c_k + T_end background,  opacity = 1 - T_end,  depth = sum_k w_k t_k
 
     A sample is kept where it is valid and T_k >= transmittance_min, T_k over the samples kept
     before it. Since T never rises, T over all valid samples decides the same: the two agree until
@@ -174,15 +188,12 @@ def integrate(
 
     Args:
         sigma: Densities [n_rays, n_steps], 1 / scene unit.
-        colors: Colours [n_rays, n_steps, 3].
-        t: Distances [n_rays, n_steps], scene units.
         dt: Step lengths [n_steps] or [n_rays, n_steps], scene units.
-        background: Colour [3] or [n_rays, 3].
         valid: Candidates to consider [n_rays, n_steps], bool; all of them when None.
         transmittance_min: Stop a ray once its transmittance is below this.
 
     Returns:
-        Rendering of n_rays rays.
+        Light of n_rays rays.
     """
     if valid is None:
         valid = torch.ones_like(sigma, dtype=torch.bool)
@@ -195,15 +206,48 @@ def integrate(
     tau = sigma * torch.where(valid, dt, zero)
     kept = valid & (light_before(tau)[:, :-1] >= transmittance_min)
     tau = torch.where(kept, tau, zero)
-
     light = light_before(tau)
     alpha = -torch.expm1(-tau)
-    weights = light[:, :-1] * alpha
-    transmittance = light[:, -1]
+    return Light(weights=light[:, :-1] * alpha, transmittance=light[:, -1], kept=kept)
+
+
+def integrate(
+    sigma: Tensor,
+    colors: Tensor,
+    t: Tensor,
+    dt: Tensor,
+    background: Tensor,
+    valid: Tensor | None = None,
+    transmittance_min: float = 0.0,
+    head: Head = RGB,
+    directions: Tensor | None = None,
+) -> Rendering:
+    """Emission and absorption along each ray, with the weights of `attenuate`.
+
+    rgb = sum_k w_k c_k + T_end background,  opacity = 1 - T_end,  depth = sum_k w_k t_k
+
+    Args:
+        sigma: Densities [n_rays, n_steps], 1 / scene unit.
+        colors: Colours [n_rays, n_steps, 3], or what else the head composites [.., .., C].
+        t: Distances [n_rays, n_steps], scene units.
+        dt: Step lengths [n_steps] or [n_rays, n_steps], scene units.
+        background: Colour [3] or [n_rays, 3].
+        valid: Candidates to consider [n_rays, n_steps], bool; all of them when None.
+        transmittance_min: Stop a ray once its transmittance is below this.
+        head: Makes colours of rays from what was composited.
+        directions: Unit vectors [n_rays, 3], for heads that need them.
+
+    Returns:
+        Rendering of n_rays rays.
+    """
+    weights, transmittance, kept = attenuate(sigma, dt, valid, transmittance_min)
+    if directions is None:  # a head that needs them shows it
+        directions = torch.full_like(t[:, :1], float("nan")).expand(-1, 3)
+    composited = (weights[..., None] * colors).sum(dim=1)
     return Rendering(
-        rgb=(weights[..., None] * colors).sum(dim=1) + transmittance[:, None] * background,
+        rgb=head.color(composited, transmittance, directions, background),
         opacity=1.0 - transmittance,
-        depth=(weights * torch.where(kept, t, zero)).sum(dim=1),
+        depth=(weights * torch.where(kept, t, torch.zeros_like(t))).sum(dim=1),
         transmittance=transmittance,
         weights=weights,
         t=t,
@@ -235,17 +279,20 @@ def render(
     scaling: str = "none",
     content_distance: float | Tensor = 1.0,
     jacobian: str = "none",
+    head: Head = RGB,
 ) -> Rendering:
     """Render rays through a grid of raw values, every candidate sample of every ray at once.
 
-    sigma = density_scale softplus(raw_0 + density_shift),  c = sigmoid(raw_1..3)
+    sigma = density_scale softplus(raw_0 + density_shift),  c = head(raw_1..F)
 
     Both come after interpolation and before `integrate`. A candidate is valid where it lies in the
     grid (0 <= u <= size - 1; always, under contraction), t < far, and its mask cell is occupied.
-    The gradient scaling sits between the activations and the integration, as in the paper.
+    The gradient scaling sits between the activations and the integration, as in the paper: on
+    sigma, and on what the head composites of each sample.
 
     Args:
-        raw: Node values [X, Y, Z, 4]: raw density, raw rgb. Sets dtype and device of the result.
+        raw: Node values [X, Y, Z, M]: raw density, F raw features, and what is not read. Sets dtype
+            and device of the result.
         origins: Ray origins [n_rays, 3], scene units.
         directions: Ray directions [n_rays, 3], unit vectors.
         box_min: Lower corner of the (inner) box [3], scene units.
@@ -267,6 +314,7 @@ def render(
         scaling: See `distance_scale`.
         content_distance: See `distance_scale`; one for all or [n_rays].
         jacobian: See `distance_scale`; |det J| is 1 without contraction.
+        head: Makes colours of features; `RgbHead` has F = 3, c = sigmoid(raw_1..3).
 
     Returns:
         Rendering of n_rays rays.
@@ -293,13 +341,15 @@ def render(
     if mask is not None:
         valid = valid & occupied(mask, u, shape)
 
-    values = trilinear(raw, u)  # [n_rays, n_steps, 4]
+    values = trilinear(raw[..., : 1 + head.n_features], u)  # [n_rays, n_steps, 1 + F]
     sigma = density_scale * softplus(values[..., 0] + density_shift)
-    colors = torch.sigmoid(values[..., 1:4])
+    weights = attenuate(sigma.detach(), dt, valid, transmittance_min).weights
+    colors = head.shade(values[..., 1:], directions, weights)  # [n_rays, n_steps, C]
 
     det = jacobian_determinant(normalized_coordinates(points, corner_min, corner_max), norm, border)
     scale = distance_scale(t, content_distance, scaling, det, jacobian)
     scale = torch.where(valid, scale, torch.zeros_like(scale))  # dropped samples have no gradient
     sigma, colors = GradientScaler.apply(sigma, colors, scale)
 
-    return integrate(sigma, colors, t, dt, like_raw(background), valid, transmittance_min)
+    over = like_raw(background)
+    return integrate(sigma, colors, t, dt, over, valid, transmittance_min, head, directions)

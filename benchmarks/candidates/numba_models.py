@@ -1,0 +1,695 @@
+"""numba for models with more features than a colour: sh, deferred, features.
+
+As numba_cpu.py, whose walk it shares: threads with gradients of their own, a ray taken in phases,
+adjoint by hand, samples kept. What a node holds and the units of a layer lie side by side, so a
+sample at a time is worked on in vectors of these; densities lie in a row for the ray. Everything
+that a model fixes is a constant of the functions that are made for it. A layer takes four samples
+at once, so that a weight read is used four times.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+from numba import njit, prange
+from workload import DENSITY_SHIFT, MODELS, ModelName, Workload
+
+from candidates.numba_cpu import (
+    ALPHA,
+    ATTENUATION,
+    BACK,
+    FX,
+    FY,
+    FZ,
+    LIGHT,
+    RAW,
+    TILE,
+    WEIGHT,
+    F,
+    S,
+    Scene,
+    T,
+    U,
+    exponential,
+    has_gradient,
+    log1p,
+    sigmoid,
+    walk,
+)
+from candidates.numba_cpu import (
+    obstacle as obstacle,
+)
+
+N_ROWS = RAW + 1
+FACTOR = N_ROWS
+"""One more row: what a sample's gradients are multiplied by."""
+AT_ONCE = 4
+"""Samples whose rows of a layer are worked on together."""
+
+
+@njit(fastmath=True, error_model="numpy")
+def weigh(scene, n, rows):
+    """Raw densities in row RAW to weights; row RAW becomes the slope of the density. Returns the
+    light that passes."""
+    for s in range(n):
+        x = rows[RAW, s] + F(DENSITY_SHIFT)
+        e = exponential(-abs(x))
+        tau = (max(x, F(0.0)) + log1p(e)) * scene.step
+        rows[RAW, s] = (F(1.0) if x >= F(0.0) else e) / (F(1.0) + e)
+        attenuation = exponential(-tau)
+        series = tau * (F(1.0) - tau * (F(0.5) - tau * (F(1.0 / 6.0) - tau * F(1.0 / 24.0))))
+        rows[ATTENUATION, s] = attenuation
+        rows[ALPHA, s] = series if tau < F(0.01) else F(1.0) - attenuation
+        ratio = rows[T, s] / scene.content_distance
+        rows[FACTOR, s] = min(F(1.0), ratio * ratio) if scene.scaled else F(1.0)
+    light = F(1.0)
+    for s in range(n):
+        rows[WEIGHT, s] = light * rows[ALPHA, s]
+        light *= rows[ATTENUATION, s]
+        rows[LIGHT, s] = light
+    return light
+
+
+@njit(fastmath=True, error_model="numpy")
+def adj_weigh(scene, n, rows, behind):
+    """From what flows back into weights, in row BACK, and into what lies behind all, times its
+    light: to the gradients of raw densities, in row RAW."""
+    for s in range(n - 1, -1, -1):
+        adj_weight = rows[BACK, s]
+        rows[BACK, s] = rows[LIGHT, s] * adj_weight - behind
+        behind += rows[WEIGHT, s] * adj_weight
+    for s in range(n):
+        rows[RAW, s] *= rows[FACTOR, s] * scene.step * rows[BACK, s]
+
+
+@cache
+def layer(n_own: int, n_out: int) -> tuple[Callable[..., Any], ...]:
+    """One layer on rows of samples, of which n_own inputs differ from row to row.
+
+    Returns:
+        forward(n, x, weights, base, out), for which base [n_out] is what all rows begin with;
+        adj_inputs(n, adj, transposed, adj_x); adj_weights(n, x, adj, out), added to.
+    """
+
+    @njit(fastmath=True, error_model="numpy")
+    def forward(n, x, weights, base, out):
+        whole = n - n % AT_ONCE
+        for s in range(0, whole, AT_ONCE):
+            a, b, c, d = out[s], out[s + 1], out[s + 2], out[s + 3]
+            for j in range(n_out):
+                a[j] = base[j]
+                b[j] = base[j]
+                c[j] = base[j]
+                d[j] = base[j]
+            for i in range(n_own):
+                p, q, r, t = x[s, i], x[s + 1, i], x[s + 2, i], x[s + 3, i]
+                for j in range(n_out):
+                    w = weights[i, j]
+                    a[j] += p * w
+                    b[j] += q * w
+                    c[j] += r * w
+                    d[j] += t * w
+        for s in range(whole, n):
+            a = out[s]
+            for j in range(n_out):
+                a[j] = base[j]
+            for i in range(n_own):
+                for j in range(n_out):
+                    a[j] += x[s, i] * weights[i, j]
+
+    @njit(fastmath=True, error_model="numpy")
+    def adj_inputs(n, adj, transposed, adj_x):
+        for s in range(n):
+            for i in range(n_own):
+                adj_x[s, i] = F(0.0)
+            for j in range(n_out):
+                a = adj[s, j]
+                for i in range(n_own):
+                    adj_x[s, i] += a * transposed[j, i]
+
+    @njit(fastmath=True, error_model="numpy")
+    def adj_weights(n, x, adj, out):
+        whole = n - n % AT_ONCE
+        for s in range(0, whole, AT_ONCE):
+            for i in range(n_own):
+                p, q, r, t = x[s, i], x[s + 1, i], x[s + 2, i], x[s + 3, i]
+                for j in range(n_out):
+                    out[i, j] += (
+                        p * adj[s, j] + q * adj[s + 1, j] + r * adj[s + 2, j] + t * adj[s + 3, j]
+                    )
+        for s in range(whole, n):
+            for i in range(n_own):
+                for j in range(n_out):
+                    out[i, j] += x[s, i] * adj[s, j]
+
+    return forward, adj_inputs, adj_weights
+
+
+class Network(NamedTuple):
+    """Weights [inputs, outputs] and biases of three layers, and all weights transposed."""
+
+    w1: np.ndarray
+    b1: np.ndarray
+    w2: np.ndarray
+    b2: np.ndarray
+    w3: np.ndarray
+    b3: np.ndarray
+    t1: np.ndarray
+    t2: np.ndarray
+    t3: np.ndarray
+
+
+class Rows(NamedTuple):
+    """A thread's scratch: a row for each sample, or of `deferred` one for the ray. For all threads
+    together every array has one more axis, the first."""
+
+    raw: np.ndarray  # [n_steps, n_values] what is read, then what flows back
+    color: np.ndarray  # [n_steps, n_channels]
+    x: np.ndarray  # [n_steps, inputs]
+    h1: np.ndarray  # [n_steps, width], ReLU applied
+    h2: np.ndarray
+    y: np.ndarray  # [n_steps, 4]
+    adj_x: np.ndarray
+    adj1: np.ndarray
+    adj2: np.ndarray
+    lit: np.ndarray  # [n_steps] int32, of each row its sample
+    base: np.ndarray  # [2, width] what the first layer begins with, and its adjoint
+    of_view: np.ndarray  # [64] harmonics or encoding of the direction
+
+
+@njit(inline="always")
+def rows_of(k, thread):
+    return Rows(
+        k.raw[thread],
+        k.color[thread],
+        k.x[thread],
+        k.h1[thread],
+        k.h2[thread],
+        k.y[thread],
+        k.adj_x[thread],
+        k.adj1[thread],
+        k.adj2[thread],
+        k.lit[thread],
+        k.base[thread],
+        k.of_view[thread],
+    )
+
+
+@njit(inline="always")
+def network_of(net, thread):
+    return Network(
+        net.w1[thread],
+        net.b1[thread],
+        net.w2[thread],
+        net.b2[thread],
+        net.w3[thread],
+        net.b3[thread],
+        net.t1[thread],
+        net.t2[thread],
+        net.t3[thread],
+    )
+
+
+@njit
+def clear(net):
+    """Not in the parallel loop itself, where numba 0.68 leaves biases as they are."""
+    net.w1.fill(F(0.0))
+    net.b1.fill(F(0.0))
+    net.w2.fill(F(0.0))
+    net.b2.fill(F(0.0))
+    net.w3.fill(F(0.0))
+    net.b3.fill(F(0.0))
+
+
+@njit
+def add_to(net, other):
+    net.w1[:] += other.w1
+    net.b1[:] += other.b1
+    net.w2[:] += other.w2
+    net.b2[:] += other.b2
+    net.w3[:] += other.w3
+    net.b3[:] += other.b3
+
+
+@njit(fastmath=True, error_model="numpy")
+def gather_densities(scene, n_values, n, rows, base):
+    """Raw densities at the samples, into row RAW."""
+    v = scene.values
+    y = U(n_values) * U(scene.size[2])
+    x = y * U(scene.size[1])
+    side = U(n_values)
+    for s in range(n):
+        fx, fy, fz = rows[FX, s], rows[FY, s], rows[FZ, s]
+        gx, gy = F(1.0) - fx, F(1.0) - fy
+        near = U(n_values) * U(base[s])
+        far = near + x
+        a = gx * (gy * v[near] + fy * v[near + y]) + fx * (gy * v[far] + fy * v[far + y])
+        near, far = near + side, far + side
+        b = gx * (gy * v[near] + fy * v[near + y]) + fx * (gy * v[far] + fy * v[far + y])
+        rows[RAW, s] = a + fz * (b - a)
+
+
+@njit(fastmath=True, inline="always")
+def shares_of(rows, s):
+    """Of a sample in its eight nodes, by where they lie: x, y, z, the last the fastest."""
+    fx, fy, fz = rows[FX, s], rows[FY, s], rows[FZ, s]
+    gx, gy, gz = F(1.0) - fx, F(1.0) - fy, F(1.0) - fz
+    return (
+        gx * gy * gz,
+        gx * gy * fz,
+        gx * fy * gz,
+        gx * fy * fz,
+        fx * gy * gz,
+        fx * gy * fz,
+        fx * fy * gz,
+        fx * fy * fz,
+    )
+
+
+@cache
+def functions(name: ModelName) -> Callable[..., None]:
+    """The step of a model."""
+    model = MODELS[name]
+    n_values, width = model.n_values, model.width
+    n_channels = model.n_features if name == "deferred" else 3
+    n_own = {"sh": 1, "deferred": model.n_inputs, "features": 9}[name]
+    n_view = model.n_inputs - 9
+    forward1, adj_inputs1, adj_weights1 = layer(n_own, width)
+    forward2, adj_inputs2, adj_weights2 = layer(width, width)
+    forward3, adj_inputs3, adj_weights3 = layer(width, 3)
+    is_sh, is_deferred, is_features = (name == m for m in ("sh", "deferred", "features"))
+    threshold = F(model.threshold)
+    n_frequencies = model.n_frequencies
+
+    @njit(fastmath=True, error_model="numpy")
+    def gather(scene, s, rows, base, out):
+        """All that the nodes hold at a sample."""
+        v = scene.values
+        y = U(n_values) * U(scene.size[2])
+        x = y * U(scene.size[1])
+        w000, w001, w010, w011, w100, w101, w110, w111 = shares_of(rows, s)
+        at = U(n_values) * U(base[s])
+        side = U(n_values)
+        for c in range(n_values):
+            i = at + U(c)
+            low = w000 * v[i] + w010 * v[i + y] + w100 * v[i + x] + w110 * v[i + x + y]
+            i += side
+            out[c] = low + (w001 * v[i] + w011 * v[i + y] + w101 * v[i + x] + w111 * v[i + x + y])
+
+    @njit(fastmath=True, error_model="numpy")
+    def add(out, at, share, adj):
+        """Add to a node: all is read before anything is written."""
+        for c in range(0, n_values, 8):
+            i = at + U(c)
+            a, b = out[i] + share * adj[c], out[i + U(1)] + share * adj[c + 1]
+            d, e = out[i + U(2)] + share * adj[c + 2], out[i + U(3)] + share * adj[c + 3]
+            f, g = out[i + U(4)] + share * adj[c + 4], out[i + U(5)] + share * adj[c + 5]
+            h, k = out[i + U(6)] + share * adj[c + 6], out[i + U(7)] + share * adj[c + 7]
+            out[i], out[i + U(1)], out[i + U(2)], out[i + U(3)] = a, b, d, e
+            out[i + U(4)], out[i + U(5)], out[i + U(6)], out[i + U(7)] = f, g, h, k
+
+    @njit(fastmath=True, error_model="numpy")
+    def adj_gather(scene, s, rows, base, adj, out, touched):
+        """Hand a sample's gradient to the nodes."""
+        y = U(scene.size[2])
+        x = y * U(scene.size[1])
+        w000, w001, w010, w011, w100, w101, w110, w111 = shares_of(rows, s)
+        at, side = U(base[s]), U(n_values)
+        add(out, side * at, w000, adj)
+        add(out, side * (at + U(1)), w001, adj)
+        add(out, side * (at + y), w010, adj)
+        add(out, side * (at + y + U(1)), w011, adj)
+        add(out, side * (at + x), w100, adj)
+        add(out, side * (at + x + U(1)), w101, adj)
+        add(out, side * (at + x + y), w110, adj)
+        add(out, side * (at + x + y + U(1)), w111, adj)
+        for node in (at, at + y, at + x, at + x + y):
+            if not touched[node // TILE]:
+                touched[node // TILE] = True
+
+    @njit(fastmath=True, error_model="numpy")
+    def adj_gather_density(scene, s, rows, base, out, touched):
+        """The same of a sample that has no gradient but its density's."""
+        y = U(scene.size[2])
+        x = y * U(scene.size[1])
+        w000, w001, w010, w011, w100, w101, w110, w111 = shares_of(rows, s)
+        at, side, adj = U(base[s]), U(n_values), rows[RAW, s]
+        out[side * at] += w000 * adj
+        out[side * (at + U(1))] += w001 * adj
+        out[side * (at + y)] += w010 * adj
+        out[side * (at + y + U(1))] += w011 * adj
+        out[side * (at + x)] += w100 * adj
+        out[side * (at + x + U(1))] += w101 * adj
+        out[side * (at + x + y)] += w110 * adj
+        out[side * (at + x + y + U(1))] += w111 * adj
+        for node in (at, at + y, at + x, at + x + y):
+            if not touched[node // TILE]:
+                touched[node // TILE] = True
+
+    @njit(fastmath=True, error_model="numpy")
+    def encode(d, out):
+        """The direction, its sines and cosines."""
+        for axis in range(3):
+            out[axis] = d[axis]
+            for k in range(n_frequencies):
+                angle = d[axis] * F(1 << k)
+                out[3 + 6 * k + axis] = F(np.sin(angle))
+                out[6 + 6 * k + axis] = F(np.cos(angle))
+
+    @njit(fastmath=True, error_model="numpy")
+    def harmonics(d, out):
+        """Up to degree 2."""
+        x, y, z = d[0], d[1], d[2]
+        out[0] = F(0.28209479177387814)
+        out[1] = F(-0.4886025119029199) * y
+        out[2] = F(0.4886025119029199) * z
+        out[3] = F(-0.4886025119029199) * x
+        out[4] = F(1.0925484305920792) * x * y
+        out[5] = F(-1.0925484305920792) * y * z
+        out[6] = F(0.31539156525252005) * (F(2.0) * z * z - x * x - y * y)
+        out[7] = F(-1.0925484305920792) * x * z
+        out[8] = F(0.5462742152960396) * (x * x - y * y)
+
+    @njit(fastmath=True, error_model="numpy")
+    def run_network(n, net, k):
+        """Rows x to y; the first layer begins with base[0]."""
+        forward1(n, k.x, net.w1, k.base[0], k.h1)
+        for s in range(n):
+            for j in range(width):
+                k.h1[s, j] = max(k.h1[s, j], F(0.0))
+        forward2(n, k.h1, net.w2, net.b2, k.h2)
+        for s in range(n):
+            for j in range(width):
+                k.h2[s, j] = max(k.h2[s, j], F(0.0))
+        forward3(n, k.h2, net.w3, net.b3, k.y)
+
+    @njit(fastmath=True, error_model="numpy")
+    def adj_run_network(n, net, k, gradient):
+        """From what flows back in rows y to rows adj_x; the network's is added to, but for what
+        the first layer begins with: that goes to base[1]."""
+        adj_weights3(n, k.h2, k.y, gradient.w3)
+        adj_inputs3(n, k.y, net.t3, k.adj2)
+        for s in range(n):
+            for j in range(3):
+                gradient.b3[j] += k.y[s, j]
+            for j in range(width):
+                k.adj2[s, j] = k.adj2[s, j] if k.h2[s, j] > F(0.0) else F(0.0)
+                gradient.b2[j] += k.adj2[s, j]
+        adj_weights2(n, k.h1, k.adj2, gradient.w2)
+        adj_inputs2(n, k.adj2, net.t2, k.adj1)
+        for j in range(width):
+            k.base[1, j] = F(0.0)
+        for s in range(n):
+            for j in range(width):
+                k.adj1[s, j] = k.adj1[s, j] if k.h1[s, j] > F(0.0) else F(0.0)
+                k.base[1, j] += k.adj1[s, j]
+        adj_weights1(n, k.x, k.adj1, gradient.w1)
+        adj_inputs1(n, k.adj1, net.t1, k.adj_x)
+
+    @njit(fastmath=True, error_model="numpy")
+    def color_samples(n, rows, k, view, net):
+        """Rows raw to color; of `features`, n are those that have one."""
+        if is_sh:
+            for s in range(n):
+                red, green, blue = F(0.0), F(0.0), F(0.0)
+                for b in range(9):
+                    red += view[b] * k.raw[s, 1 + 3 * b]
+                    green += view[b] * k.raw[s, 2 + 3 * b]
+                    blue += view[b] * k.raw[s, 3 + 3 * b]
+                k.color[s, 0], k.color[s, 1], k.color[s, 2] = red, green, blue
+        elif is_deferred:
+            for s in range(n):
+                for c in range(n_channels):
+                    k.color[s, c] = k.raw[s, 1 + c]
+        else:
+            for s in range(n):
+                for i in range(n_own):
+                    k.x[s, i] = k.raw[s, 4 + i]
+            for j in range(width):
+                k.base[0, j] = net.b1[j]
+            for i in range(n_view):
+                for j in range(width):
+                    k.base[0, j] += view[i] * net.w1[n_own + i, j]
+            run_network(n, net, k)
+            for s in range(n):
+                for c in range(3):
+                    k.color[s, c] = k.raw[s, 1 + c] + k.y[s, c]
+        for s in range(n):
+            for c in range(n_channels):
+                k.color[s, c] = sigmoid(k.color[s, c])
+
+    @njit(fastmath=True, error_model="numpy")
+    def adj_color_samples(n, rows, k, view, net, adj_channels, gradient):
+        """Rows color to what flows back into raw values but densities, in rows raw."""
+        for r in range(n):
+            s = k.lit[r]
+            share = rows[FACTOR, s] * rows[WEIGHT, s]
+            for c in range(n_channels):
+                color = k.color[r, c]
+                k.color[r, c] = share * adj_channels[c] * color * (F(1.0) - color)
+        if is_sh:
+            for r in range(n):
+                for b in range(9):
+                    for c in range(3):
+                        k.raw[r, 1 + 3 * b + c] = view[b] * k.color[r, c]
+        elif is_deferred:
+            for r in range(n):
+                for c in range(n_channels):
+                    k.raw[r, 1 + c] = k.color[r, c]
+        else:
+            for r in range(n):
+                for c in range(3):
+                    k.y[r, c] = k.color[r, c]
+            adj_run_network(n, net, k, gradient)
+            for j in range(width):
+                gradient.b1[j] += k.base[1, j]
+            for i in range(n_view):
+                for j in range(width):
+                    gradient.w1[n_own + i, j] += view[i] * k.base[1, j]
+            for r in range(n):
+                for c in range(3):
+                    k.raw[r, 1 + c] = k.color[r, c]
+                for i in range(n_own):
+                    k.raw[r, 4 + i] = k.adj_x[r, i]
+
+    @njit(fastmath=True, error_model="numpy")
+    def train_ray(
+        scene, o, d, target, loss_weight, net, rows, base, k, view, gradient, out, touched, out_rgb
+    ):
+        n = walk(scene, o, d, rows, base)
+        if is_features:
+            gather_densities(scene, n_values, n, rows, base)
+        else:
+            for s in range(n):
+                gather(scene, s, rows, base, k.raw[s])
+                rows[RAW, s] = k.raw[s, 0]
+        light = weigh(scene, n, rows)
+        lit = 0
+        for s in range(n):
+            if not is_features or rows[WEIGHT, s] > threshold:
+                k.lit[lit] = s
+                lit += 1
+        if is_features:
+            for r in range(lit):
+                gather(scene, k.lit[r], rows, base, k.raw[r])
+        if is_sh:
+            harmonics(d, view)
+        else:
+            encode(d, view)
+        color_samples(lit, rows, k, view, net)
+        seen = np.zeros(n_channels, np.float32)
+        for r in range(lit):
+            for c in range(n_channels):
+                seen[c] += rows[WEIGHT, k.lit[r]] * k.color[r, c]
+        if is_deferred:
+            for c in range(n_channels):
+                k.x[0, c] = seen[c]
+            for i in range(n_own - n_channels):
+                k.x[0, n_channels + i] = view[i]
+            for j in range(width):
+                k.base[0, j] = net.b1[j]
+            run_network(1, net, k)
+            for c in range(3):
+                out_rgb[c] = seen[c] + (F(1.0) - light) * k.y[0, c]
+        else:
+            for c in range(3):
+                out_rgb[c] = seen[c]
+        adj_channels = np.zeros(n_channels, np.float32)
+        behind = F(0.0)
+        for c in range(3):
+            out_rgb[c] += light * scene.background[c]
+            adj_channels[c] = F(2.0) * loss_weight * (out_rgb[c] - target[c])
+            behind += light * adj_channels[c] * scene.background[c]
+        if is_deferred:
+            for c in range(3):
+                behind -= light * adj_channels[c] * k.y[0, c]
+                k.y[0, c] = (F(1.0) - light) * adj_channels[c]
+            adj_run_network(1, net, k, gradient)
+            for j in range(width):
+                gradient.b1[j] += k.base[1, j]
+            for c in range(n_channels):
+                adj_channels[c] += k.adj_x[0, c]
+        for s in range(n):
+            rows[BACK, s] = F(0.0)
+        for r in range(lit):
+            total = F(0.0)
+            for c in range(n_channels):
+                total += adj_channels[c] * k.color[r, c]
+            rows[BACK, k.lit[r]] = total
+        adj_weigh(scene, n, rows, behind)
+        adj_color_samples(lit, rows, k, view, net, adj_channels, gradient)
+        r = 0
+        for s in range(n):
+            if r < lit and k.lit[r] == s:
+                k.raw[r, 0] = rows[RAW, s]
+                adj_gather(scene, s, rows, base, k.raw[r], out, touched)
+                r += 1
+            else:
+                adj_gather_density(scene, s, rows, base, out, touched)
+
+    @njit(parallel=True, fastmath=True, error_model="numpy")
+    def train(
+        scene,
+        origins,
+        directions,
+        target_rgb,
+        net,
+        all_rows,
+        of_network,  # gradients
+        gradients,
+        touched,
+        rows,
+        base,
+        out_rgb,
+    ):
+        """One step: the sum of the threads' gradients is left in the first's, others zeroed."""
+        n_threads, n_numbers = gradients.shape
+        n_rays = len(origins)
+        run = TILE * U(n_values)
+        for tile in prange(touched.size):
+            if has_gradient(touched, tile):
+                gradients[0, U(tile) * run : (U(tile) + U(1)) * run] = F(0.0)
+        touched[:] = False
+        for thread in prange(n_threads):
+            k, gradient = rows_of(all_rows, thread), network_of(of_network, thread)
+            clear(gradient)
+            for i in range(n_rays * thread // n_threads, n_rays * (thread + 1) // n_threads):
+                train_ray(
+                    scene,
+                    origins[i],
+                    directions[i],
+                    target_rgb[i],
+                    F(1.0) / F(n_rays),
+                    net,
+                    rows[thread],
+                    base[thread],
+                    k,
+                    k.of_view,
+                    gradient,
+                    gradients[thread],
+                    touched,
+                    out_rgb[i],
+                )
+        for other in range(1, n_threads):
+            add_to(network_of(of_network, 0), network_of(of_network, other))
+        for tile in prange(touched.size):
+            if has_gradient(touched, tile):
+                for other in range(1, n_threads):
+                    for at in range(U(tile) * run, min((U(tile) + U(1)) * run, U(n_numbers))):
+                        gradients[0, at] += gradients[other, at]
+                        gradients[other, at] = F(0.0)
+
+    return train
+
+
+class NumbaModels:
+    """A workload's training step in numba."""
+
+    def __init__(self, work: Workload, threads: int, device: str) -> None:
+        """Load a workload."""
+        self._threads = threads
+        self._shape = work.values.shape
+        model = MODELS[work.model]
+        size = np.array(self._shape[:3], S)
+        scene = Scene(
+            values=work.values.ravel(),
+            size=size,
+            to_nodes=F(0.5) * (size - 1).astype(F),
+            free=work.free,
+            to_cells=F(0.5) * np.array(work.free.shape, F),
+            skips=work.skips,
+            n_steps=work.n_steps,
+            step=F(work.step),
+            background=np.array(work.background, F),
+            scaled=work.scaled,
+            content_distance=F(work.content_distance),
+        )
+        n_steps, width = work.n_steps, model.width
+        arrays = work.network or tuple(np.zeros(s, F) for s in [(1, 1), 1] * 3)
+        transposed = (np.ascontiguousarray(array.T) for array in arrays[::2])
+        n_channels = model.n_features if work.model == "deferred" else 3
+
+        def room(*shape: int) -> np.ndarray:
+            return np.zeros(shape, F)
+
+        rows = Rows(
+            raw=room(threads, n_steps, model.n_values),
+            color=room(threads, n_steps, n_channels),
+            x=room(threads, n_steps, max(1, model.n_inputs)),
+            h1=room(threads, n_steps, width),
+            h2=room(threads, n_steps, width),
+            y=room(threads, n_steps, 4),
+            adj_x=room(threads, n_steps, max(1, model.n_inputs)),
+            adj1=room(threads, n_steps, width),
+            adj2=room(threads, n_steps, width),
+            lit=np.zeros((threads, n_steps), S),
+            base=room(threads, 2, width),
+            of_view=room(threads, 64),
+        )
+        network = Network(*arrays, *transposed)
+        self._network_gradients = Network(*(room(threads, *array.shape) for array in network))
+        self._gradients = np.zeros((threads, work.values.size), F)
+        self._rgb = np.zeros_like(work.origins)
+        self._has_network = bool(work.network)
+        run = int(TILE) * model.n_values
+        self._train = functions(work.model)
+        self._arguments = (
+            scene,
+            work.origins,
+            work.directions,
+            work.target_rgb,
+            network,
+            rows,
+            self._network_gradients,
+            self._gradients,
+            np.zeros(-(-work.values.size // run), np.bool_),
+            np.zeros((threads, N_ROWS + 1, n_steps), F),
+            np.zeros((threads, n_steps), S),
+            self._rgb,
+        )
+
+    def step(self) -> None:
+        """Forward, loss and adjoint."""
+        numba.set_num_threads(self._threads)
+        self._train(*self._arguments)
+
+    def gradient(self) -> np.ndarray:
+        """[X, Y, Z, n_values]"""
+        return self._gradients[0].reshape(self._shape)
+
+    def network_gradient(self) -> np.ndarray:
+        """[n_parameters], weights and biases in turn."""
+        if not self._has_network:
+            return np.zeros(0, F)
+        return np.concatenate([array[0].ravel() for array in self._network_gradients[:6]])
+
+    def rgb(self) -> np.ndarray:
+        """[n_rays, 3]"""
+        return self._rgb
+
+
+load = NumbaModels

@@ -1,0 +1,448 @@
+"""Eager torch for models with more features than a colour: sh, deferred, features.
+
+Samples are packed. embedding_bag reads the grid without a copy of eight nodes for each sample;
+autograd does what lies between nodes and loss, in parts of the rays; gradients go to the nodes in
+place. `features` has its densities apart, since most samples need nothing else, and does once for a
+ray what its network makes of the direction. Milliseconds of the two ways to hand gradients to the
+nodes, in a whole step of 4096 rays on one thread, 160^3 grid, dense:
+
+                      sh    deferred    features
+    index_add       2341        1045        1565
+    add_by_pairs    1594         641        1279
+
+Tried for the adjoint and slower: index_put and scatter_add with rows, a sparse matrix (coordinates
+or rows) times the gradients, sorting all nodes and embedding_bag. For reading: index_select with
+bmm, grid_sample, a sparse matrix. Parts and the way to the nodes are decided by timing.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from measuring import Stopwatch
+from workload import DENSITY_SHIFT, MODELS, Workload
+
+from candidates.torch_eager import TorchSpace
+
+PIECE = 32768
+"""Samples whose gradient is handed to the nodes at once."""
+REST = 0.02
+"""Share of samples for which another round of `add_by_pairs` is not worth it."""
+
+Scattering = Literal["rows", "pairs"]
+
+
+def add_by_rows(
+    gradient: torch.Tensor,  # [n_nodes, n_values], added to
+    node: torch.Tensor,  # [n_samples, 8] int32
+    share: torch.Tensor,  # [n_samples, 8]
+    adj_raw: torch.Tensor,  # [n_samples, n_values]
+) -> None:
+    """Hand the gradients of samples to nodes: a row for each of the eight."""
+    n, n_values = adj_raw.shape
+    if n_values == 1:  # one after the other, which is faster than to sort them
+        gradient.view(-1).scatter_add_(0, node.view(-1).long(), (share * adj_raw).view(-1))
+        return
+    for begin in range(0, n, PIECE):
+        part = slice(begin, min(begin + PIECE, n))
+        parcels = share[part, :, None] * adj_raw[part, None]
+        gradient.index_add_(0, node[part].view(-1), parcels.view(-1, n_values))
+
+
+def add_by_pairs(
+    gradient: torch.Tensor,  # [n_nodes, n_values], added to
+    node: torch.Tensor,  # [n_samples, 8] int32
+    share: torch.Tensor,  # [n_samples, 8]
+    adj_raw: torch.Tensor,  # [n_samples, n_values]
+) -> None:
+    """The same in rounds of samples that lie in different cells.
+
+    Sorting by cell is an eighth of the work of sorting by node, which index_add does. In a round no
+    node is met twice at the same corner: reading, adding and writing runs in parallel, on pairs of
+    nodes that follow each other along z. Pairs from an even node on do not overlap, nor do those
+    from an odd one.
+    """
+    if not len(node):
+        return
+    n_nodes, n_values = gradient.shape
+    pairs = [
+        gradient[odd : odd + (n_nodes - odd) // 2 * 2].view(-1, 2 * n_values) for odd in (0, 1)
+    ]
+    corners = (node[0, ::2] - node[0, 0]).tolist()
+    first, order = torch.sort(node[:, 0])
+    while len(first) > REST * len(node):
+        new = torch.ones_like(first, dtype=torch.bool)
+        torch.ne(first[1:], first[:-1], out=new[1:])
+        for odd in (0, 1):
+            at = (new & (first % 2 == odd)).nonzero()[:, 0]
+            low, sample = first.index_select(0, at), order.index_select(0, at)
+            for begin in range(0, len(low), PIECE // 4):
+                part = slice(begin, begin + PIECE // 4)
+                adj = adj_raw.index_select(0, sample[part])[:, None]
+                weights = share.index_select(0, sample[part]).view(-1, 4, 2, 1)
+                for i, corner in enumerate(corners):
+                    from_odd = (odd + corner) % 2
+                    rows = ((low[part] + (corner - from_odd)) >> 1).long()
+                    values = pairs[from_odd].index_select(0, rows)
+                    values.view(-1, 2, n_values).addcmul_(adj, weights[:, i])
+                    pairs[from_odd].index_copy_(0, rows, values)
+        more = ~new
+        first, order = first[more], order[more]
+    if len(first):
+        add_by_rows(gradient, node[order], share[order], adj_raw[order])
+
+
+class Interpolate(torch.autograd.Function):
+    """Nodes to samples; on the way back gradients are added to a table that stays."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        on: torch.Tensor,  # anything that requires a gradient, or there would be no way back
+        table: torch.Tensor,  # [n_nodes, n_values]
+        gradient: torch.Tensor,  # [n_nodes, n_values], added to
+        node: torch.Tensor,  # [n_samples, 8] int32
+        share: torch.Tensor,  # [n_samples, 8]
+        scattering: Scattering,
+    ) -> torch.Tensor:
+        ctx.save_for_backward(node, share)
+        ctx.gradient = gradient
+        ctx.scattering = scattering
+        return F.embedding_bag(node, table, mode="sum", per_sample_weights=share)
+
+    @staticmethod
+    def backward(ctx: Any, *adj: torch.Tensor) -> tuple[None, ...]:
+        add = add_by_pairs if ctx.scattering == "pairs" else add_by_rows
+        add(ctx.gradient, *ctx.saved_tensors, adj[0])
+        return (None,) * 6
+
+
+class Composite(torch.autograd.Function):
+    """Weighted sums over the samples of each ray."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        weight: torch.Tensor,  # [n_samples]
+        channels: torch.Tensor,  # [n_samples, n_channels]
+        ray: torch.Tensor,  # [n_samples], ascending
+        first: torch.Tensor,  # [n_rays] its first sample
+    ) -> torch.Tensor:
+        ctx.save_for_backward(weight, channels, ray)
+        return sums(channels, first, weight)
+
+    @staticmethod
+    def backward(ctx: Any, *adj: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        weight, channels, ray = ctx.saved_tensors
+        adj_sample = adj[0].index_select(0, ray)
+        return (channels * adj_sample).sum(1), adj_sample.mul_(weight[:, None]), None, None
+
+
+class Spread(torch.autograd.Function):
+    """What a ray has, for each of its samples."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        values: torch.Tensor,  # [n_rays, n]
+        ray: torch.Tensor,  # [n_samples], ascending
+        first: torch.Tensor,  # [n_rays] its first sample
+    ) -> torch.Tensor:
+        ctx.save_for_backward(first)
+        return values.index_select(0, ray)
+
+    @staticmethod
+    def backward(ctx: Any, *adj: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        return sums(adj[0], ctx.saved_tensors[0]), None, None
+
+
+class Scale(torch.autograd.Function):
+    """The paper's operation: identity forward, gradients times a factor of each sample backward."""
+
+    @staticmethod
+    def forward(ctx: Any, x: torch.Tensor, factor: torch.Tensor) -> torch.Tensor:
+        ctx.save_for_backward(factor)
+        return x.view_as(x)
+
+    @staticmethod
+    def backward(ctx: Any, *adj: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        (factor,) = ctx.saved_tensors
+        return adj[0] * factor.view(-1, *[1] * (adj[0].ndim - 1)), None
+
+
+class Unpack(torch.autograd.Function):
+    """Densities, and all columns: on the way back the two meet in place."""
+
+    @staticmethod
+    def forward(ctx: Any, raw: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return raw[:, 0].clone(), raw.view_as(raw)
+
+    @staticmethod
+    def backward(ctx: Any, *adj: torch.Tensor) -> torch.Tensor:
+        adj_density, adj_raw = adj
+        adj_raw[:, 0] += adj_density
+        return adj_raw
+
+
+def sums(
+    values: torch.Tensor, first: torch.Tensor, weight: torch.Tensor | None = None
+) -> torch.Tensor:
+    """Of the rows of each ray, from its first to the next one's: [n_rays, n]."""
+    every = torch.arange(values.shape[0], device=values.device)
+    return F.embedding_bag(every, values, first, mode="sum", per_sample_weights=weight)
+
+
+def view_encoding(directions: torch.Tensor, n_frequencies: int) -> torch.Tensor:
+    """[n, 3] to [n, 3 + 6 n_frequencies]"""
+    angles = [directions * 2.0**k for k in range(n_frequencies)]
+    return torch.cat([directions, *(f(a) for a in angles for f in (torch.sin, torch.cos))], dim=1)
+
+
+def spherical_harmonics(directions: torch.Tensor) -> torch.Tensor:
+    """[n, 3] to [n, 9]: up to degree 2."""
+    x, y, z = directions.unbind(1)
+    basis = [
+        torch.full_like(x, 0.28209479177387814),
+        -0.4886025119029199 * y,
+        0.4886025119029199 * z,
+        -0.4886025119029199 * x,
+        1.0925484305920792 * x * y,
+        -1.0925484305920792 * y * z,
+        0.31539156525252005 * (2.0 * z * z - x * x - y * y),
+        -1.0925484305920792 * x * z,
+        0.5462742152960396 * (x * x - y * y),
+    ]
+    return torch.stack(basis, dim=1)
+
+
+def perceptron(x: torch.Tensor, network: list[torch.Tensor]) -> torch.Tensor:
+    """Weights and biases in turn; ReLU between the layers."""
+    for weight, bias in zip(network[:-2:2], network[1:-2:2], strict=True):
+        x = torch.addmm(bias, x, weight).relu_()
+    return torch.addmm(network[-1], x, network[-2])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Choices:
+    """What can be done in more than one way."""
+
+    parts: int = 1
+    """Parts into which the rays are cut, so that what one needs stays in the caches."""
+    scattering: Scattering = "rows"
+    """How gradients are handed to the nodes."""
+    threads: int = 1
+    """torch.set_num_threads."""
+
+
+class Part(NamedTuple):
+    """Samples of some rays, packed; and where they lie."""
+
+    index: torch.Tensor  # [n_samples] in [n_rays, n_steps], flattened
+    ray: torch.Tensor  # [n_samples], ascending
+    first: torch.Tensor  # [n_rays] each one's first sample
+    node: torch.Tensor  # [n_samples, 8] int32
+    share: torch.Tensor  # [n_samples, 8]
+    factor: torch.Tensor  # [n_samples] on gradients
+    directions: torch.Tensor  # [n_rays, 3]
+
+
+class TorchModels:
+    """A workload's training step in torch."""
+
+    def __init__(self, work: Workload, choices: Choices, device: str = "cpu") -> None:
+        """Load a workload."""
+        self._work = work
+        self.choices = choices
+        self._space = TorchSpace(work.free, device)
+        self._steps = (torch.arange(work.n_steps, device=device) + 0.5) * work.step
+        self._rays = [
+            torch.from_numpy(array).to(device)
+            for array in (work.origins, work.directions, work.target_rgb)
+        ]
+        self._background = torch.tensor(work.background, device=device)
+        nodes = torch.tensor(work.values.shape[:3], device=device)
+        self._to_nodes = 0.5 * (nodes[:, None] - 1)
+        self._last = (nodes[:, None] - 2).int()
+        strides = torch.tensor(
+            [work.values.shape[1] * work.values.shape[2], work.values.shape[2], 1]
+        )
+        corners = torch.tensor(list(itertools.product((0, 1), repeat=3)))
+        self._strides = strides.int().tolist()
+        self._corners = (corners @ strides).int().to(device)  # [8]
+        self._values = torch.from_numpy(work.values.reshape(-1, work.values.shape[3])).to(device)
+        self._gradient = torch.zeros_like(self._values)
+        if work.model == "features":  # most samples need nothing but their density
+            self._densities = self._values[:, :1].contiguous()
+            self._density_gradient = torch.zeros_like(self._densities)
+        self.network = [torch.from_numpy(array).to(device) for array in work.network]
+        for parameter in self.network:
+            parameter.requires_grad_()
+        self._on = torch.zeros((), device=device, requires_grad=True)
+        self._colors: Callable[[Part], torch.Tensor] = {
+            "sh": self._sh,
+            "deferred": self._deferred,
+            "features": self._features,
+        }[work.model]
+
+    def step(self) -> None:
+        """Forward, loss and adjoint, part after part."""
+        torch.set_num_threads(self.choices.threads)
+        self._gradient.zero_()
+        if self._work.model == "features":
+            self._density_gradient.zero_()
+        for parameter in self.network:
+            parameter.grad = None
+        n_rays = len(self._work.origins)
+        for part in self._parts():
+            rgb = self._colors(self._part(part))
+            loss = (rgb - self._rays[2][part]).square().sum() / n_rays
+            loss.backward()
+
+    def _parts(self) -> list[slice]:
+        n_rays, parts = len(self._work.origins), self.choices.parts
+        ends = [n_rays * i // parts for i in range(parts + 1)]
+        return [slice(a, b) for a, b in itertools.pairwise(ends) if b > a]
+
+    @torch.no_grad()
+    def _part(self, part: slice) -> Part:
+        work = self._work
+        origins, directions, _ = (array[part] for array in self._rays)
+        index, t, q, _ = self._space.samples(origins, directions, self._steps)
+        ray = index // work.n_steps
+        counts = torch.bincount(ray, minlength=len(origins))
+        # A row for each axis: columns of three or eight numbers are no vectors.
+        u = (q.t() + 1.0).mul_(self._to_nodes)
+        cell = torch.minimum(u.int(), self._last)
+        x, y, z = u.sub_(cell)
+        x_stride, y_stride, _ = self._strides
+        base = (cell[0] * x_stride).add_(cell[1], alpha=y_stride).add_(cell[2])
+        share = q.new_empty(8, len(t))
+        columns = ((1.0 - x) * (1.0 - y), (1.0 - x) * y, x * (1.0 - y), x * y)
+        for i, column in enumerate(columns):
+            torch.mul(column, z, out=share[2 * i + 1])
+            torch.sub(column, share[2 * i + 1], out=share[2 * i])
+        factor = (t / work.content_distance).square_().clamp_(max=1.0)
+        return Part(
+            index=index,
+            ray=ray,
+            first=counts.cumsum(0) - counts,
+            node=base[:, None] + self._corners,
+            share=share.t().contiguous(),
+            factor=factor if work.scaled else torch.ones_like(factor),
+            directions=directions,
+        )
+
+    def _weights(self, raw_density: torch.Tensor, part: Part) -> tuple[torch.Tensor, torch.Tensor]:
+        """Of samples [n_samples], and light that passes [n_rays]."""
+        sigma = Scale.apply(F.softplus(raw_density + DENSITY_SHIFT), part.factor)
+        n_rays, n_steps = len(part.directions), self._work.n_steps
+        tau = sigma.new_zeros(n_rays * n_steps).index_copy(0, part.index, sigma * self._work.step)
+        tau = tau.view(n_rays, n_steps)
+        depth = tau.cumsum(1)
+        weight = torch.exp(tau - depth) * -torch.expm1(-tau)
+        return weight.view(-1).index_select(0, part.index), torch.exp(-depth[:, -1])
+
+    def _interpolate(self, node: torch.Tensor, share: torch.Tensor) -> torch.Tensor:
+        """All raw values [n_samples, n_values]."""
+        scattering = self.choices.scattering
+        return Interpolate.apply(self._on, self._values, self._gradient, node, share, scattering)
+
+    def _read(self, part: Part) -> tuple[torch.Tensor, torch.Tensor]:
+        """Raw densities [n_samples] and all raw values [n_samples, n_values]."""
+        return Unpack.apply(self._interpolate(part.node, part.share))
+
+    def _sh(self, part: Part) -> torch.Tensor:
+        """Features times harmonics, summed by a product with zeros and ones."""
+        density, raw = self._read(part)
+        weight, passed = self._weights(density, part)
+        basis = spherical_harmonics(part.directions).repeat_interleave(3, dim=1)
+        basis = F.pad(basis, (1, raw.shape[1] - 28))
+        choose = F.pad(torch.eye(3, device=raw.device).repeat(9, 1), (0, 0, 1, raw.shape[1] - 28))
+        color = torch.sigmoid((raw * basis.index_select(0, part.ray)) @ choose)
+        color = Scale.apply(color, part.factor)
+        seen = Composite.apply(weight, color, part.ray, part.first)
+        return seen + passed[:, None] * self._background
+
+    def _deferred(self, part: Part) -> torch.Tensor:
+        density, raw = self._read(part)
+        weight, passed = self._weights(density, part)
+        channels = Scale.apply(torch.sigmoid(raw), part.factor)
+        features = Composite.apply(weight, channels, part.ray, part.first)[:, 1:]
+        encoded = view_encoding(part.directions, MODELS["deferred"].n_frequencies)
+        specular = perceptron(torch.cat([features, encoded], dim=1), self.network)
+        over = passed[:, None] * self._background
+        return features[:, :3] + (1.0 - passed)[:, None] * specular + over
+
+    def _features(self, part: Part) -> torch.Tensor:
+        """Of the first layer, what comes of the direction is done once for a ray."""
+        density = Interpolate.apply(
+            self._on, self._densities, self._density_gradient, part.node, part.share, "rows"
+        )
+        weight, passed = self._weights(density[:, 0], part)
+        seen = (weight.detach() > MODELS["features"].threshold).nonzero()[:, 0]
+        ray = part.ray[seen]
+        counts = torch.bincount(ray, minlength=len(passed))
+        first = counts.cumsum(0) - counts
+        raw = self._interpolate(part.node[seen], part.share[seen])
+        encoded = view_encoding(part.directions, MODELS["features"].n_frequencies)
+        weights, bias = self.network[:2]
+        of_ray = torch.addmm(bias, encoded, weights[9:])
+        # Zeros where a node has its density, its own colour, and nothing.
+        of_sample = F.pad(weights[:9], (0, 0, 4, raw.shape[1] - 13))
+        hidden = torch.addmm(Spread.apply(of_ray, ray, first), raw, of_sample).relu_()
+        own = F.pad(torch.eye(3, device=raw.device), (0, 0, 1, raw.shape[1] - 4))
+        color = torch.sigmoid(torch.addmm(perceptron(hidden, self.network[2:]), raw, own))
+        color = Scale.apply(color, part.factor[seen])
+        light = Composite.apply(weight.index_select(0, seen), color, ray, first)
+        return light + passed[:, None] * self._background
+
+    def gradient(self) -> np.ndarray:
+        """[X, Y, Z, n_values]"""
+        gradient = self._gradient
+        if self._work.model == "features":
+            gradient = torch.cat([self._density_gradient, gradient[:, 1:]], dim=1)
+        return gradient.cpu().numpy().reshape(self._work.values.shape)
+
+    def network_gradient(self) -> np.ndarray:
+        """[n_parameters], weights and biases in turn."""
+        parts = [np.zeros(0, np.float32)]
+        parts += [p.grad.cpu().numpy().ravel() for p in self.network if p.grad is not None]
+        return np.concatenate(parts)
+
+    @torch.no_grad()
+    def rgb(self) -> np.ndarray:
+        """[n_rays, 3]"""
+        return torch.cat([self._colors(self._part(p)) for p in self._parts()]).cpu().numpy()
+
+
+def fastest(work: Workload, threads: int, device: str, rounds: int = 3) -> TorchModels:
+    """The choices whose step takes least time here, on that many threads."""
+    seconds = Stopwatch(device).seconds
+    pipeline = TorchModels(work, Choices(threads=threads), device)
+    scatterings: tuple[Scattering, ...] = ("rows", "pairs")
+    candidates = [
+        Choices(parts=parts, scattering=scattering, threads=threads)
+        for parts, scattering in itertools.product((1, 4, 16), scatterings)
+    ]
+    best = [float("inf")] * len(candidates)
+    for turn in range(rounds + 1):
+        for i, choices in enumerate(candidates):
+            pipeline.choices = choices
+            spent = seconds(pipeline.step)
+            best[i] = min(best[i], spent) if turn else best[i]
+    pipeline.choices = candidates[int(np.argmin(best))]
+    return pipeline
+
+
+def obstacle(device: str) -> str | None:
+    """It runs wherever torch is."""
+    return None
+
+
+load = fastest

@@ -1,0 +1,136 @@
+"""What the parts of a model are: the interfaces that ``launch.assembly`` puts together.
+
+Each part has a scalar form, which runs on CUDA, in float64 and wherever a vector form is missing,
+and may have a vector form for the CPU: sixteen samples, or the rows of a batch, at a time. Adjoints
+stand directly below. Parts are values that Python can hash, so that kernels made of them are kept.
+
+Names of arguments in the signatures below:
+
+    params      what the part reads, a Warp struct of its own
+    position    of a sample, folded coordinates c (base.types)
+    raw         what a field holds at a sample, ``vector(n_floats)``: raw density first
+    channels    what is added up along a ray, ``vector(n_channels)``
+    gradient    ``base.types.gradient_type``: added to
+    packs, slot scratch of a CPU worker: sixteen steps, see volume.packs
+"""
+
+from typing import Any, NamedTuple
+
+
+class Sampler(NamedTuple):
+    """Where the steps of a ray lie."""
+
+    Params: Any
+    """Struct, with near, far and transmittance_min among its fields."""
+    interval: Any
+    """(params, step) -> vec2: where a step begins, and its length."""
+    edge: Any
+    """(params, step) -> t at which a step begins; of the last one plus one, where steps end."""
+    steps_within: Any
+    """(params, interval of t) -> vec2i: the first step that can lie in it, one past the last."""
+    step_after: Any
+    """(params, ray, t, step) -> the first step after `step` whose sample may lie at t or beyond."""
+    place_pack: Any = None
+    """Vector form of interval: (params, ray, step, packs, slot) places sixteen steps."""
+
+
+class Encoding(NamedTuple):
+    """What is stored over space, and how it is read."""
+
+    n_floats: int
+    """Numbers read at a position: raw density, features, and padding that nothing looks at."""
+    Params: Any
+    """Struct of the stored values."""
+    read: Any
+    """(params, position) -> raw."""
+    adj_read: Any
+    """(params, position, adj_raw, gradient) hands adj_raw to what it was read from."""
+    place: Any
+    """(params, position) -> where it lies in the field, [0, 1]^3; workers own parts along the first
+    axis, and take rays by it."""
+    read_pack: Any = None
+    """Vector form of read: (params, ray, packs, slot), from x, y, z of a pack to its raw."""
+    adj_read_pack: Any = None
+    """(params, packs, slot, later, worker, deferred) adds a pack's adj_raw where the worker owns
+    what it was read from, and leaves a record of the rest."""
+    add_records: Any = None
+    """(params, worker, sender, deferred) adds what a sender has left for a worker."""
+    pack_fields: tuple[tuple[str, Any], ...] = ()
+    """Fields of a pack that are its own: names and types."""
+    Record: Any = None
+    """Struct of what a pack leaves for other workers."""
+
+
+class Head(NamedTuple):
+    """From features of samples to channels that are added up along the ray, and on to colour.
+
+    A head of samples decodes each one's features to red, green and blue, and hands on what was
+    added up as it is. A head of rays adds up features, and shades each ray once.
+    """
+
+    n_channels: int
+    """Channels added up along a ray."""
+    Params: Any
+    """Struct of what the head reads besides features: the weights of an MLP, or Nothing."""
+    View: Any
+    """Vector type of what depends on the direction of view, worked out once a ray."""
+    prepare: Any
+    """(params, direction) -> view."""
+    adj_prepare: Any
+    """(params, direction, adj_view, gradient) once a ray, after its samples."""
+    decode: Any
+    """(params, view, raw) -> channels of a sample, each of which lies in [0, 1]: what lies behind a
+    sample is bounded by that, see volume.walk.behind_limit."""
+    adj_decode: Any
+    """(params, view, raw, channels, adj_channels, gradient) -> adj_raw, whose first entry, that of
+    the density, is 0, and adj_view."""
+    shade: Any
+    """(params, direction, channels, opacity) -> rgb before the background, once a ray."""
+    adj_shade: Any
+    """(params, direction, channels, opacity, adj_rgb, gradient) -> adj_channels, adj_opacity."""
+    weight_min: float = -1.0
+    """Samples of no more weight are not decoded: their channels are 0."""
+    begin_rows: Any = None
+    """(params, worker) before the first row of a launch. Vector forms: rows and row name what
+    belongs to a ray, see volume.walk_packs."""
+    prepare_row: Any = None
+    """(params, rows, row) for a ray, from its direction."""
+    adj_prepare_row: Any = None
+    """(params, rows, row, worker, gradient)"""
+    decode_pack: Any = None
+    """(params, rows, row, packs, slot, n) for n packs of a ray, from raw and weight to channel."""
+    adj_decode_pack: Any = None
+    """(params, rows, row, packs, slot, n, worker, gradient) from weight, scale and the row's
+    adj_channels to adj_raw, but for the density's."""
+    n_packs: int = 1
+    """Packs of a ray that are decoded together, at most."""
+    shade_rows: Any = None
+    """(params, rows, row, n) for n rays: from channels and transmittance to rgb."""
+    adj_shade_rows: Any = None
+    """(params, rows, row, n, worker, gradient) from adj_rgb to adj_channels and adj_opacity."""
+    pack_fields: tuple[tuple[str, Any], ...] = ()
+    """Fields of a pack that are its own."""
+    row_fields: tuple[tuple[str, Any], ...] = ()
+    """Fields of a ray's row that are its own."""
+    batch: int = 1
+    """Rays whose rows are shaded together."""
+
+
+class RayLoss(NamedTuple):
+    """A loss over a ray's samples: any function of their weights and of where they lie.
+
+    Its derivative needs of the rest of the ray what ``State`` holds after all samples.
+    """
+
+    State: Any
+    """Struct of sums over the samples so far."""
+    add: Any
+    """(state, weight, t, dt) -> state with one more sample."""
+    value: Any
+    """(state) -> the loss, from all samples."""
+    weighted: Any
+    """(state) -> sum over all samples of weight times dL/dweight."""
+    adj_weight: Any
+    """(total, before, weight, t, dt) -> dL/dweight, from all samples and those before."""
+    bound: Any
+    """(total, t_end) -> no |dL/dweight| exceeds it."""

@@ -1,0 +1,91 @@
+"""Number types and the structs that kernels share.
+
+Grids are [X, Y, Z] with z fastest. Lengths are scene units. ``q`` are normalised coordinates, in
+which the box is [-1, 1]^3; ``c`` are these after folding, within [-(1 + border), 1 + border]^3;
+``u`` are grid coordinates, in which node (i, j, k) sits at (i, j, k).
+"""
+
+from functools import cache
+
+import warp as wp
+
+real = wp.float64 if __name__.startswith("warpnerf_kernels_float64") else wp.float32
+vec2 = wp.types.vector(2, real)
+vec3 = wp.types.vector(3, real)
+vec4 = wp.types.vector(4, real)
+mat33 = wp.types.matrix((3, 3), real)
+
+
+@cache
+def vector(n: int) -> type:
+    """n numbers: what a node stores, features, channels, units of a layer."""
+    return wp.types.vector(n, real)
+
+
+@wp.struct
+class Nothing:
+    """What a part reads that has no parameters."""
+
+    unused: int
+
+
+@wp.struct
+class Density:
+    """From raw to density: sigma = scale softplus(raw + shift)."""
+
+    shift: real
+    scale: real  # 1 / scene unit
+
+
+@wp.struct
+class Box:
+    """The region that is trained, and how space outside of it is folded into a shell around it."""
+
+    centre: vec3
+    half: vec3  # half of its edges
+    border: real  # width of the shell, in half edges; 0 without contraction
+
+
+@wp.struct
+class FreeSpace:
+    """Where nothing needs sampling: over the folded box, cells of their own size."""
+
+    distance: wp.array(dtype=wp.uint8)  # [MX * MY * MZ] cells to the nearest occupied one, 0 there
+    size: wp.vec3i  # MX, MY, MZ
+    to_cells: vec3  # folded coordinates to cells: m = c to_cells + size / 2
+
+
+@cache
+def gradient_type(n_floats: int) -> type:
+    """The gradient of a loss with respect to what a field stores, and to the weights of a head."""
+
+    @wp.struct
+    class Gradient:
+        values: wp.array(dtype=vector(n_floats))  # [n_nodes]
+        touched: wp.array(dtype=wp.uint8)  # [n_tiles] 1 where a pair of nodes begins that got some
+        weights: wp.array2d(dtype=real)  # [n_workers, n_weights] a copy for each worker
+
+    return Gradient
+
+
+@wp.struct
+class Ray:
+    """A ray prepared for one box: q(t) = q_origin + t q_direction."""
+
+    q_origin: vec3
+    q_direction: vec3
+    direction: vec3  # unit, in the scene
+    offset: real  # where in its step a sample sits, [0, 1]; 0.5 is the midpoint
+    begin: int  # first step that can lie in the box
+    end: int  # one past the last
+
+
+@wp.struct
+class Sample:
+    """A visited step."""
+
+    step: int
+    t: real  # distance from the ray's origin
+    dt: real  # step length
+    det_jacobian: real  # |det J| of the contraction, 1 without
+    position: vec3  # folded coordinates c

@@ -1,0 +1,361 @@
+"""A dense grid: values at nodes, trilinear in between. An encoding, with its transpose below.
+
+Nodes hold n_floats values side by side: raw density, features, padding to a power of two.
+"""
+
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from ..base.parts import Encoding
+from ..base.simd import LANES, VECTORS, lanes, lanes_int
+from ..base.types import Ray, real, vec3, vector
+from .interp import adj_gather, flat_index, gather, lowest_node, place_in
+
+wp.set_module_options({"enable_backward": False})
+
+
+@cache
+def grid_type(n_floats: int) -> type:
+    """A grid as kernels take it."""
+
+    @wp.struct
+    class Grid:
+        values: wp.array(dtype=vector(n_floats))  # [X * Y * Z]
+        size: wp.vec3i  # X, Y, Z, each >= 2
+        to_nodes: vec3  # folded coordinates to grid coordinates: u = c to_nodes + middle
+        middle: vec3  # grid coordinates of the centre, (size - 1) / 2
+
+    return Grid
+
+
+@wp.func
+def read(grid: Any, position: vec3):
+    """Raw values at a position."""
+    u = wp.cw_mul(position, grid.to_nodes) + grid.middle
+    node = lowest_node(u, grid.size)
+    fraction = u - vec3(real(node[0]), real(node[1]), real(node[2]))
+    return gather(
+        grid.values, grid.size, flat_index(node[0], node[1], node[2], grid.size), fraction
+    )
+
+
+@wp.func
+def adj_read(
+    grid: Any,
+    position: vec3,
+    adj_raw: Any,
+    gradient: Any,  # added to
+):
+    """Transpose of read."""
+    u = wp.cw_mul(position, grid.to_nodes) + grid.middle
+    node = lowest_node(u, grid.size)
+    fraction = u - vec3(real(node[0]), real(node[1]), real(node[2]))
+    adj_gather(
+        grid.size,
+        flat_index(node[0], node[1], node[2], grid.size),
+        fraction,
+        adj_raw,
+        gradient,
+    )
+
+
+@wp.func
+def place(grid: Any, position: vec3) -> vec3:
+    """Where a position lies in the grid, [0, 1]^3."""
+    u = wp.cw_mul(position, grid.to_nodes) + grid.middle
+    return wp.cw_div(u, real(2.0) * grid.middle)
+
+
+PACK_FIELDS = (
+    ("base", lanes_int),  # flat index of the lowest of the eight nodes around
+    (
+        "shares",
+        wp.types.matrix((4, LANES), wp.float32),
+    ),  # of the four columns of nodes around, by x
+    # and y; together 1
+    ("fraction_x", lanes),  # position between the nodes, [0, 1]
+    ("fraction_y", lanes),
+    ("fraction_z", lanes),
+)
+
+NODES = (
+    VECTORS
+    + r"""
+constexpr int FLOATS = sizeof(*VALUES) / sizeof(float);  // of a node
+typedef float node_vec __attribute__((ext_vector_type(FLOATS)));
+typedef float pair_vec __attribute__((ext_vector_type(2 * FLOATS)));  // a column's two nodes
+typedef float node_at __attribute__((ext_vector_type(FLOATS), aligned(4), may_alias));
+typedef float pair_at __attribute__((ext_vector_type(2 * FLOATS), aligned(4), may_alias));
+typedef float quad_at __attribute__((ext_vector_type(4), aligned(4), may_alias));
+// Bring the four columns of nodes around a sample into the cache, ahead of their use.
+auto fetch_node = [&](const auto* node) {
+    for (size_t at = 0; at < sizeof(*node); at += 64) __builtin_prefetch((const char*)node + at);
+};
+auto fetch = [&](const auto* node, const auto& size) {
+    const size_t stride_y = size.c[2], stride_x = stride_y * size.c[1];
+    fetch_node(node);
+    fetch_node(node + stride_y);
+    fetch_node(node + stride_x);
+    fetch_node(node + stride_x + stride_y);
+};
+"""
+)
+"""What native functions about nodes begin with; VALUES is where these lie."""
+
+
+@wp.func_native(
+    NODES.replace("VALUES", "grid.values.data")
+    + r"""
+auto& pack = packs.data[slot];
+const ivec visited = load_int(pack.visited);
+vec ux = load(pack.x) * grid.to_nodes.c[0] + grid.middle.c[0];
+vec uy = load(pack.y) * grid.to_nodes.c[1] + grid.middle.c[1];
+vec uz = load(pack.z) * grid.to_nodes.c[2] + grid.middle.c[2];
+auto index = [&](ivec i, ivec j, ivec l) -> ivec {
+    return (i * grid.size.c[1] + j) * grid.size.c[2] + l;
+};
+ivec i = clamp(truncate(ux), grid.size.c[0] - 1);
+ivec j = clamp(truncate(uy), grid.size.c[1] - 1);
+ivec l = clamp(truncate(uz), grid.size.c[2] - 1);
+store_int(pack.base, index(i, j, l));
+const vec fraction_x = visited ? ux - to_float(i) : all(0.0f);
+const vec fraction_y = visited ? uy - to_float(j) : all(0.0f);
+const vec fraction_z = visited ? uz - to_float(l) : all(0.0f);
+split(fraction_x, fraction_y, pack.shares.data);
+store(pack.fraction_x, fraction_x);
+store(pack.fraction_y, fraction_y);
+store(pack.fraction_z, fraction_z);
+// Memory is slower than all of this: fetch what the next pack will read, going straight on.
+const vec ahead = (float)LANES * load(pack.dt);
+ux += ahead * (ray.q_direction.c[0] * grid.to_nodes.c[0]);
+uy += ahead * (ray.q_direction.c[1] * grid.to_nodes.c[1]);
+uz += ahead * (ray.q_direction.c[2] * grid.to_nodes.c[2]);
+i = clamp(truncate(ux), grid.size.c[0] - 1);
+j = clamp(truncate(uy), grid.size.c[1] - 1);
+l = clamp(truncate(uz), grid.size.c[2] - 1);
+const ivec node_ahead = index(i, j, l);
+for (int n = 0; n < LANES; ++n) fetch(grid.values.data + node_ahead[n], grid.size);
+
+const float* values = (const float*)grid.values.data;
+const size_t stride_y = FLOATS * (size_t)grid.size.c[2], stride_x = stride_y * grid.size.c[1];
+const auto& shares = pack.shares.data;
+const unsigned wanted = FLOATS > 4 ? bits(visited) : 0xffffu;  // four read as fast as a branch
+node_vec raw[LANES];
+#pragma clang loop unroll(full)
+for (int n = 0; n < LANES; ++n) {
+    raw[n] = 0.0f;
+    if (!(wanted >> n & 1)) continue;
+    // A column's two nodes lie side by side: one vector holds both.
+    auto column = [&](const float* node) -> pair_vec { return *(const pair_at*)node; };
+    const float* node = values + FLOATS * (size_t)pack.base.c[n];
+    pair_vec both = shares[0][n] * column(node);
+    both = fma(pair_vec(shares[1][n]), column(node + stride_y), both);
+    both = fma(pair_vec(shares[2][n]), column(node + stride_x), both);
+    both = fma(pair_vec(shares[3][n]), column(node + stride_x + stride_y), both);
+    raw[n] = fma(node_vec(pack.fraction_z.c[n]), both.hi - both.lo, both.lo);
+}
+for (int f = 0; f < FLOATS; f += 4) {
+    quad four[LANES];
+    for (int n = 0; n < LANES; ++n) four[n] = *(const quad_at*)((const float*)&raw[n] + f);
+    vec a, b, c, d;
+    to_lanes(four, a, b, c, d);
+    store(pack.raw.data[f], a);
+    store(pack.raw.data[f + 1], b);
+    store(pack.raw.data[f + 2], c);
+    store(pack.raw.data[f + 3], d);
+}
+"""
+)
+def read_pack(grid: Any, ray: Ray, packs: wp.array(dtype=Any), slot: int):
+    """read for the samples of a pack, and the fetching of what the next pack will read."""
+    ...
+
+
+ADD_OWN = (
+    NODES.replace("VALUES", "deferred.gradient.values.data")
+    + r"""
+const auto& size = grid.size;
+const int n_workers = deferred.records.shape[0], n_packs = deferred.records.shape[1];
+const int row = deferred.n_addressed.shape[1];  // numbers in a sender's row
+const int n_planes = (size.c[0] + n_workers - 1) / n_workers;  // of nodes, for each worker
+const int stride_y = size.c[2], stride_x = stride_y * size.c[1];
+auto* values = deferred.gradient.values.data;
+auto* flags = deferred.gradient.touched.data;
+// No more than there are, which int holds.
+auto first_node = [&](int owner) -> int { return least(owner * n_planes, size.c[0]) * stride_x; };
+auto owned = [&](int owner, ivec node) -> unsigned {
+    return bits((first_node(owner) <= node) & (node < first_node(owner + 1)));
+};
+auto fetch_own = [&](const auto& samples) {
+    each(owned(worker, load_int(samples.base)), [&](int n) {
+        fetch(values + samples.base.c[n], size);
+    });
+};
+// Give a column's two nodes their shares of what a sample has for both.
+auto add_column = [&](int node, float share, pair_vec both) {
+    pair_at* pair = (pair_at*)(values + node);
+    *pair = fma(pair_vec(share), both, pair_vec(*pair));
+    flags[(unsigned)node / TILE] = 1;  // on the border of two parts by either, with the same 1
+};
+// Add what samples have for the worker's own planes. Returns whether that is all of it.
+auto add_own = [&](const auto& samples, unsigned visited, const auto& shares) -> bool {
+    quad four[FLOATS / 4][LANES];
+    #pragma clang loop unroll(full)
+    for (int f = 0; f < FLOATS; f += 4) {
+        to_quads(load(samples.adj_raw.data[f]), load(samples.adj_raw.data[f + 1]),
+                 load(samples.adj_raw.data[f + 2]), load(samples.adj_raw.data[f + 3]), four[f / 4]);
+    }
+    node_vec adj[LANES];
+    #pragma clang loop unroll(full)
+    for (int n = 0; n < LANES; ++n) {
+        node_vec whole;  // put together in registers: what is stored in parts is slow to load
+        #pragma clang loop unroll(full)
+        for (int f = 0; f < FLOATS; f += 4) *(quad_at*)((float*)&whole + f) = four[f / 4][n];
+        adj[n] = whole;
+    }
+    auto add_plane = [&](int n, int node, const auto* share) {
+        pair_vec both;
+        both.hi = samples.fraction_z.c[n] * adj[n];
+        both.lo = adj[n] - both.hi;
+        add_column(node, share[0][n], both);
+        add_column(node + stride_y, share[1][n], both);
+    };
+    auto add_lower = [&](int n) { add_plane(n, samples.base.c[n], shares); };
+    auto add_upper = [&](int n) { add_plane(n, samples.base.c[n] + stride_x, shares + 2); };
+    const ivec base = load_int(samples.base);
+    const unsigned lower = visited & owned(worker, base);
+    const unsigned upper = visited & owned(worker, base + stride_x);
+    if ((lower & upper) == visited) {
+        #pragma clang loop unroll(full)
+        for (int n = 0; n < LANES; ++n) {
+            if (!(visited >> n & 1)) continue;
+            add_lower(n);
+            add_upper(n);
+        }
+        return true;
+    }
+    each(lower, add_lower);
+    each(upper, add_upper);
+    return false;
+};
+"""
+)
+"""What adj_read_pack and add_records begin with: adding to the planes that a worker owns."""
+
+
+@wp.func_native(
+    ADD_OWN
+    + r"""
+const auto& pack = packs.data[slot];
+fetch_own(packs.data[later]);
+const unsigned visited = bits(load_int(pack.visited));
+if (add_own(pack, visited, pack.shares.data)) return;
+const int sent = deferred.n_records.data[worker * row]++;
+auto& record = deferred.records.data[(size_t)worker * n_packs + sent];
+const ivec base = load_int(pack.base);
+record.visited = visited;
+store_int(record.base, base);
+store(record.fraction_x, load(pack.fraction_x));
+store(record.fraction_y, load(pack.fraction_y));
+store(record.fraction_z, load(pack.fraction_z));
+for (int f = 0; f < FLOATS; ++f) store(record.adj_raw.data[f], load(pack.adj_raw.data[f]));
+for (int receiver = 0; receiver < n_workers; ++receiver) {
+    const unsigned theirs = owned(receiver, base) | owned(receiver, base + stride_x);
+    if (receiver == worker || !(theirs & visited)) continue;
+    int& n = deferred.n_addressed.data[worker * row + receiver];
+    deferred.addressed.data[((size_t)worker * n_workers + receiver) * n_packs + n++] = sent;
+}
+"""
+)
+def adj_read_pack(
+    grid: Any,
+    packs: wp.array(dtype=Any),
+    slot: int,
+    later: int,  # slot of a pack that comes soon
+    worker: int,
+    deferred: Any,  # added to, and what is in it
+):
+    """adj_read for a pack's samples, where the worker owns the nodes; a record of the rest."""
+    ...
+
+
+@wp.func_native(
+    ADD_OWN
+    + r"""
+constexpr int SOON = 4;  // records from the one that is added to the one that is asked for
+auto fetch_whole = [&](const auto& x) {
+    for (size_t at = 0; at < sizeof(x); at += 64) __builtin_prefetch((const char*)&x + at);
+};
+const auto* records = deferred.records.data + (size_t)sender * n_packs;
+const int* which = deferred.addressed.data + ((size_t)sender * n_workers + worker) * n_packs;
+const int n = deferred.n_addressed.data[sender * row + worker];
+for (int k = 0; k < n; ++k) {
+    if (k + SOON < n) fetch_whole(records[which[k + SOON]]);
+    if (k + 1 < n) fetch_own(records[which[k + 1]]);
+    const auto& record = records[which[k]];
+    float shares[4][LANES];
+    split(load(record.fraction_x), load(record.fraction_y), shares);
+    add_own(record, record.visited, shares);
+}
+"""
+)
+def add_records(grid: Any, worker: int, sender: int, deferred: Any):
+    """Add what a sender has left for a worker."""
+    ...
+
+
+@cache
+def record_type(n_floats: int) -> type:
+    """What a pack of samples has for the nodes around them, not all of which are the sender's."""
+
+    @wp.struct
+    class Record:
+        visited: wp.uint32  # bit n: lane n is a sample
+        base: lanes_int  # flat index of the lowest of the eight nodes around
+        fraction_x: lanes  # position between the nodes, [0, 1]
+        fraction_y: lanes
+        fraction_z: lanes
+        adj_raw: wp.types.matrix((n_floats, LANES), wp.float32)  # of the raw values at the samples
+
+    return Record
+
+
+@cache
+def dense(n_floats: int) -> Encoding:
+    """The encoding whose nodes hold so many values: 4, 8, 16, 32 or 64."""
+    return Encoding(
+        n_floats=n_floats,
+        Params=grid_type(n_floats),
+        read=read,
+        adj_read=adj_read,
+        place=place,
+        read_pack=read_pack,
+        adj_read_pack=adj_read_pack,
+        add_records=add_records,
+        pack_fields=PACK_FIELDS,
+        Record=record_type(n_floats),
+    )
+
+
+@cache
+def resample_kernel(n_floats: int) -> wp.Kernel:
+    """Another grid's nodes, read off a first one."""
+    node = vector(n_floats)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def resample(
+        first: int,
+        values: wp.array(dtype=node),  # [X * Y * Z]
+        size: wp.vec3i,
+        scale: vec3,  # u in the old grid = u in the new one * scale + offset
+        offset: vec3,
+        out_size: wp.vec3i,
+        out_values: wp.array(dtype=node),  # [X' * Y' * Z']
+    ):
+        n = first + wp.tid()
+        base, fraction = place_in(size, scale, offset, n, out_size)
+        out_values[n] = gather(values, size, base, fraction)
+
+    return resample

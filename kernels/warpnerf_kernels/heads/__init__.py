@@ -1,0 +1,1 @@
+"""Heads: from features and the direction of view to colour, with adjoints."""

@@ -1,0 +1,1 @@
+"""What changes parameters between launches: Adam, total variation."""

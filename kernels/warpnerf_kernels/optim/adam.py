@@ -1,0 +1,267 @@
+"""The update of the grid. Kingma & Ba 2015, algorithm 1; entries without a gradient are left alone.
+
+It waits for memory, so both moments of an entry share 32 bits: in the upper 16 the mean as a
+bfloat16 (sign, 8 bits of exponent, 7 of fraction), in the lower 16 the square, which has no sign (8
+and 8). What does not fit is rounded up or down at random, with odds that keep the average right:
+rounded to the nearest, an average that moves by less than half of its last bit would stand still.
+
+On the CPU all channels of a tile are worked on at once, in Clang's vector types. float32 only.
+"""
+
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from ..base.tiles import (
+    AHEAD,
+    GROUP,
+    TILE,
+    but_first,
+    first_of,
+    prefetch,
+    tile_of,
+    tiles_ahead,
+    touched_tiles,
+)
+from ..base.types import gradient_type, real, vec3, vector
+from ..fields.interp import place_in
+
+wp.set_module_options({"enable_backward": False})
+
+
+@cache
+def moments_type(n_floats: int) -> type:
+    """The moments of a node, both of a float in each number."""
+    return wp.types.vector(n_floats, wp.uint32)
+
+
+WORDS = r"""
+#if defined(__CUDA_ARCH__)
+constexpr int AT_ONCE = 1;
+typedef float number;
+typedef unsigned bits;
+#else
+constexpr int AT_ONCE = CHANNELS;
+typedef float number __attribute__((ext_vector_type(AT_ONCE), aligned(4), may_alias));
+typedef unsigned bits __attribute__((ext_vector_type(AT_ONCE), aligned(4), may_alias));
+#endif
+auto as_bits = [](number x) -> bits { bits y; memcpy(&y, &x, sizeof(y)); return y; };
+auto as_number = [](bits x) -> number { number y; memcpy(&y, &x, sizeof(y)); return y; };
+auto mean_of = [&](bits moments) -> number { return as_number(moments & 0xffff0000u); };
+auto square_of = [&](bits moments) -> number { return as_number((moments << 16) >> 1); };
+// Rounded up if the 16, or 15, bits that are cut off and as many of `noise` carry over.
+auto join = [&](number mean, number square, bits noise) -> bits {
+    return ((as_bits(mean) + (noise >> 16)) & 0xffff0000u) |
+        ((as_bits(square) + (noise & 0x7fffu)) >> 15);
+};
+"""
+"""What the native functions begin with; on the CPU they work on so many CHANNELS at once."""
+
+
+@wp.func_native(
+    f"constexpr int CHANNELS = {4 * TILE}, TILE = {TILE};"
+    + WORDS
+    + r"""
+#if defined(__CUDA_ARCH__)
+auto root = [](number x) -> number { return sqrtf(x); };
+auto is_zero = [](number x) -> bool { return x == 0.0f; };
+#else
+auto root = [](number x) -> number { return __builtin_elementwise_sqrt(x); };
+auto is_zero = [&](number x) -> bool { return __builtin_reduce_or(as_bits(x)) == 0; };
+#endif
+static_assert(sizeof(values.data->c[0]) == sizeof(float), "moments are cut out of float32");
+constexpr int FLOATS = sizeof(*values.data) / sizeof(float);  // of a node
+for (int c = 0; c < FLOATS * TILE && c < FLOATS * count; c += AT_ONCE) {
+    const int n_here = FLOATS * count - c;  // a tile may be cut short, by the end of the grid
+    auto load = [&](auto* from) {
+        number x{};
+        if (n_here >= AT_ONCE) memcpy(&x, (const float*)(from + node) + c, sizeof(x));
+        else memcpy(&x, (const float*)(from + node) + c, sizeof(float) * n_here);
+        return x;
+    };
+    auto store = [&](auto* to, number x) {
+        if (n_here >= AT_ONCE) memcpy((float*)(to + node) + c, &x, sizeof(x));
+        else memcpy((float*)(to + node) + c, &x, sizeof(float) * n_here);
+    };
+    const number g = load(gradient.values.data);
+    if (is_zero(g)) continue;
+    const number value = load(values.data);
+    const bits old = as_bits(load(moments.data));
+    number rate;
+    for (int n = 0; n < AT_ONCE; ++n) ((float*)&rate)[n] = learning_rate.c[(c + n) % FLOATS];
+    const number m = beta1 * mean_of(old) + (1.0f - beta1) * g;
+    const number v = beta2 * square_of(old) + (1.0f - beta2) * (g * g);
+    const number moved = value - rate * (correction1 * m) / (root(correction2 * v) + epsilon);
+    const bits noise = (as_bits(g) + update * 0x9e3779b9u) * 0x9e3779b9u;  // 2^32 / golden ratio
+    const bits joined = join(m, v, noise);
+    store(values.data, g != 0.0f ? moved : value);
+    store(moments.data, as_number(g != 0.0f ? joined : old));
+    store(gradient.values.data, number{});
+}
+"""
+)
+def update_nodes(
+    node: int,
+    count: int,  # up to TILE
+    update: wp.uint32,
+    learning_rate: Any,
+    beta1: float,
+    beta2: float,
+    epsilon: float,
+    correction1: float,
+    correction2: float,
+    gradient: Any,
+    values: wp.array(dtype=Any),
+    moments: wp.array(dtype=Any),
+):
+    """adam_step for some nodes, from the given one on.
+
+    Gradient and update together decide how moments are rounded.
+    """
+    ...
+
+
+@cache
+def adam_kernel(n_floats: int) -> wp.Kernel:
+    """The update of a field whose nodes hold so many floats."""
+    Node, Moments, Gradient = vector(n_floats), moments_type(n_floats), gradient_type(n_floats)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def adam_step(
+        first: int,
+        span: int,  # nodes per thread
+        update: wp.uint32,  # counts from 1
+        learning_rate: Node,  # per channel
+        beta1: float,
+        beta2: float,
+        epsilon: float,
+        correction1: float,  # 1 / (1 - beta1^update)
+        correction2: float,  # 1 / (1 - beta2^update)
+        gradient: Gradient,  # zeroed
+        values: wp.array(dtype=Node),  # [n_nodes] updated
+        moments: wp.array(dtype=Moments),  # [n_nodes] updated
+    ):
+        """One update. An entry whose gradient is exactly zero keeps its value and its moments."""
+        n_nodes = values.shape[0]
+        start = (first + wp.tid()) * span
+        end = start + wp.min(span, n_nodes - start)  # start + span might be beyond int
+        last = tile_of(end - 1) + 1
+        for group in range(tile_of(start), last, wp.static(GROUP)):
+            tiles = tiles_ahead(gradient.touched, group, last)
+            while tiles != wp.uint64(0):
+                node = (group + wp.static(AHEAD) + first_of(tiles)) * wp.static(TILE)
+                prefetch(gradient.values, node)
+                prefetch(values, node)
+                prefetch(moments, node)
+                tiles = but_first(tiles)
+            tiles = touched_tiles(gradient.touched, group, last)
+            while tiles != wp.uint64(0):
+                node = (group + first_of(tiles)) * wp.static(TILE)
+                begin = wp.max(start, node)
+                update_nodes(
+                    begin,
+                    wp.min(end, node + wp.static(TILE)) - begin,
+                    update,
+                    learning_rate,
+                    beta1,
+                    beta2,
+                    epsilon,
+                    correction1,
+                    correction2,
+                    gradient,
+                    values,
+                    moments,
+                )
+                tiles = but_first(tiles)
+
+    return adam_step
+
+
+@wp.func_native(
+    "constexpr int CHANNELS = 4;"
+    + WORDS
+    + r"""
+constexpr int FLOATS = sizeof(*moments.data) / sizeof(unsigned);
+const int stride_y = size.c[2], stride_x = stride_y * size.c[1];
+for (int c = 0; c < FLOATS; c += AT_ONCE) {
+    number mean = 0.0f, square = 0.0f;
+    for (int corner = 0; corner < 8; ++corner) {
+        const bool x = corner & 4, y = corner & 2, z = corner & 1;
+        const float share = (x ? fraction.c[0] : 1.0f - fraction.c[0]) *
+            (y ? fraction.c[1] : 1.0f - fraction.c[1]) * (z ? fraction.c[2] : 1.0f - fraction.c[2]);
+        const int node = base + x * stride_x + y * stride_y + z;
+        const bits old = *(const bits*)&moments.data[node].c[c];
+        mean += share * mean_of(old);
+        square += share * square_of(old);
+    }
+    const bits half = 0u * as_bits(mean) + 0x80004000u;
+    *(bits*)&out_moments.data[n].c[c] = join(mean, square, half);
+}
+"""
+)
+def gather_moments(
+    moments: wp.array(dtype=Any),
+    size: wp.vec3i,
+    base: int,  # flat index of the lowest node
+    fraction: vec3,
+    out_moments: wp.array(dtype=Any),
+    n: int,
+):
+    """interp.gather for moments, rounded to the nearest."""
+    ...
+
+
+@cache
+def resample_moments_kernel(n_floats: int) -> wp.Kernel:
+    """dense.resample_kernel for moments."""
+    Moments = moments_type(n_floats)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def resample_moments(
+        first: int,
+        moments: wp.array(dtype=Moments),  # [X * Y * Z]
+        size: wp.vec3i,
+        scale: vec3,
+        offset: vec3,
+        out_size: wp.vec3i,
+        out_moments: wp.array(dtype=Moments),  # [X' * Y' * Z']
+    ):
+        n = first + wp.tid()
+        base, fraction = place_in(size, scale, offset, n, out_size)
+        gather_moments(moments, size, base, fraction, out_moments, n)
+
+    return resample_moments
+
+
+@wp.kernel(enable_backward=False)
+def adam_weights(
+    first: int,
+    learning_rate: real,
+    beta1: real,
+    beta2: real,
+    epsilon: real,
+    correction1: real,  # 1 / (1 - beta1^update)
+    correction2: real,  # 1 / (1 - beta2^update)
+    gradient: wp.array2d(dtype=real),  # [n_workers, n_weights] of each worker, zeroed
+    values: wp.array(dtype=real),  # [n_weights] updated
+    means: wp.array(dtype=real),  # [n_weights] updated
+    squares: wp.array(dtype=real),  # [n_weights] updated
+):
+    """One update of weights that all rays share, from the sum of the workers' gradients in order.
+
+    An entry whose gradient is exactly zero is left alone, as a node's is.
+    """
+    n = first + wp.tid()
+    total = real(0.0)
+    for worker in range(gradient.shape[0]):
+        total += gradient[worker, n]
+        gradient[worker, n] = real(0.0)
+    if total != real(0.0):
+        mean = beta1 * means[n] + (real(1.0) - beta1) * total
+        square = beta2 * squares[n] + (real(1.0) - beta2) * (total * total)
+        means[n] = mean
+        squares[n] = square
+        values[n] -= (
+            learning_rate * (correction1 * mean) / (wp.sqrt(correction2 * square) + epsilon)
+        )

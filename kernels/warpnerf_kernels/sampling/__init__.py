@@ -1,0 +1,1 @@
+"""Where rays are sampled: the placing of steps, free space."""

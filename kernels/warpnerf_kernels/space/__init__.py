@@ -1,0 +1,1 @@
+"""Where things are: cameras, and unbounded space folded into a box."""

@@ -1,0 +1,186 @@
+"""From pixels to rays, and from photographs to batches of rays with their colours.
+
+``c2w`` has OpenGL axes (x right, y up, looking along -z); pixel (u, v) has its centre at
+(u + 0.5, v + 0.5), row 0 at the top.
+"""
+
+import warp as wp
+
+from ..base.tiles import prefetch
+from ..base.types import mat33, real, vec2, vec3
+
+wp.set_module_options({"enable_backward": False})
+
+RANDOM_BACKGROUND = 1
+
+AHEAD = 8
+"""Rays from the one that a CPU draws to the one whose pixel it asks for."""
+
+
+@wp.struct
+class View:
+    """A photograph's camera, and where its pixels are in the pile of all pixels."""
+
+    rotation: mat33  # camera to world
+    position: vec3  # scene units
+    focal: vec2  # fx, fy, pixels
+    principal: vec2  # cx, cy, pixels
+    radial: vec3  # k1, k2, k3
+    tangential: vec2  # p1, p2
+    width: int  # pixels
+    first_pixel: int  # index of its pixel (0, 0)
+
+
+@wp.func
+def distort(view: View, p: vec2) -> vec2:
+    """OpenCV's radial and tangential distortion of a point in the plane z = 1."""
+    x = p[0]
+    y = p[1]
+    r2 = x * x + y * y
+    radial = real(1.0) + r2 * (view.radial[0] + r2 * (view.radial[1] + r2 * view.radial[2]))
+    p1 = view.tangential[0]
+    p2 = view.tangential[1]
+    two = real(2.0)
+    return vec2(
+        x * radial + two * p1 * x * y + p2 * (r2 + two * x * x),
+        y * radial + p1 * (r2 + two * y * y) + two * p2 * x * y,
+    )
+
+
+@wp.func
+def strain(view: View, r2: real) -> real:
+    """A bound on how far distort's Jacobian is from the identity, up to r2 from the axis."""
+    radial = view.radial
+    tangential = wp.abs(view.tangential[0]) + wp.abs(view.tangential[1])
+    third = real(5.0) * wp.abs(radial[1]) + r2 * real(7.0) * wp.abs(radial[2])
+    return r2 * (real(3.0) * wp.abs(radial[0]) + r2 * third) + real(8.0) * tangential * wp.sqrt(r2)
+
+
+@wp.func
+def undistort(view: View, distorted: vec2) -> vec2:
+    """Inverse of distort, by Newton's method on the two equations.
+
+    Where a lens changes little, p starts at the target. Else the target moves out from the
+    principal point in eight strides of one step each, for which p is first moved straight on as
+    far. Steps follow until p is close to where it ends, and four more. Where a lens folds over, and
+    nothing is found, it ends wherever 40 steps lead.
+    """
+    p = vec2()
+    two = real(2.0)
+    share = real(0.0)  # of its way that the target has come
+    if strain(view, real(1.6) * wp.length_sq(distorted)) < real(0.5):
+        p = distorted
+        share = real(1.0)
+    left = int(4)  # steps to take once p is close: each doubles the digits
+    for _ in range(40):
+        if share < real(1.0):
+            further = share + real(0.125)
+            if share > real(0.0):
+                p = p * (further / share)
+            share = further
+        elif wp.length_sq(distort(view, p) - distorted) < real(1.0e-6):
+            left -= 1
+        x = p[0]
+        y = p[1]
+        r2 = x * x + y * y
+        radial = real(1.0) + r2 * (view.radial[0] + r2 * (view.radial[1] + r2 * view.radial[2]))
+        slope = view.radial[0] + r2 * (two * view.radial[1] + r2 * real(3.0) * view.radial[2])
+        p1 = view.tangential[0]
+        p2 = view.tangential[1]
+        # The Jacobian of distort, which is symmetric.
+        a = radial + two * x * x * slope + two * p1 * y + real(6.0) * p2 * x
+        b = two * x * y * slope + two * p1 * x + two * p2 * y
+        d = radial + two * y * y * slope + real(6.0) * p1 * y + two * p2 * x
+        residual = distort(view, p) - share * distorted
+        det = a * d - b * b
+        p = p - vec2(d * residual[0] - b * residual[1], a * residual[1] - b * residual[0]) / det
+        if left == 0:
+            break
+    return p
+
+
+@wp.func
+def pixel_direction(view: View, u: real, v: real) -> vec3:
+    """Unit direction in world space of the ray through image position (u, v), in pixels."""
+    p = vec2((u - view.principal[0]) / view.focal[0], (v - view.principal[1]) / view.focal[1])
+    if wp.length_sq(view.radial) + wp.length_sq(view.tangential) > real(0.0):
+        p = undistort(view, p)
+    return wp.normalize(view.rotation * vec3(p[0], -p[1], real(-1.0)))
+
+
+@wp.kernel
+def camera_rays(
+    first: int,
+    view: View,
+    out_origins: wp.array(dtype=vec3),  # [H * W] scene units
+    out_directions: wp.array(dtype=vec3),  # [H * W] unit vectors
+):
+    """The rays through all pixel centres of one camera, row by row."""
+    i = first + wp.tid()
+    out_origins[i] = view.position
+    out_directions[i] = pixel_direction(
+        view, real(i % view.width) + real(0.5), real(i // view.width) + real(0.5)
+    )
+
+
+@wp.func
+def view_of_pixel(views: wp.array(dtype=View), pixel: int) -> int:
+    """The last view whose first pixel is not after `pixel`."""
+    low = int(0)
+    high = int(views.shape[0])
+    while high - low > 1:
+        middle = (low + high) // 2
+        before = views[middle].first_pixel <= pixel
+        low = wp.where(before, middle, low)  # a processor cannot foresee which: no branch
+        high = wp.where(before, high, middle)
+    return low
+
+
+@wp.kernel
+def sample_pixels(
+    first: int,  # this launch makes rays first, first + 1, ...
+    # photographs
+    views: wp.array(dtype=View),  # [n_views], by first_pixel
+    pixels: wp.array(dtype=wp.vec4ub),  # all photographs, one after another: rgb, straight alpha
+    content_distances: wp.array(dtype=real),  # [n_views] scene units
+    # how
+    seed: int,  # of the training
+    rays_before: wp.uint32,  # in the training, before ray 0 of this batch
+    background: vec3,  # rgb in [0, 1]
+    background_mode: int,  # RANDOM_BACKGROUND: a colour of its own for each ray
+    jitter: int,  # 1: a random offset for each ray, 0: the middle of the step
+    # out
+    out_origins: wp.array(dtype=vec3),  # [n_rays] scene units
+    out_directions: wp.array(dtype=vec3),  # [n_rays] unit vectors
+    out_offsets: wp.array(dtype=real),  # [n_rays] in [0, 1)
+    out_background: wp.array(dtype=vec3),  # [n_rays] in [0, 1]
+    out_content_distance: wp.array(dtype=real),  # [n_rays] scene units
+    out_target_rgb: wp.array(dtype=vec3),  # [n_rays] the pixel over its background, in [0, 1]
+):
+    """A batch of rays through random pixels, all pixels equally likely."""
+    i = first + wp.tid()
+    state = wp.rand_init(seed, int(rays_before + wp.uint32(i)))
+    pixel = wp.randi(state, 0, pixels.shape[0])
+    later = wp.rand_init(seed, int(rays_before + wp.uint32(i + wp.static(AHEAD))))
+    prefetch(pixels, wp.randi(later, 0, pixels.shape[0]))
+    v = view_of_pixel(views, pixel)
+    view = views[v]
+    local = pixel - view.first_pixel
+    out_origins[i] = view.position
+    out_directions[i] = pixel_direction(
+        view, real(local % view.width) + real(0.5), real(local // view.width) + real(0.5)
+    )
+    behind = background
+    if background_mode == RANDOM_BACKGROUND:
+        behind = vec3(real(wp.randf(state)), real(wp.randf(state)), real(wp.randf(state)))
+    offset = real(0.5)
+    if jitter == 1:
+        offset = real(wp.randf(state))
+    colour = pixels[pixel]
+    unit = real(1.0) / real(255.0)
+    alpha = real(colour[3]) * unit
+    rgb = unit * vec3(real(colour[0]), real(colour[1]), real(colour[2]))
+    out_offsets[i] = offset
+    out_background[i] = behind
+    out_content_distance[i] = content_distances[v]
+    out_target_rgb[i] = alpha * rgb + (real(1.0) - alpha) * behind

@@ -1,0 +1,1 @@
+"""Along a ray: compositing, the distance scaling of its gradient, and losses."""

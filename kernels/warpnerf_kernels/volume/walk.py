@@ -1,0 +1,181 @@
+"""The walk along a ray, and its adjoint: one walk, two passes, a sample at a time.
+
+The forward pass composites samples front to back; the backward pass walks the same samples and
+needs of the rest of the ray only what lies behind: it starts with that, and sheds it on its way.
+Both get their samples from ``next_sample``, the one place that decides where a ray is sampled.
+
+This is the specification. walk_packs.py does the same, sixteen samples at a time.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from ..base.activation import adj_softplus, opacity_of
+from ..base.parts import Encoding, Head, RayLoss, Sampler
+from ..base.types import Box, Density, FreeSpace, Ray, gradient_type, real, vector
+from ..sampling.traversal import traversal
+from .compositing import matter_of, shed
+from .gradscale import distance_scale
+
+wp.set_module_options({"enable_backward": False})
+
+
+@cache
+def integral_type(n_channels: int, loss: RayLoss) -> type:
+    """What a ray has gathered."""
+    State = loss.State
+
+    @wp.struct
+    class Integral:
+        channels: vector(n_channels)  # sums of weight times channel, without background
+        depth: real  # sum of weight times t
+        transmittance: real  # what passes all samples
+        n_samples: int
+        loss: State  # sums of the loss over samples
+
+    return Integral
+
+
+@cache
+def walk(sampler: Sampler, encoding: Encoding, head: Head, loss: RayLoss) -> SimpleNamespace:
+    """The two passes for a model's parts.
+
+    Returns:
+        integrate, adj_integrate, and Integral, the type between them.
+    """
+    Steps, Field, Params = sampler.Params, encoding.Params, head.Params
+    Raw, Channels, View = vector(encoding.n_floats), vector(head.n_channels), head.View
+    Gradient = gradient_type(encoding.n_floats)
+    State = loss.State
+    Integral = integral_type(head.n_channels, loss)
+    next_sample = traversal(sampler).next_sample
+    edge = sampler.edge
+    read, adj_read = encoding.read, encoding.adj_read
+    prepare, adj_prepare = head.prepare, head.adj_prepare
+    decode, adj_decode = head.decode, head.adj_decode
+    add_loss, weighted, adj_loss, loss_bound = loss.add, loss.weighted, loss.adj_weight, loss.bound
+    weight_min = head.weight_min
+
+    @wp.func
+    def integrate(
+        box: Box,
+        free: FreeSpace,
+        march: Steps,
+        field: Field,
+        density: Density,
+        params: Params,
+        ray: Ray,
+        contraction: int,
+    ) -> Integral:
+        """Composite a ray's samples front to back: sum_i T_i alpha_i c_i."""
+        view = prepare(params, ray.direction)
+        total = Integral()
+        total.transmittance = real(1.0)
+        step = int(ray.begin)
+        while step < ray.end:
+            sample = next_sample(box, free, march, ray, step, contraction)
+            step = sample.step + 1
+            if sample.step < ray.end:
+                raw = read(field, sample.position)
+                matter = matter_of(density, raw[0], sample.dt)
+                opacity = opacity_of(matter.sigma * sample.dt, matter.attenuation)
+                weight = total.transmittance * opacity
+                if weight > real(weight_min):
+                    total.channels += weight * decode(params, view, raw)
+                total.loss = add_loss(total.loss, weight, sample.t, sample.dt)
+                total.depth += weight * sample.t
+                total.transmittance *= matter.attenuation
+                total.n_samples += 1
+                if total.transmittance < march.transmittance_min:
+                    step = ray.end
+        return total
+
+    @wp.func
+    def adj_integrate(
+        box: Box,
+        free: FreeSpace,
+        march: Steps,
+        field: Field,
+        density: Density,
+        params: Params,
+        ray: Ray,
+        total: Integral,
+        adj_channels: Channels,
+        adj_transmittance: real,  # of what passes all samples
+        adj_depth: real,
+        adj_loss_value: real,
+        content_distance: real,
+        contraction: int,
+        scaling: int,
+        jacobian: int,
+        gradient: Gradient,  # added to
+    ):
+        """Adjoint of integrate. With G_i = dL/dw_i = <adj_channels, c_i> + adj_depth t_i + loss,
+
+        dL/dsigma_i = dt_i (T_{i+1} G_i - sum_{j>i} w_j G_j - T_end dL/dT_end),
+        dL/dc_i = w_i adj_channels,
+
+        both multiplied by the distance scaling. The two sums are what lies behind sample i.
+        """
+        view = prepare(params, ray.direction)
+        adj_view = View()
+        behind = (
+            wp.dot(adj_channels, total.channels)
+            + adj_depth * total.depth
+            + adj_transmittance * total.transmittance
+            + adj_loss_value * weighted(total.loss)
+        )
+        limit = behind_limit(
+            adj_transmittance,
+            adj_channels,
+            adj_depth * edge(march, ray.end),
+            adj_loss_value * loss_bound(total.loss, edge(march, ray.end)),
+        )
+        before = State()
+        transmittance = real(1.0)
+        step = int(ray.begin)
+        for _n in range(total.n_samples):
+            sample = next_sample(box, free, march, ray, step, contraction)
+            step = sample.step + 1
+            raw = read(field, sample.position)
+            matter = matter_of(density, raw[0], sample.dt)
+            weight = transmittance * opacity_of(matter.sigma * sample.dt, matter.attenuation)
+            transmittance *= matter.attenuation
+            scale = distance_scale(
+                sample.t, content_distance, sample.det_jacobian, scaling, jacobian
+            )
+            adj_weight = adj_depth * sample.t + adj_loss_value * adj_loss(
+                total.loss, before, weight, sample.t, sample.dt
+            )
+            before = add_loss(before, weight, sample.t, sample.dt)
+            adj_raw = Raw()
+            if weight > real(weight_min):
+                channels = decode(params, view, raw)
+                adj_weight += wp.dot(adj_channels, channels)
+                adj_sample_channels = scale * (weight * adj_channels)
+                adj_raw, adj_sample_view = adj_decode(
+                    params, view, raw, channels, adj_sample_channels, gradient
+                )
+                adj_view += adj_sample_view
+            behind = shed(behind, weight, adj_weight, limit, transmittance)
+            adj_sigma = scale * (sample.dt * (transmittance * adj_weight - behind))
+            adj_raw[0] = adj_softplus(matter.sigma_slope, adj_sigma)
+            adj_read(field, sample.position, adj_raw, gradient)
+        adj_prepare(params, ray.direction, adj_view, gradient)
+
+    return SimpleNamespace(integrate=integrate, adj_integrate=adj_integrate, Integral=Integral)
+
+
+@wp.func
+def behind_limit(adj_transmittance: real, adj_channels: Any, of_depth: real, of_loss: real) -> real:
+    """How much what lies behind a sample can be, for each unit of light that gets there.
+
+    Channels lie in [0, 1].
+    """
+    of_channels = real(0.0)
+    for c in range(len(adj_channels)):
+        of_channels += wp.abs(adj_channels[c])
+    return wp.max(wp.abs(adj_transmittance), of_channels + wp.abs(of_depth) + wp.abs(of_loss))

@@ -1,0 +1,143 @@
+"""Lenses from files, and the limits of the distortion."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from tiny_scenes import camera_at
+
+from warpnerf.checks import InputError
+from warpnerf.scenes.camera import Camera
+from warpnerf.scenes.lens import LensFields, has_invertible_distortion, read_lens
+
+FILE = Path("scene/transforms.json")
+POSE = np.eye(3, 4)
+
+
+def camera(frame: LensFields, whole: LensFields | None = None) -> Camera:
+    """Camera of an image of 8x6 pixels."""
+    lens = read_lens(FILE, [("$.frames[0]", frame), ("$", whole or LensFields())])
+    return lens.camera(width=8, height=6, c2w=POSE, image="a.png")
+
+
+def test_everything_is_taken_from_the_file() -> None:
+    keys = {"k1": 0.01, "k2": -0.02, "k3": 0.03, "p1": 0.004, "p2": -0.005}
+    result = camera(LensFields(fl_x=10.0, fl_y=11.0, cx=4.5, cy=2.5, w=8.0, h=6.0, **keys))
+    assert (result.fx, result.fy, result.cx, result.cy) == (10.0, 11.0, 4.5, 2.5)
+    assert {key: getattr(result, key) for key in keys} == keys
+
+
+def test_what_is_missing_follows_from_the_image() -> None:
+    result = camera(LensFields(camera_angle_x=np.pi / 2))
+    assert (result.fx, result.fy) == pytest.approx((4.0, 4.0))
+    assert (result.cx, result.cy, result.k1) == (4.0, 3.0, 0.0)
+    result = camera(LensFields(camera_angle_x=np.pi / 2, camera_angle_y=np.pi / 2))
+    assert (result.fx, result.fy) == pytest.approx((4.0, 3.0))
+    assert camera(LensFields(fl_y=9.0)).fx == 9.0
+
+
+def test_focal_length_wins_over_angle_and_frame_over_file() -> None:
+    assert camera(LensFields(fl_x=10.0, camera_angle_x=1.0)).fx == 10.0
+    result = camera(LensFields(camera_angle_x=np.pi / 2), LensFields(fl_x=10.0, cx=5.0))
+    assert (result.fx, result.cx) == (pytest.approx(4.0), 5.0)
+
+
+@pytest.mark.parametrize(
+    "model", ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"]
+)
+def test_known_models_are_accepted(model: str) -> None:
+    assert camera(LensFields(camera_model=model, fl_x=10.0, is_fisheye=False, k4=0.0)).fx == 10.0
+
+
+@pytest.mark.parametrize(
+    ("frame", "message"),
+    [
+        (LensFields(), r"\$\.frames\[0\]: has no focal length"),
+        (LensFields(fl_x=0.0), r"\$\.frames\[0\]\.fl_x: 0 is no focal length"),
+        (LensFields(fl_x=-1.0), r"\.fl_x: -1 is no focal length"),
+        (LensFields(fl_x=np.nan), r"\.fl_x: nan is no focal length"),
+        (LensFields(fl_x=10.0, fl_y=np.inf), r"\.fl_y: inf is no focal length"),
+        (LensFields(camera_angle_x=0.0), r"\.camera_angle_x: 0 is not a field of view"),
+        (LensFields(camera_angle_x=np.pi), r"\.camera_angle_x: 3.14159 is not a field of view"),
+        (LensFields(camera_angle_x=40.0), r"\.camera_angle_x: 40 is not a field of view"),
+        (LensFields(camera_angle_x=np.nan), r"\.camera_angle_x: nan is not a field of view"),
+        (LensFields(camera_angle_x=5e-324), r"\.camera_angle_x: 4.94066e-324 is not a field of"),
+        (LensFields(camera_angle_x=1e-50), r"\.camera_angle_x: means a focal length of"),
+        (LensFields(fl_x=0.1), r"\.fl_x: means a focal length of 0.1 pixels.*8x6; give pixels"),
+        (LensFields(fl_x=10.0, cx=np.nan), r"\.cx: nan is not a finite number"),
+        (LensFields(fl_x=10.0, cy=1e5), r"\.cy: means a principal point at 100000 pixels"),
+        (LensFields(fl_x=10.0, k2=np.inf), r"\.k2: inf is not a finite number"),
+        (LensFields(fl_x=10.0, k4=0.1), r"\.k4: is not modelled unless it is 0; undistort"),
+        (LensFields(fl_x=10.0, is_fisheye=True), r"\.is_fisheye: that lens is not modelled"),
+        (LensFields(fl_x=10.0, camera_model="OPENCV_FISHEYE"), r"\.camera_model: 'OPENCV_FISHEYE'"),
+        (LensFields(fl_x=10.0, w=16.0, h=12.0), r"\.w: .* 16x12 pixels, but a\.png has 8x6"),
+        (LensFields(fl_x=10.0, w=8.0, h=12.0), r"\.h: .* 8x12 pixels, but a\.png has 8x6"),
+        (LensFields(fl_x=10.0, w=6.0, h=8.0), r"\.w: .* 6x8 pixels, but a\.png has 8x6"),
+        (LensFields(fl_x=4.0, k1=-0.5), r"\.k1 = -0\.5 folds over within the image a\.png"),
+    ],
+)
+def test_bad_lens_is_refused_by_name(frame: LensFields, message: str) -> None:
+    with pytest.raises(InputError, match=rf"transforms\.json: .*{message}"):
+        camera(frame)
+
+
+def test_message_names_the_level_that_is_wrong() -> None:
+    with pytest.raises(InputError, match=r"transforms\.json: \$\.fl_x: -1"):
+        camera(LensFields(cx=4.0), LensFields(fl_x=-1.0))
+
+
+def random_lens(seed: int) -> Camera:
+    k1, k2, k3, p1, p2 = np.random.default_rng(seed).normal(0.0, [0.1, 0.05, 0.02, 0.01, 0.01])
+    return camera_at(np.eye(4), k1=k1, k2=k2, k3=k3, p1=p1, p2=p2)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_distortion_agrees_with_opencv(seed: int) -> None:
+    lens = random_lens(seed)
+    points = np.random.default_rng(seed).uniform(-0.5, 0.5, (20, 2))
+    coefficients = np.array([lens.k1, lens.k2, lens.p1, lens.p2, lens.k3])
+    expected, _ = cv2.projectPoints(
+        np.concatenate([points, np.ones((20, 1))], axis=1),
+        *(np.zeros(3), np.zeros(3), np.eye(3), coefficients),
+    )
+    distorted, jacobian = lens.distort(points)
+    np.testing.assert_allclose(distorted, expected[:, 0], rtol=0, atol=1e-14)
+
+    step = 1e-6
+    for axis in range(2):
+        shift = step * np.eye(2)[axis]
+        slope = (lens.distort(points + shift)[0] - lens.distort(points - shift)[0]) / (2 * step)
+        np.testing.assert_allclose(jacobian[:, :, axis], slope, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("k1", [-2.0, -1.0, -0.7, -0.45, -0.38, -0.25, -0.1, 0.5, 5.0])
+def test_fold_of_one_coefficient_is_found_where_it_is(k1: float) -> None:
+    # r (1 + k1 r^2) has its maximum (2/3) sqrt(-1 / (3 k1)); the corner is at distorted radius 0.5
+    # or 0.7071. Where the determinant (1 + k1 r^2)(1 + 3 k1 r^2) gets close to 0 may go both ways.
+    for half in (0.3535533905932738, 0.5):
+        lens = camera_at(np.eye(4), width=10, height=10, cx=5.0, cy=5.0, fx=5 / half, fy=5 / half)
+        lens = Camera(**{**vars(lens), "k1": k1})
+        farthest = (2.0 / 3.0) * np.sqrt(1.0 / (-3.0 * k1)) if k1 < 0.0 else np.inf
+        corner = half * np.sqrt(2.0)
+        assert abs(farthest / corner - 1.0) > 0.01
+        assert has_invertible_distortion(lens) == (corner < farthest)
+
+
+def test_fold_that_a_higher_coefficient_turns_back_is_found() -> None:
+    # r - r^3 + r^5 / 2.5 falls between its extrema, then rises to pass the corner again.
+    lens = camera_at(
+        np.eye(4), width=10, height=10, cx=5.0, cy=5.0, fx=5.0, fy=5.0, k1=-1.0, k2=0.4
+    )
+    assert not has_invertible_distortion(lens)
+
+
+def test_distortion_of_real_lenses_is_accepted() -> None:
+    fox = camera_at(
+        np.eye(4),
+        **{"width": 270, "height": 480, "fx": 343.88, "fy": 343.62, "cx": 138.64, "cy": 241.32},
+        **{"k1": 0.0578421, "k2": -0.0805099, "p1": -0.000980296, "p2": 0.00015575},
+    )
+    assert has_invertible_distortion(fox)

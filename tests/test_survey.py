@@ -1,0 +1,56 @@
+"""What a look at a scene's files finds, besides what loading it does."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tiny_scenes import ring, save, write_blender, write_transforms
+
+from warpnerf.scenes.survey import survey
+
+
+def test_formats_are_named(tmp_path: Path) -> None:
+    write_transforms(tmp_path / "a")
+    write_blender(tmp_path / "b", "train", ring(4))
+    write_blender(tmp_path / "b", "test", ring(2))
+    for path in (tmp_path / "a", tmp_path / "a" / "transforms.json"):
+        found = survey(path)
+        assert found.format == "instant-ngp / nerfstudio (transforms.json)"
+        assert found.files == (tmp_path / "a" / "transforms.json",)
+    found = survey(tmp_path / "b")
+    assert found.format == "Blender / NeRF-synthetic (transforms_train.json, transforms_test.json)"
+    assert survey("builtin:room").format.startswith("built in")
+    assert survey(tmp_path / "nowhere").files == ()
+
+
+def test_all_poses_that_are_refused_are_named(tmp_path: Path) -> None:
+    content = write_transforms(tmp_path, 6)
+    content["frames"][1]["transform_matrix"][0][0] += 0.1
+    content["frames"][4]["transform_matrix"] = [[1.0]]
+    save(tmp_path / "transforms.json", content)
+    assert survey(tmp_path).refused == ("$.frames[1]", "$.frames[4]")
+
+
+def test_poses_that_are_not_quite_rigid_are_counted(tmp_path: Path) -> None:
+    content = write_transforms(tmp_path, 4)
+    assert survey(tmp_path).oddities == ()
+    content["frames"][2]["transform_matrix"][0][0] += 3e-4
+    save(tmp_path / "transforms.json", content)
+    found = survey(tmp_path)
+    assert found.refused == ()
+    assert len(found.oddities) == 1 and "1 of 4 poses are not quite rigid" in found.oddities[0]
+
+
+def test_unknown_keys_are_named_and_harmless_ones_are_not(tmp_path: Path) -> None:
+    content = write_transforms(tmp_path, 4)
+    content |= {"aabb_scale": 4, "exposure": 2.0}
+    content["frames"][3] |= {"sharpness": 9.0, "white_balance": [1, 1, 1]}
+    save(tmp_path / "transforms.json", content)
+    (oddity,) = survey(tmp_path).oddities
+    assert oddity.endswith("keys that are not read: exposure, white_balance")
+
+
+def test_what_cannot_be_read_is_left_to_loading(tmp_path: Path) -> None:
+    (tmp_path / "transforms.json").write_text("{")
+    found = survey(tmp_path)
+    assert (found.refused, found.oddities) == ((), ())

@@ -1,0 +1,394 @@
+"""A training that is interrupted and resumed ends as one that was not, bit for bit."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from test_determinism import small_scene
+from tiny_fields import assert_same_state
+
+from warpnerf.checks import InputError
+from warpnerf.config import GridConfig, OptimConfig, TrainConfig
+from warpnerf.model.models import Deferred
+from warpnerf.rendering import adjoint
+from warpnerf.rendering.adjoint import Gradients
+from warpnerf.scenes.scene import Scene
+from warpnerf.training import trainer as training
+from warpnerf.training.checkpoint import load_checkpoint, save_checkpoint
+from warpnerf.training.state import TrainingState
+from warpnerf.training.trainer import Trainer, train
+
+STEPS = 20
+GROWING = (7, 13)
+"""The steps at which the grid of ``tiny_config`` grows: the first with a share above 0.3, 0.6."""
+
+
+@pytest.fixture(autouse=True)
+def early_growth(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Free space is looked for, and the grid grows, within a short training."""
+    monkeypatch.setattr(training, "FIRST_LOOK", 4)
+    monkeypatch.setattr(training, "REPORT_EVERY", 3)
+
+
+NO_GROWTH = GridConfig(voxels=6000, grow_at=(), alpha_init=0.1)
+
+
+def ball() -> Scene:
+    """Something round of many colours, with nothing around it."""
+    scene = small_scene()
+    v, u = np.mgrid[:18, :24]
+    inside = np.hypot(v - 8.5, u - 11.5) < 4.0
+    for view in scene.views:
+        view.image[..., 3] = 255 * inside
+    return scene
+
+
+def tiny_config(**changes: Any) -> TrainConfig:
+    return replace(
+        TrainConfig(
+            steps=STEPS,
+            rays_per_step=300,
+            occupancy_every=5,
+            alpha_min=0.1,
+            background="random",
+            threads=1,
+            grid=GridConfig(voxels=6000, grow_at=(0.301, 0.601), alpha_init=0.1),
+            optim=OptimConfig(tv_every=3, tv_density=1e-4, tv_rgb=1e-4, accumulate_at=()),
+        ),
+        **changes,
+    )
+
+
+def stopped_at(
+    step: int, file: Path, config: TrainConfig, scene: Scene, resume: TrainingState | None = None
+) -> TrainingState:
+    """Train up to a step, and what a file then gives back."""
+    trainer = Trainer(scene, config, resume)
+    trainer.run(
+        on_checkpoint=lambda state: save_checkpoint(file, state),
+        stop=lambda: trainer.steps_done >= step,
+    )
+    assert trainer.steps_done == step
+    return load_checkpoint(file)
+
+
+def without_seconds(state: TrainingState) -> TrainingState:
+    """The one thing that no two trainings share."""
+    return replace(state, progress=replace(state.progress, seconds=0.0))
+
+
+@pytest.mark.parametrize(
+    ("model", "threads", "unbounded"),
+    [
+        ("deferred", 1, False),
+        ("deferred", 3, False),
+        ("deferred", 1, True),
+        ("deferred", 3, True),
+        ("rgb", 3, False),
+        ("sh", 3, False),
+        ("features", 3, False),
+    ],
+)
+def test_resumed_after_any_step_it_ends_the_same(
+    tmp_path: Path, model: str, threads: int, unbounded: bool, on_cpu: None
+) -> None:
+    scene = replace(ball(), unbounded=unbounded)
+    config = tiny_config(threads=threads, model=model)
+    whole = stopped_at(STEPS, tmp_path / "whole", config, scene)
+    assert whole.grown == 2 and 0.02 < whole.progress.occupied < 0.98
+    assert unbounded or (whole.field.grid.box_min > scene.box_min).any()
+    for step in range(1, STEPS):
+        begun = stopped_at(step, tmp_path / "begun", config, scene)
+        assert begun.grown == sum(step > at for at in GROWING)
+        resumed = stopped_at(STEPS, tmp_path / "resumed", begun.config, scene, begun)
+        assert_same_state(without_seconds(resumed), without_seconds(whole))
+
+
+def test_interrupted_after_every_step_it_ends_the_same(tmp_path: Path, on_cpu: None) -> None:
+    whole = stopped_at(STEPS, tmp_path / "whole", tiny_config(), ball())
+    state = None
+    for step in range(1, STEPS + 1):
+        state = stopped_at(step, tmp_path / "state", tiny_config(), ball(), state)
+    assert state is not None
+    assert_same_state(without_seconds(state), without_seconds(whole))
+
+
+def accumulating(config: TrainConfig, *shares: float) -> TrainConfig:
+    return replace(config, optim=replace(config.optim, accumulate_at=shares))
+
+
+@pytest.mark.parametrize(
+    ("shares", "updates"),
+    [
+        ((), [1, 2, 3, 4, 5, 6, 7]),
+        ((0.3,), [1, 2, 3, 5, 7]),
+        ((0.4, 0.6), [1, 2, 3, 5, 7]),  # the last update has only two steps left
+        ((0.1, 0.1, 0.1), [1, 7]),
+    ],
+)
+def test_updates_take_more_steps_as_training_goes_on(
+    shares: tuple[float, ...], updates: list[int]
+) -> None:
+    seen: list[int] = []
+    config = accumulating(tiny_config(steps=7, checkpoint_every=1e-9), *shares)
+    train(ball(), config, on_checkpoint=lambda state: seen.append(state.progress.step))
+    assert seen == updates
+
+
+@pytest.mark.parametrize(
+    ("unbounded", "channels", "late"),
+    [
+        (False, 3, [13, 14, 15, 16, 18, 20, 28, 40]),
+        (False, 4, [14, 16, 24, 40]),
+        (True, 3, [*range(13, 21), *range(22, 29, 2), 32, 36, 40]),
+        (True, 4, [*range(13, 21), *range(22, 29, 2), 32, 36, 40]),
+    ],
+)
+def test_updates_take_more_steps_the_less_rays_meet_unless_told(
+    unbounded: bool, channels: int, late: list[int]
+) -> None:
+    scene = ball()
+    views = [replace(view, image=view.image[..., :channels]) for view in scene.views]
+    seen: list[int] = []
+    train(
+        replace(scene, views=views, unbounded=unbounded),
+        tiny_config(steps=40, checkpoint_every=1e-9, optim=OptimConfig()),
+        on_checkpoint=lambda state: seen.append(state.progress.step),
+    )
+    assert seen == [*range(1, 13), *late]
+
+
+@pytest.mark.parametrize("shares", [(0.0,), (0.5, 0.4), (1.0,), (math.nan,)])
+def test_shares_that_are_none_are_refused(shares: tuple[float, ...]) -> None:
+    for make, name in (
+        (lambda: OptimConfig(accumulate_at=shares), r"optim\.accumulate_at"),
+        (lambda: GridConfig(grow_at=shares), r"grid\.grow_at"),
+    ):
+        with pytest.raises(InputError, match=rf"^{name} must be shares between 0 and 1"):
+            make()
+
+
+def test_updates_of_very_many_steps_or_none_are_refused() -> None:
+    OptimConfig(accumulate_at=(0.5,) * 6)
+    with pytest.raises(InputError, match=r"^optim\.accumulate_at must hold at most 6.*, not 7:"):
+        OptimConfig(accumulate_at=(0.5,) * 7)
+    with pytest.raises(InputError, match=r"^optim\.accumulate_at must be auto or shares .*'never'"):
+        OptimConfig(accumulate_at="never")  # type: ignore[arg-type]
+
+
+def test_updates_are_counted_apart_from_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    smoothed: list[tuple[int, int]] = []
+    updates: list[int] = []
+    rates: list[float] = []
+    looked: list[int] = []
+    add, adam = training.add_total_variation, training.adam_step
+    look = Trainer._look_for_free_space
+    config = accumulating(tiny_config(grid=NO_GROWTH), 0.2, 0.5)
+    trainer = Trainer(ball(), replace(config, optim=replace(config.optim, decay=0.3)))
+
+    def adding(*arguments: Any) -> None:
+        smoothed.append((trainer._updates, arguments[4]))
+        add(*arguments)
+
+    def updating(*arguments: Any) -> None:
+        updates.append(arguments[3])
+        rates.append(arguments[4])
+        adam(*arguments)
+
+    def looking(trainer: Trainer) -> None:
+        looked.append(trainer.steps_done)
+        look(trainer)
+
+    monkeypatch.setattr(training, "add_total_variation", adding)
+    monkeypatch.setattr(training, "adam_step", updating)
+    monkeypatch.setattr(Trainer, "_look_for_free_space", looking)
+    trainer.run()
+    # Updates end after 1, 2, 3, 4, 6, 8, 10, 14, 18 and 20 steps.
+    assert updates == list(range(1, 11))
+    begun, n_steps = [0, 1, 2, 3, 4, 6, 8, 10, 14, 18], [1, 1, 1, 1, 2, 2, 2, 4, 4, 2]
+    fading = 0.3 ** (np.array(begun) / STEPS)
+    np.testing.assert_allclose(rates, fading * np.array(n_steps) ** 0.25, rtol=1e-12)
+    assert smoothed == [(0, 1), (3, 1), (6, 2), (9, 2)]  # every third
+    assert looked == [0, 6]  # before every fifth
+
+
+@pytest.mark.parametrize(
+    ("model", "threads", "samples"),
+    [
+        *(("deferred", *how) for how in ((1, 1 << 21), (3, 1 << 21), (3, 1000))),
+        ("rgb", 3, 1000),
+        ("features", 3, 1000),
+    ],
+)
+def test_an_update_adds_up_the_gradients_of_its_steps(
+    model: str, threads: int, samples: int, monkeypatch: pytest.MonkeyPatch, on_cpu: None
+) -> None:
+    """Also where its rays take turns."""
+    monkeypatch.setattr(adjoint, "SAMPLES", samples)
+    taken: list[np.ndarray] = []
+    of_weights: list[np.ndarray] = []
+
+    def no_update(parameters: Any, states: Any, gradients: Gradients, *rest: Any) -> None:
+        taken.append(gradients.values.numpy().copy())
+        of_weights.append(gradients.weights.numpy().sum(axis=0))
+        gradients.values.zero_()
+        gradients.weights.zero_()
+
+    monkeypatch.setattr(training, "adam_step", no_update)  # so both see one grid
+    optim = OptimConfig(tv_density=0.0, tv_rgb=0.0, accumulate_at=())
+    config = tiny_config(steps=5, grid=NO_GROWTH, optim=optim, threads=threads, model=model)
+    train(ball(), config)
+    train(ball(), accumulating(config, 0.1, 0.2))
+    for found in (taken, of_weights) if of_weights[0].size else (taken,):
+        assert len(found) == 5 + 2
+        single, together = found[:5], found[5:]
+        np.testing.assert_array_equal(together[0], single[0])
+        largest = np.abs(together[1]).max()
+        np.testing.assert_allclose(together[1], np.sum(single[1:], axis=0), atol=1e-5 * largest)
+        assert largest > 0.0
+
+
+def test_reports_come_as_often_where_an_update_takes_many_steps() -> None:
+    reported: list[int] = []
+    config = accumulating(tiny_config(), 0.1, 0.3)  # updates after 1, 2, 4, 6, 10, 14, ... steps
+    train(ball(), config, on_progress=lambda progress: reported.append(progress.step))
+    assert reported == [4, 6, 10, 14, 18, 20]
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_resumed_between_updates_of_several_steps_it_ends_the_same(
+    threads: int, tmp_path: Path, on_cpu: None
+) -> None:
+    config = accumulating(tiny_config(threads=threads), 0.2, 0.5)
+    whole = stopped_at(STEPS, tmp_path / "whole", config, ball())
+    assert whole.updates == 10
+    for step in (4, 6, 10, 14, 18):
+        begun = stopped_at(step, tmp_path / "begun", config, ball())
+        resumed = stopped_at(STEPS, tmp_path / "resumed", config, ball(), begun)
+        assert_same_state(without_seconds(resumed), without_seconds(whole))
+
+
+def test_train_resumes_too_and_leaves_the_state_alone(tmp_path: Path, on_cpu: None) -> None:
+    scene = ball()
+    whole = train(scene, tiny_config())
+    state = stopped_at(9, tmp_path / "state", tiny_config(), scene)
+    for _ in range(2):  # the second would differ had the first worked in the state's own arrays
+        result = train(scene, resume=state)
+        assert replace(result.progress, seconds=0.0) == replace(whole.progress, seconds=0.0)
+        values = result.field.grid.values.numpy()
+        np.testing.assert_array_equal(values, whole.field.grid.values.numpy())
+        weights = result.field.weights.numpy()
+        np.testing.assert_array_equal(weights, whole.field.weights.numpy())
+
+
+def test_estimates_that_another_machine_rounds_otherwise_change_nothing(
+    tmp_path: Path, on_cpu: None
+) -> None:
+    scene = replace(ball(), unbounded=True)
+    whole = stopped_at(STEPS, tmp_path / "whole", tiny_config(), scene)
+    begun = stopped_at(5, tmp_path / "begun", tiny_config(), scene)
+    nudged = replace(scene, content_distance=2.0 * (1 + 1e-7), box_max=scene.box_max * (1 + 1e-7))
+    resumed = stopped_at(STEPS, tmp_path / "resumed", tiny_config(), nudged, begun)
+    assert_same_state(without_seconds(resumed), without_seconds(whole))
+
+
+def test_a_finished_training_resumes_to_its_end(tmp_path: Path) -> None:
+    state = stopped_at(STEPS, tmp_path / "state", tiny_config(), ball())
+    saved: list[TrainingState] = []
+    result = train(ball(), resume=state, on_checkpoint=saved.append)
+    assert result.progress == state.progress
+    np.testing.assert_array_equal(result.field.grid.values.numpy(), state.field.grid.values.numpy())
+    assert not saved  # nothing new
+
+
+def test_seconds_before_the_resumption_count(tmp_path: Path) -> None:
+    config = tiny_config(time_limit=1000.0)
+    state = stopped_at(2, tmp_path / "state", config, ball())
+    spent = replace(state, progress=replace(state.progress, seconds=900.0))
+    trainer = Trainer(ball(), config, spent)
+    assert trainer.fraction == 0.9
+    trainer.update()
+    assert 900.0 <= trainer.report().seconds < 1000.0
+
+
+def test_checkpoints_come_when_due_and_at_the_end() -> None:
+    for every, steps in ((1e-9, list(range(1, STEPS + 1))), (1e9, [STEPS])):
+        saved: list[int] = []
+        train(
+            ball(),
+            tiny_config(checkpoint_every=every),
+            on_checkpoint=lambda state, saved=saved: saved.append(state.progress.step),
+        )
+        assert saved == steps
+
+
+@pytest.mark.parametrize(
+    ("changes", "name"),
+    [
+        ({"steps": STEPS + 1}, "steps"),
+        ({"time_limit": 60.0}, "time_limit"),
+        ({"seed": 1}, "seed"),
+        ({"scaling": "none"}, "scaling"),
+        ({"grid": GridConfig(voxels=6000, grow_at=(0.301,), alpha_init=0.1)}, "grid.grow_at"),
+        ({"optim": OptimConfig(decay=0.5)}, "optim.decay"),
+        ({"model": "rgb"}, "model"),
+        ({"model": Deferred(width=16)}, "model.width"),
+        ({"optim": replace(tiny_config().optim, accumulate_at=(0.5,))}, "optim.accumulate_at"),
+    ],
+)
+def test_another_configuration_is_refused_by_name(
+    tmp_path: Path, changes: dict[str, Any], name: str
+) -> None:
+    state = stopped_at(1, tmp_path / "state", tiny_config(), ball())
+    with pytest.raises(InputError, match=rf"^{name} is "):
+        train(ball(), tiny_config(**changes), resume=state)
+
+
+def test_what_does_not_decide_the_result_may_change(tmp_path: Path) -> None:
+    state = stopped_at(17, tmp_path / "state", tiny_config(), ball())
+    changed = tiny_config(threads=2, checkpoint_every=7.0)
+    progress = train(ball(), changed, resume=state).progress
+    assert progress.step == STEPS
+
+
+def test_other_photographs_are_refused(tmp_path: Path) -> None:
+    state = stopped_at(1, tmp_path / "state", tiny_config(), ball())
+    scene = ball()
+    scene.views[1].image[3, 4, 0] ^= 1
+    with pytest.raises(InputError, match=r"noise.*photographs"):
+        train(scene, resume=state)
+
+
+def test_the_threads_in_use_are_part_of_the_state() -> None:
+    trainer = Trainer(ball(), tiny_config(threads=None))
+    trainer.update()
+    assert trainer.state().config.threads == trainer.workers.count
+
+
+@pytest.mark.parametrize("where", ["loss", "grid", "weights"])
+def test_what_is_not_finite_is_never_saved(where: str) -> None:
+    saved: list[int] = []
+    trainer = Trainer(ball(), tiny_config(checkpoint_every=1e-9))
+
+    def keep(state: TrainingState) -> None:
+        saved.append(state.progress.step)
+        if trainer.steps_done == 4 and where == "loss":  # of the batch of step 5
+            trainer.grid.values.fill_(math.nan)
+        if trainer.steps_done == 4 and where == "weights":
+            trainer.weights.fill_(math.nan)
+
+    def spoil() -> bool:
+        if trainer.steps_done == 4 and where == "grid":
+            values = trainer.grid.values.numpy()
+            values[0, 2] = math.nan  # a corner, which no ray meets
+            trainer.grid.values.assign(values)
+        return False
+
+    with pytest.raises(FloatingPointError, match="not finite after step 5"):
+        trainer.run(on_checkpoint=keep, stop=spoil)
+    assert saved == [1, 2, 3, 4]

@@ -1,0 +1,99 @@
+"""The commands that are about the machine: ``warpnerf check`` and ``warpnerf warmup``."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from warpnerf.checks import InputError
+from warpnerf.config import ModelName
+
+if TYPE_CHECKING:
+    from warpnerf.evaluation.verify import Result
+    from warpnerf.training.warmup import Warmed
+
+FAILED = 1
+
+
+def check_command(device: str = "cpu", threads: int | None = None, json: Path | None = None) -> int:
+    """Check gradients and determinism on this machine; exit with 1 if a check fails.
+
+    Args:
+        device: cpu, cuda, cuda:1, ...
+        threads: CPU threads; by default one per usable core.
+        json: Also write the results to this file.
+    """
+    require_writable(json)
+    from warpnerf.evaluation.verify import report, verify
+    from warpnerf.runtime.terminal import print_table
+
+    def shown(result: Result) -> None:
+        word = "passed" if result.passed else "FAILED"
+        print(f"{word}  {result.name}", flush=True)
+
+    start = time.perf_counter()
+    results = verify(device, threads, on_result=shown)
+    seconds = time.perf_counter() - start
+    print()
+    print_table(
+        ("check", "error", "tolerance", ""),
+        [
+            (r.name, f"{r.error:.1e}", f"{r.tolerance:.0e}", "ok" if r.passed else "FAILED")
+            for r in results
+        ],
+        bad=[not r.passed for r in results],
+    )
+    failed = [result for result in results if not result.passed]
+    for result in failed:
+        if result.note:
+            print(f"{result.name}: {result.note}")
+    said = f"{len(failed)} of {len(results)} checks failed" if failed else "all checks passed"
+    print(f"{said} on {device} in {seconds:.1f} s", flush=True)
+    if json is not None:
+        write_json(json, report(results, device, seconds))
+    return FAILED if failed else 0
+
+
+def warmup_command(device: str = "cpu", model: ModelName | None = None) -> int:
+    """Compile all kernels that training and evaluation with the presets need.
+
+    Args:
+        device: Where they are to run: cpu, cuda, cuda:1, ...
+        model: That will be trained; by default that of the presets.
+    """
+    from warpnerf.model.models import model_of
+    from warpnerf.training.warmup import warm_up
+
+    def shown(kernel: Warmed) -> None:
+        how = f"compiled in {kernel.seconds:.1f} s" if kernel.compiled else "in the cache"
+        print(f"{kernel.name}: {how}", flush=True)
+
+    start = time.perf_counter()
+    kernels = warm_up(device, shown, None if model is None else model_of(model))
+    compiled = sum(kernel.compiled for kernel in kernels)
+    seconds = time.perf_counter() - start
+    print(
+        f"{len(kernels)} kernels are ready, {compiled} of them compiled now, after {seconds:.1f} s"
+    )
+    return 0
+
+
+def require_writable(path: Path | None) -> None:
+    """Raise InputError where --json names a file in no folder."""
+    if path is not None and not path.parent.is_dir():
+        raise InputError(f"--json {path}: its folder does not exist; make it first.")
+
+
+def write_json(path: Path, text: str) -> None:
+    """Write what --json asks for, whole or not at all.
+
+    Raises:
+        InputError: It cannot be written.
+    """
+    from warpnerf.training.checkpoint import write_atomically
+
+    try:
+        write_atomically(path, text.encode())
+    except OSError as error:
+        raise InputError(f"--json {path} cannot be written: {error.strerror}.") from error

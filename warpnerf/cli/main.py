@@ -1,0 +1,371 @@
+"""The command: reads the line, calls the package, prints."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import logging
+import re
+import sys
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from warpnerf import __version__
+from warpnerf.checks import InputError
+from warpnerf.cli.demo import demo_command
+from warpnerf.cli.inspect import inspect_command
+from warpnerf.cli.machine import (
+    check_command,
+    require_writable,
+    warmup_command,
+    write_json,
+)
+from warpnerf.cli.progress import ProgressBar
+from warpnerf.cli.render import render_command
+from warpnerf.config import PRESETS, ModelName, Scaling, TrainConfig
+from warpnerf.model.models import configured
+from warpnerf.runtime.signals import Stopped, StopRequest, raise_when_asked
+
+if TYPE_CHECKING:
+    from warpnerf.scenes.scene import Scene
+    from warpnerf.training.run import Run
+    from warpnerf.training.state import Progress
+    from warpnerf.training.trainer import Trainer
+
+FAILED = 1
+BAD_INPUT = 2
+
+OUT_OF_MEMORY = re.compile("failed to allocate|can't start new thread", re.IGNORECASE)
+"""What Warp and the standard library say in a RuntimeError where a MemoryError is meant."""
+
+
+def train_command(
+    scene: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[SCENE]")] = None,
+    /,
+    output: Path | None = None,
+    resume: Path | None = None,
+    preset: Literal["fast", "quality"] | None = None,
+    model: ModelName | None = None,
+    model_options: tuple[str, ...] = (),
+    steps: int | None = None,
+    time_limit: float | None = None,
+    scaling: Scaling | None = None,
+    content_distance: float | Literal["auto"] | None = None,
+    voxels: int | None = None,
+    near: float | None = None,
+    downscale: int | None = None,
+    device: str | None = None,
+    threads: int | None = None,
+    seed: int | None = None,
+    checkpoint_every: float | None = None,
+    overwrite: bool = False,
+) -> int:
+    """Train a voxel grid on a scene, and look at its test views.
+
+    Args:
+        scene: Folder with transforms.json or transforms_train.json; builtin:room or
+            builtin:room-sparse.
+        output: Folder for the configuration, the field, the log, the figures and the pictures.
+        resume: Go on with the run in this folder, as it was begun; scene only if it has moved.
+        preset: Starting point, by default fast; the options below replace its values.
+        model: What the grid holds: deferred (features and a small MLP for each ray, by default),
+            features (DVGO's: an MLP for each sample), sh (spherical harmonics), or rgb (colour
+            that is the same from all sides).
+        model_options: Of the model, such as specular=8 width=64 (deferred), features=12
+            residual=false threshold=0.0001 (features), degree=2 (sh).
+        steps: Batches of rays to train on.
+        time_limit: Seconds of training; the schedule is squeezed to fit.
+        scaling: How a sample's gradient depends on its distance from the camera.
+        content_distance: Where gradients reach full strength, in the scene's units.
+        voxels: Nodes of the final grid, in all; memory goes with their number.
+        near: Nothing is sampled nearer to the camera than this, in the scene's units.
+        downscale: Average blocks of so many pixels squared; by default 1, as they are.
+        device: cpu, cuda, cuda:1, ...
+        threads: CPU threads; by default one per usable core, or as the resumed run had.
+        seed: Same seed and threads: same result on the CPU.
+        checkpoint_every: Seconds between two checkpoints to resume from; by default 300.
+        overwrite: Replace the run that the output folder holds.
+    """
+    chosen: dict[str, Any] = {
+        "steps": steps,
+        "time_limit": time_limit,
+        "scaling": scaling,
+        "content_distance": content_distance,
+        "device": device,
+        "threads": threads,
+        "seed": seed,
+        "checkpoint_every": checkpoint_every,
+    }
+    given = {name: value for name, value in chosen.items() if value is not None}
+
+    def changed(config: TrainConfig) -> TrainConfig:
+        config = dataclasses.replace(config, **given)
+        if model is not None or model_options:
+            chosen_model = configured(model or config.model.name, model_options)
+            config = dataclasses.replace(config, model=chosen_model)
+        if voxels is not None:
+            grid = dataclasses.replace(config.grid, voxels=voxels)
+            config = dataclasses.replace(config, grid=grid)
+        if near is not None:
+            march = dataclasses.replace(config.march, near=near)
+            config = dataclasses.replace(config, march=march)
+        return config
+
+    if resume is not None:
+        fixed = {"output": output, "preset": preset, "downscale": downscale, "overwrite": overwrite}
+        for name, value in fixed.items():
+            if value is not None and value is not False:
+                raise InputError(
+                    f"--{name} does not go with --resume: the run in {resume} goes on as it was "
+                    "begun; leave it out."
+                )
+        return _resume(resume, scene, changed)
+    if scene is None or output is None:
+        raise InputError(
+            "train wants a SCENE and --output DIR for a new run, or --resume DIR to go on with one."
+        )
+    config = changed(PRESETS[preset or "fast"])
+    return _begin(scene, output, 1 if downscale is None else downscale, config, overwrite)
+
+
+def eval_command(
+    folder: tyro.conf.Positional[Path],
+    /,
+    scene: str | None = None,
+    split: Literal["test", "train", "val", "all"] = "test",
+    lpips: Path | None = None,
+    json: Path | None = None,
+    device: str = "cpu",
+    threads: int | None = None,
+) -> int:
+    """Measure a trained run on a split of its scene, or of other photographs of the same place.
+
+    Args:
+        folder: Output folder of a training run.
+        scene: Other photographs in the same coordinates, reduced as those of the training were.
+        split: Which views.
+        lpips: Weights of LPIPS, to measure it as well; see warpnerf/lpips.py for the file.
+        json: Also write the figures to this file.
+        device: cpu, cuda, cuda:1, ...
+        threads: CPU threads; by default one per usable core.
+    """
+    from warpnerf.evaluation.evaluate import evaluate, require_measurable
+    from warpnerf.scenes.load import load_scene
+    from warpnerf.training.run import Run
+
+    require_writable(json)
+    distance = None
+    if lpips is not None:
+        from warpnerf.evaluation.lpips import Lpips
+
+        distance = Lpips(lpips)
+    run = Run(folder)
+    config = run.read_config()
+    field, notes = run.load_field(device, threads)
+    for note in notes:
+        print(f"warpnerf: note: {note}", file=sys.stderr)
+    views = load_scene(scene or config.scene, downscale=config.downscale)
+    require_measurable(views, split)
+    result = evaluate(field, views, split, lpips=distance)
+    print(result)
+    if json is not None:
+        write_json(json, result.to_json())
+    return 0
+
+
+def _begin(source: str, output: Path, downscale: int, config: TrainConfig, overwrite: bool) -> int:
+    """Train from the first step on."""
+    from warpnerf.scenes.files import exists
+
+    if exists(output):
+        from warpnerf.training.run import Run
+
+        Run.require_free(output, overwrite)
+    scene = _read(source, downscale)
+
+    # Not before: these load Warp, and bad input is refused at once.
+    from warpnerf.training.run import Run
+    from warpnerf.training.trainer import Trainer
+
+    trainer = Trainer(scene, config)
+    _describe(scene, trainer.content_distance, config)
+    run = Run(output)
+    run.create(scene, _absolute(source), downscale, trainer.content_distance, config)
+    return _train(run, scene, trainer)
+
+
+def _resume(folder: Path, moved: str | None, changed: Callable[[TrainConfig], TrainConfig]) -> int:
+    """Train from the last checkpoint on."""
+    from warpnerf.training.run import Run
+    from warpnerf.training.trainer import Trainer
+
+    run = Run(folder)
+    begun = run.read_config()
+    state, notes = run.load_state()
+    config = changed(state.config)
+    state.require_same_config(config)
+    scene = _read(moved or begun.scene, begun.downscale)
+    trainer = Trainer(scene, config, state)
+    _describe(scene, trainer.content_distance, config)
+    for note in notes:
+        print(f"  note: {note}")
+    for name in ("device", "threads"):
+        old, new = getattr(state.config, name), getattr(config, name)
+        if new != old:
+            print(f"  note: {name} {new} instead of {old}: sums are rounded in another order")
+    print(f"  going on after step {trainer.steps_done}")
+    run.rewind_log(trainer.steps_done)
+    del state  # the trainer has copies
+    return _train(run, scene, trainer)
+
+
+def _read(source: str, downscale: int) -> Scene:
+    from warpnerf.evaluation.evaluate import require_measurable
+    from warpnerf.scenes.load import load_scene
+
+    print(f"reading {source}", flush=True)
+    scene = load_scene(source, downscale=downscale)
+    require_measurable(scene, _split_to_look_at(scene))
+    return scene
+
+
+def _split_to_look_at(scene: Scene) -> str:
+    return "test" if scene.splits.get("test") else "train"
+
+
+def _train(run: Run, scene: Scene, trainer: Trainer) -> int:
+    """Train to the end, or until asked to stop; look at the test views."""
+    with StopRequest() as stop:
+        try:
+            with ProgressBar("first step") as bar:
+
+                def on_progress(progress: Progress) -> None:
+                    run.log(progress)
+                    bar.report(progress.fraction, _text(progress))
+
+                trainer.run(on_progress, run.save_checkpoint, lambda: stop.asked)
+        except FloatingPointError as error:
+            kept = "Nothing was saved before."
+            if run.last_step is not None:
+                kept = f"Step {run.last_step} is saved: warpnerf eval {run.folder} looks at it."
+            print(f"warpnerf: error: {error} {kept}", file=sys.stderr)
+            return FAILED
+        except Stopped as stopped:  # asked a second time
+            print(f"stopped; {run.way_on()}", flush=True)
+            return stopped.exit_code
+        if trainer.fraction >= 1.0:
+            run.save_field(trainer.field())
+    if stop.exit_code is not None:
+        step = trainer.steps_done
+        saved = f"stopped and saved after step {step}; go on with: {run.resume_command}"
+        print(saved if run.last_step == step else f"stopped; {run.way_on()}", flush=True)
+        return stop.exit_code
+    split = _split_to_look_at(scene)
+    print(f"rendering the {'test' if split == 'test' else 'training'} views", flush=True)
+    try:
+        print(run.evaluate(trainer.field(), scene, split))
+    except Stopped as stopped:
+        print(f"stopped; the field is saved. Go on with: {run.resume_command}", flush=True)
+        return stopped.exit_code
+    print(
+        f"wrote {run.folder}: field.safetensors, metrics.json, log.jsonl, config.json, and test/ "
+        f"with truth, rendering and depth of every view\nlook at {run.sheet}",
+    )
+    return 0
+
+
+def _describe(scene: Scene, content_distance: float, config: TrainConfig) -> None:
+    """What was understood of a scene."""
+    train, test = len(scene.splits["train"]), len(scene.splits["test"])
+    sizes = sorted({(c.width, c.height) for c in scene.cameras})
+    shown = ", ".join(f"{w} x {h}" for w, h in sizes[:3]) + (", ..." if len(sizes) > 3 else "")
+    extent = scene.box_max - scene.box_min
+    print(f"{scene.name}: {train} training and {test} test views, {shown} pixels")
+    for warning in scene.warnings:
+        print(f"  warning: {warning}")
+    for note in scene.notes:
+        print(f"  note: {note}")
+    print(f"  content distance {content_distance:.4g} scene units, scaling {config.scaling}")
+    print(
+        f"  box {extent[0]:.4g} x {extent[1]:.4g} x {extent[2]:.4g} scene units, "
+        + ("space outside folded in" if scene.unbounded else "nothing outside"),
+        flush=True,
+    )
+
+
+def _absolute(source: str) -> str:
+    return source if source.startswith("builtin:") else str(Path(source).resolve())
+
+
+class _Printer(logging.Handler):
+    """Prints what modules below have to say."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        print(record.getMessage(), flush=True)
+
+
+def _text(progress: Progress) -> str:
+    speed = progress.step / max(progress.seconds, 1e-6)
+    size = " x ".join(str(n) for n in progress.size)
+    return (
+        f"step {progress.step}  loss {progress.loss:.5f}  PSNR {progress.psnr:.2f}  "
+        f"grid {size}  {speed:.1f} steps/s"
+    )
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command.
+
+    Returns:
+        0; 2 for bad input; 1 where training failed; 130 after Ctrl-C, 143 after SIGTERM.
+    """
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if arguments == ["--version"]:
+        print(f"warpnerf {__version__}")
+        return 0
+    raise_when_asked()
+    warnings.filterwarnings("ignore", module="PIL")  # what matters in an image is refused
+    logging.getLogger("PIL").setLevel(logging.CRITICAL)
+    own = logging.getLogger("warpnerf")
+    own.handlers, own.propagate = [_Printer()], False
+    own.setLevel(logging.INFO)
+    warnings.formatwarning = lambda message, *_: f"warpnerf: warning: {message}.\n"
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # file names may hold anything
+    try:
+        return tyro.extras.subcommand_cli_from_dict(
+            {
+                "demo": demo_command,
+                "inspect": inspect_command,
+                "train": train_command,
+                "eval": eval_command,
+                "render": render_command,
+                "check": check_command,
+                "warmup": warmup_command,
+            },
+            prog="warpnerf",
+            description="Voxel-grid radiance fields from posed photographs, without floaters.",
+            args=arguments,
+        )
+    except InputError as error:
+        print(f"warpnerf: error: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except (MemoryError, RuntimeError) as error:
+        if not isinstance(error, MemoryError) and not OUT_OF_MEMORY.search(str(error)):
+            raise
+        why = f" ({error})" if str(error) else ""
+        print(
+            f"warpnerf: error: out of memory{why}; use fewer --voxels, or a larger --downscale.",
+            file=sys.stderr,
+        )
+        return BAD_INPUT
+    except (OSError, FloatingPointError) as error:
+        print(f"warpnerf: error: {error}", file=sys.stderr)
+        return FAILED
+    except Stopped as stopped:
+        print("stopped", file=sys.stderr)
+        return stopped.exit_code

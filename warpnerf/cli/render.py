@@ -1,0 +1,149 @@
+"""`warpnerf render`: a trained scene as a video, or as pictures of a split."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from warpnerf.checks import InputError, require_positive
+from warpnerf.cli.progress import ProgressBar
+
+if TYPE_CHECKING:
+    from warpnerf.scenes.camera import Camera
+    from warpnerf.scenes.scene import Scene
+
+MAX_FRAMES = 100_000
+"""An hour at 25 frames per second, and a little more."""
+
+
+def render_command(
+    folder: tyro.conf.Positional[Path],
+    /,
+    path: Literal["auto", "orbit", "through", "back"] = "auto",
+    stills: Literal["test", "train", "val", "all"] | None = None,
+    output: Path | None = None,
+    size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="WIDTH HEIGHT")] = None,
+    fps: float = 30.0,
+    seconds: float = 8.0,
+    distance: float | None = None,
+    depths: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="NEAR FAR")] = None,
+    scene: str | None = None,
+    device: str = "cpu",
+    threads: int | None = None,
+) -> int:
+    """Render a trained run: colour and depth side by side, along a path, or a split's views.
+
+    Args:
+        folder: Output folder of a training run.
+        path: orbit: around what the cameras look at. through: through the training cameras.
+            back: the same, backing away from them, where floaters show. auto: orbit where the
+            cameras look at one thing, else through.
+        stills: Render the views of this split as PNG pictures instead of a video.
+        output: FILE.mp4, FILE.gif, or a new folder for PNG frames; for stills a folder. By default
+            PATH.mp4 (video.mp4 for auto) or stills/ in the run's folder.
+        size: Of the colour picture, pixels; by default as the photographs.
+        fps: Frames per second.
+        seconds: Length of the video.
+        distance: How far `back` backs away, scene units; by default half the content distance.
+        depths: What gets the first and the last colour, scene units; by default what is seen.
+        scene: Where the run's photographs are now, if they have moved.
+        device: cpu, cuda, cuda:1, ...
+        threads: CPU threads; by default one per usable core.
+    """
+    from warpnerf.media.filming import checked_depths, depth_range, render_stills, render_video
+    from warpnerf.media.video import video_file
+    from warpnerf.scenes.load import load_scene
+    from warpnerf.training.run import Run
+
+    if depths is not None:
+        checked_depths(depths)
+    if distance is not None and (stills is not None or path != "back"):
+        raise InputError("--distance is how far --path back backs away; give both or neither.")
+    if stills is not None and path != "auto":
+        raise InputError("--stills renders the views of a split, along no path; give one of them.")
+    run = Run(folder)
+    config = run.read_config()
+    if stills is None:
+        name = "video" if path == "auto" else path
+        target, note = video_file(output or folder / f"{name}.mp4", fps)
+        if note:
+            print(note, flush=True)
+    else:
+        target = output or folder / "stills"
+        _require_folder(target)
+    field, notes = run.load_field(device, threads)
+    for note in notes:
+        print(f"warpnerf: note: {note}", file=sys.stderr)
+    views = load_scene(scene or config.scene, downscale=config.downscale)
+
+    cameras: list[Camera]
+    if stills is None:
+        from warpnerf.media.camera_path import camera_path, natural_path
+
+        kind = natural_path(views) if path == "auto" else path
+        n_frames = _n_frames(fps, seconds)
+        cameras = camera_path(views, kind, n_frames, size=size, distance=distance)
+        what = f"{n_frames} frames, path {kind!r}"
+    else:
+        named = _still_cameras(views, stills, size)
+        cameras = list(named.values())
+        what = f"{len(cameras)} views"
+    width, height = cameras[0].width, cameras[0].height
+    shown = depths or depth_range(field, cameras)
+    print(
+        f"rendering {what}, colour and depth of {width} x {height} pixels each, "
+        f"depth from {shown[0]:g} yellow to {shown[1]:g} blue, scene units",
+        flush=True,
+    )
+    with ProgressBar("first frame") as bar:
+
+        def on_frame(done: int) -> None:
+            bar.report(done / len(cameras), f"frame {done} of {len(cameras)}")
+
+        try:
+            if stills is None:
+                render_video(field, cameras, target, fps=fps, depths=shown, on_frame=on_frame)
+            else:
+                render_stills(field, named, target, depths=shown, on_frame=on_frame)
+        except OSError as error:
+            raise InputError(
+                f"--output {target} cannot be written: {error.strerror or error}; name another "
+                "place, or make room."
+            ) from error
+    print(f"wrote {target}")
+    return 0
+
+
+def _n_frames(fps: float, seconds: float) -> int:
+    require_positive("--seconds", seconds)
+    n_frames = max(1, round(fps * seconds))
+    if n_frames > MAX_FRAMES:
+        raise InputError(
+            f"--seconds {seconds:g} at --fps {fps:g} are {n_frames} frames, more than "
+            f"{MAX_FRAMES}; make the video shorter."
+        )
+    return n_frames
+
+
+def _still_cameras(scene: Scene, split: str, size: tuple[int, int] | None) -> dict[str, Camera]:
+    """The cameras of a split's views by the file names of their pictures."""
+    from warpnerf.media.camera_path import path_lens
+    from warpnerf.media.pictures import picture_files
+    from warpnerf.scenes.scene import require_split
+
+    views = [scene.views[index] for index in require_split(scene, split)]
+    files = picture_files([view.name for view in views])
+    return {
+        files[view.name]: view.camera if size is None else path_lens([view.camera], size)
+        for view in views
+    }
+
+
+def _require_folder(folder: Path) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"--output {folder} is a file; stills go into a folder.")
+    if not folder.parent.is_dir():
+        raise InputError(f"--output {folder}: the folder above does not exist; make it first.")

@@ -1,0 +1,163 @@
+"""Looking at a field through a scene's cameras and measuring how well it does."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from warpnerf.checks import InputError
+from warpnerf.evaluation.metrics import SSIM_WINDOW, flip, has_flip, psnr, ssim
+from warpnerf.evaluation.near_field import Nearness, measure_nearness
+from warpnerf.runtime.terminal import table_text
+from warpnerf.scenes.scene import Scene, View, require_split
+
+if TYPE_CHECKING:
+    from warpnerf.rendering.field import Field, Rendering
+
+
+Distance = Callable[[np.ndarray, np.ndarray], float]
+"""Of a rendering and a photograph, both [H, W, 3] in [0, 1]."""
+
+HEADINGS = {
+    "psnr": ("PSNR", ".2f"),
+    "ssim": ("SSIM", ".4f"),
+    "flip": ("FLIP", ".4f"),
+    "lpips": ("LPIPS", ".4f"),
+    "depth_error": ("depth error", ".4f"),
+}
+"""Heading and format of each figure in a table."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageMetrics:
+    """One view's figures."""
+
+    name: str
+    """The view's."""
+    psnr: float
+    """dB."""
+    ssim: float
+    """At most 1."""
+    flip: float | None = None
+    """0 for equal images, at most 1; where the package flip-evaluator is installed."""
+    lpips: float | None = None
+    """0 for equal images; where its weights were given."""
+    depth_error: float | None = None
+    """Mean |depth - true depth|, scene units, over the pixels whose true depth is known."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """The figures of all views of a split, and those of the space before the training cameras."""
+
+    images: tuple[ImageMetrics, ...]
+    """In the scene's order."""
+    nearness: Nearness
+    """Of floaters."""
+
+    @property
+    def mean(self) -> dict[str, float]:
+        """Means over the images that have a figure, by name."""
+        means = {}
+        for name in HEADINGS:
+            values = [getattr(image, name) for image in self.images]
+            known = [value for value in values if value is not None]
+            if known:
+                means[name] = float(np.mean(known))
+        return means
+
+    def to_json(self) -> str:
+        """{"mean": {"psnr": ..., ...}, "floaters": {...}, "images": [{"name": ..., ...}, ...]}."""
+        images = [
+            {key: value for key, value in vars(image).items() if value is not None}
+            for image in self.images
+        ]
+        content = {"mean": self.mean, "floaters": self.nearness.to_dict(), "images": images}
+        return json.dumps(content, indent=2) + "\n"
+
+    def __str__(self) -> str:
+        """A table, the means last, and what is known of floaters."""
+        mean = self.mean
+
+        def cells(name: str, figures: Callable[[str], float | None]) -> list[str]:
+            values = ((figures(key), HEADINGS[key][1]) for key in mean)
+            return [name, *("" if value is None else format(value, how) for value, how in values)]
+
+        rows = [cells(image.name, partial(getattr, image)) for image in self.images]
+        rows.append(cells("mean", mean.get))
+        table = table_text(["image", *(HEADINGS[key][0] for key in mean)], rows)
+        return f"{table}\n{self.nearness}"
+
+
+def evaluate(
+    field: Field,
+    scene: Scene,
+    split: str = "test",
+    on_image: Callable[[View, np.ndarray, Rendering], None] | None = None,
+    lpips: Distance | None = None,
+) -> Evaluation:
+    """Render a split's views and hold them against the photographs.
+
+    Args:
+        field: A trained scene.
+        scene: Photographs in the field's coordinates.
+        split: train, val, test, or all.
+        on_image: Called with each view, its truth [H, W, 3] in [0, 1] over the field's background,
+            and its rendering.
+        lpips: A ``warpnerf.lpips.Lpips``, if LPIPS is wanted.
+
+    Raises:
+        InputError: The scene has no such split.
+    """
+    images = []
+    for index in require_split(scene, split):
+        view = scene.views[index]
+        rendering = field.render(view.camera)
+        target = truth(view, field.background)
+        rgb = np.clip(rendering.rgb, 0.0, 1.0)
+        depth_error = None
+        if view.depth is not None:
+            error = np.abs(rendering.depth - view.depth)
+            depth_error = float(np.mean(error[np.isfinite(view.depth)]))
+        images.append(
+            ImageMetrics(
+                name=view.name,
+                psnr=psnr(rgb, target),
+                ssim=ssim(rgb, target),
+                flip=flip(rgb, target) if has_flip() else None,
+                lpips=None if lpips is None else lpips(rgb, target),
+                depth_error=depth_error,
+            )
+        )
+        if on_image is not None:
+            on_image(view, target, rendering)
+    return Evaluation(images=tuple(images), nearness=measure_nearness(field, scene))
+
+
+def require_measurable(scene: Scene, split: str) -> None:
+    """Raise InputError unless a split's views are large enough to be measured: SSIM sets the least.
+
+    Raises:
+        InputError: The split is missing, or an image is too small.
+    """
+    for index in require_split(scene, split):
+        camera = scene.views[index].camera
+        if min(camera.width, camera.height) < SSIM_WINDOW:
+            raise InputError(
+                f"{scene.views[index].name} is {camera.width} x {camera.height} pixels, but SSIM "
+                f"needs {SSIM_WINDOW} x {SSIM_WINDOW}; use larger images, or a smaller --downscale."
+            )
+
+
+def truth(view: View, background: tuple[float, float, float]) -> np.ndarray:
+    """A view's photograph over a background, [H, W, 3] float64 in [0, 1]."""
+    image = view.image.astype(np.float64) / 255.0
+    if image.shape[2] == 3:
+        return image
+    alpha = image[..., 3:]
+    return alpha * image[..., :3] + (1.0 - alpha) * np.array(background)

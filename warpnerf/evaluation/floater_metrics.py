@@ -1,0 +1,53 @@
+"""Floaters, measured against a truth that is known: density where there can be none.
+
+``first_hit`` stands for that truth: origins [n, 3] and unit directions [n, 3] to the distance of
+the first surface along each ray, [n], scene units; as in ``warpnerf.scenes.builtin.room``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from warpnerf.rendering.field import Field
+from warpnerf.scenes.camera import Camera
+
+N_DIRECTIONS = 2000
+"""Rays around a camera."""
+
+FirstHit = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+def clearance(camera: Camera, first_hit: FirstHit) -> float:
+    """The distance from a camera to the nearest surface in any direction, scene units."""
+    directions = directions_around(N_DIRECTIONS)
+    return float(first_hit(np.broadcast_to(camera.position, directions.shape), directions).min())
+
+
+def near_density(field: Field, cameras: Sequence[Camera], first_hit: FirstHit) -> float:
+    """Mean optical depth from a camera to its clearance, in all directions; its true value is 0.
+
+    Args:
+        field: What to measure.
+        cameras: Around which; the training cameras, where floaters are.
+        first_hit: See the module.
+    """
+    directions = directions_around(N_DIRECTIONS)
+    depths = []
+    for camera in cameras:
+        origins = np.broadcast_to(camera.position, directions.shape)
+        steps = replace(field.steps, far=clearance(camera, first_hit), transmittance_min=0.0)
+        seen = replace(field, steps=steps).render_rays(origins, directions)
+        depths.append(float(-np.log(np.maximum(1.0 - seen.opacity, 1e-6)).mean()))
+    return float(np.mean(depths))
+
+
+def directions_around(n: int) -> np.ndarray:
+    """Evenly spread unit vectors, [n, 3]: Fibonacci's spiral."""
+    k = np.arange(n) + 0.5
+    z = 1.0 - 2.0 * k / n
+    angle = np.pi * (1.0 + 5.0**0.5) * k
+    radius = np.sqrt(1.0 - z * z)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)

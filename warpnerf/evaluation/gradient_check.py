@@ -1,0 +1,360 @@
+"""Small rendering problems in plain numbers, put to the kernels in either precision and form."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import warp as wp
+from warpnerf_kernels.base import precision, tiles
+
+from warpnerf.config import Contraction, Scaling
+from warpnerf.model.grid import box_struct, density_struct, free_struct, grid_struct
+from warpnerf.model.models import Model, Rgb, n_weights
+from warpnerf.rendering.adjoint import AdjointLaunch, gradient_struct, n_tiles
+from warpnerf.rendering.rays import rays_struct
+from warpnerf.rendering.render import (
+    KEPT_PACKS,
+    Steps,
+    scene_struct,
+    scratch_struct,
+    seen_struct,
+    variant_of,
+)
+from warpnerf.runtime.parallel import Workers
+
+DENSITY_SHIFT = 0.3
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Trial:
+    """Rays through a grid, and a loss: the product of what they see with the slopes below."""
+
+    raw: np.ndarray
+    """[X, Y, Z, n_floats] raw density, raw features, padding."""
+    origins: np.ndarray
+    """[n_rays, 3] scene units; the box is [-1, 1.2] x [-0.8, 0.9] x [-1.1, 1]."""
+    directions: np.ndarray
+    """[n_rays, 3] unit vectors."""
+    background: np.ndarray
+    """[n_rays, 3] in [0, 1]."""
+    target: np.ndarray
+    """[n_rays, 3] in [0, 1], for the training launch, which has its own loss."""
+    rgb_slope: np.ndarray
+    """[n_rays, 3] dL/drgb."""
+    opacity_slope: np.ndarray
+    """[n_rays] dL/dopacity."""
+    depth_slope: np.ndarray
+    """[n_rays] dL/ddepth."""
+    steps: Steps
+    """How rays are marched."""
+    offsets: np.ndarray
+    """[n_rays] in [0, 1): where in its step a sample sits."""
+    content_distance: np.ndarray
+    """[n_rays] scene units."""
+    free: np.ndarray = field(default_factory=lambda: np.zeros((1, 1, 1), np.uint8))
+    """[MX, MY, MZ] cells to the nearest occupied one."""
+    contraction: Contraction = "none"
+    """How space outside the box is folded in."""
+    border: float = 0.0
+    """Width of the shell that holds it, in half edges of the box."""
+    density_scale: float = 1.0
+    """1 / scene unit."""
+    model: Model = field(default_factory=Rgb)
+    """What raw values mean."""
+    weights: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    """[n_weights] of the model's MLP."""
+
+    @property
+    def n_rays(self) -> int:
+        """How many rays there are."""
+        return len(self.origins)
+
+    def rounded(self) -> Trial:
+        """The same in numbers that float32 holds, so that only arithmetic can differ."""
+        exact = {f.name: getattr(self, f.name) for f in fields(self)}
+        exact |= {
+            name: value.astype(np.float32).astype(np.float64)
+            for name, value in exact.items()
+            if isinstance(value, np.ndarray) and value.dtype == np.float64
+        }
+        return Trial(**exact)
+
+
+BOX_MIN, BOX_MAX = np.array([-1.0, -0.8, -1.1]), np.array([1.2, 0.9, 1.0])
+
+
+def make_trial(seed: int, n_rays: int = 24, size: tuple[int, int, int] = (7, 8, 6)) -> Trial:
+    """Random rays, half of them from inside the box, through a random grid."""
+    rng = np.random.default_rng(seed)
+
+    def unit(vectors: np.ndarray) -> np.ndarray:
+        return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+    origins = 2.0 * unit(rng.normal(size=(n_rays, 3)))
+    origins[::2] *= 0.2
+    return Trial(
+        raw=rng.normal(size=(*size, 4)),
+        origins=origins,
+        directions=unit(0.5 * rng.normal(size=(n_rays, 3)) - origins),
+        background=rng.uniform(size=(n_rays, 3)),
+        target=rng.uniform(size=(n_rays, 3)),
+        rgb_slope=rng.normal(size=(n_rays, 3)),
+        opacity_slope=rng.normal(size=n_rays),
+        depth_slope=rng.normal(size=n_rays),
+        steps=Steps(near=0.07, far=2.9, step=0.11),
+        offsets=rng.uniform(size=n_rays),
+        content_distance=rng.uniform(0.5, 3.0, size=n_rays),
+    )
+
+
+def stopping_early(trial: Trial) -> Trial:
+    """The same through denser matter, with rays that end where little light is left."""
+    steps = replace(trial.steps, transmittance_min=0.2)
+    return replace(trial, density_scale=2.5, steps=steps)
+
+
+def partly_free(trial: Trial) -> Trial:
+    """The same where half of 3 x 4 x 5 cells are free."""
+    occupied = np.random.default_rng(7).uniform(size=(3, 4, 5)) < 0.5
+    return replace(trial, free=np.where(occupied, 0, 1).astype(np.uint8))
+
+
+def folded(trial: Trial, contraction: Contraction = "linf") -> Trial:
+    """The same in folded space, with steps that grow outside the box."""
+    steps = replace(trial.steps, far=40.0, n_linear=12, growth=0.09)
+    return replace(trial, contraction=contraction, border=0.2, steps=steps)
+
+
+def of_model(trial: Trial, model: Model) -> Trial:
+    """The same rays through a random grid and MLP of another model."""
+    rng = np.random.default_rng(11)
+    return replace(
+        trial,
+        raw=rng.normal(size=(*trial.raw.shape[:3], model.n_floats)),
+        model=model,
+        weights=rng.normal(size=n_weights(model)) * 0.4,
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Found:
+    """A gradient."""
+
+    values: np.ndarray
+    """[X, Y, Z, n_floats] of the raw values."""
+    weights: np.ndarray
+    """[n_weights] of the MLP's."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Seen:
+    """What the rays of a trial see."""
+
+    rgb: np.ndarray
+    """[n_rays, 3] in [0, 1], with background."""
+    opacity: np.ndarray
+    """[n_rays] in [0, 1]."""
+    depth: np.ndarray
+    """[n_rays] scene units."""
+    n_samples: np.ndarray
+    """[n_rays] visited steps."""
+
+    def loss(self, trial: Trial) -> float:
+        """The trial's loss."""
+        return float(
+            np.vdot(trial.rgb_slope, self.rgb)
+            + np.vdot(trial.opacity_slope, self.opacity)
+            + np.vdot(trial.depth_slope, self.depth)
+        )
+
+
+class TrialKernels:
+    """The kernels in one precision and form, on one device."""
+
+    def __init__(self, name: str, workers: Workers, packed: bool = False) -> None:
+        """Choose them.
+
+        Args:
+            name: float32 or float64.
+            workers: Where to work.
+            packed: Sixteen samples at a time; in float32 on the CPU.
+        """
+        self._workers = workers
+        self._packed = packed
+        self._dtype = np.dtype(name).type
+        self._name = name
+        self._load = partial(precision.load, name)
+        self._types = self._load("base.types")
+        self._assembly = self._load("launch.assembly")
+
+    def see(self, trial: Trial) -> Seen:
+        """The forward launch."""
+        seen = self._forward(trial)
+        return Seen(
+            rgb=seen.rgb.numpy(),
+            opacity=1.0 - seen.transmittance.numpy(),
+            depth=seen.depth.numpy(),
+            n_samples=seen.n_samples.numpy(),
+        )
+
+    def gradient(self, trial: Trial, scaling: Scaling = "none") -> Found:
+        """The backward launch: the gradient of the trial's loss."""
+        variant = self._variant(trial, scaling)
+        launch = self._adjoint(trial, self._assembly.render_backward_kernel(variant), variant)
+        gradient = self._no_gradient(trial, launch.workers)
+        launch.run(
+            trial.n_rays,
+            gradient,
+            self._scene(trial, launch.workers),
+            self._rays(trial),
+            self._forward(trial),
+            self._array(trial.rgb_slope, self._types.vec3),
+            self._array(trial.opacity_slope),
+            self._array(trial.depth_slope),
+            # nothing is kept between launches
+            scratch_struct(variant, 1, launch.workers, self._assembly),
+        )
+        return _found(gradient, trial)
+
+    def train(self, trial: Trial, scaling: Scaling = "none") -> tuple[np.ndarray, Found]:
+        """The training launch: squared errors [n_rays], the gradient of their mean."""
+        error, n_samples = self._zeros(trial.n_rays), self._zeros(trial.n_rays, wp.int32)
+        variant = self._variant(trial, scaling)
+        launch = self._adjoint(trial, self._assembly.render_train_kernel(variant), variant)
+        gradient = self._no_gradient(trial, launch.workers)
+        launch.run(
+            trial.n_rays,
+            gradient,
+            self._scene(trial, launch.workers),
+            self._rays(trial),
+            self._array(trial.target, self._types.vec3),
+            1.0 / trial.n_rays,
+            scratch_struct(variant, KEPT_PACKS, launch.workers, self._assembly),
+            error,
+            n_samples,
+        )
+        return error.numpy(), _found(gradient, trial)
+
+    def gather(self, values: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Values [X, Y, Z, n] at points [m, 3] in folded coordinates: [m, n]."""
+        n_floats = values.shape[3]
+        out = self._zeros(len(points), self._types.vector(n_floats))
+        self._workers.launch(
+            self._load("launch.probe").probe(n_floats).read_forward,
+            len(points),
+            self._grid(values, 0.0),
+            self._array(points, self._types.vec3),
+            out,
+        )
+        return out.numpy().astype(np.float64)
+
+    def scatter(self, trial: Trial, points: np.ndarray, out: np.ndarray) -> np.ndarray:
+        """The transpose of ``gather``, which hands [m, n] to the trial's nodes: [X, Y, Z, n]."""
+        workers = self._workers if self._workers.device.is_cuda else Workers("cpu", 1)
+        gradient = self._no_gradient(trial, workers)
+        n_floats = trial.model.n_floats
+        workers.launch(
+            self._load("launch.probe").probe(n_floats).read_backward,
+            len(points),
+            self._grid(trial.raw, 0.0),
+            self._array(points, self._types.vec3),
+            self._array(out, self._types.vector(n_floats)),
+            gradient,
+        )
+        return _found(gradient, trial).values
+
+    def _forward(self, trial: Trial) -> Any:
+        variant = self._variant(trial, "none")
+        seen = seen_struct(variant, trial.n_rays, self._workers, self._assembly)
+        self._workers.launch_owned(
+            self._assembly.render_forward_kernel(variant),
+            -(-trial.n_rays // variant.batch),
+            trial.n_rays,
+            self._scene(trial, self._workers),
+            self._rays(trial),
+            scratch_struct(variant, 1, self._workers, self._assembly),
+            seen,
+        )
+        return seen
+
+    def _variant(self, trial: Trial, scaling: Scaling) -> Any:
+        return variant_of(
+            trial.model, self._name, trial.contraction, scaling, "none", packed=self._packed
+        )
+
+    def _grid(self, values: np.ndarray, border: float) -> Any:
+        x, y, z, n_floats = values.shape
+        node = self._types.vector(n_floats)
+        array = self._array(values.reshape(-1, n_floats), node)
+        return grid_struct(self._load("fields.dense"), array, (x, y, z), border)
+
+    def _scene(self, trial: Trial, workers: Workers) -> Any:
+        x, y, z = trial.free.shape
+        distance = wp.array(trial.free.ravel(), dtype=wp.uint8, device=self._workers.device)
+        return scene_struct(
+            trial.model,
+            self._name,
+            box=box_struct(self._types, BOX_MIN, BOX_MAX, trial.border),
+            free=free_struct(self._types, distance, (x, y, z), trial.border),
+            steps=trial.steps,
+            grid=self._grid(trial.raw, trial.border),
+            density=density_struct(self._types, DENSITY_SHIFT, trial.density_scale),
+            weights=self._array(trial.weights),
+            workers=workers,
+        )
+
+    def _rays(self, trial: Trial) -> Any:
+        return rays_struct(
+            self._assembly,
+            self._array(trial.origins, self._types.vec3),
+            self._array(trial.directions, self._types.vec3),
+            self._array(trial.offsets),
+            self._array(trial.background, self._types.vec3),
+            self._array(trial.content_distance),
+        )
+
+    def _no_gradient(self, trial: Trial, workers: Workers) -> Any:
+        """A kernel's Gradient of a trial's model, zero."""
+        n_nodes = math.prod(trial.raw.shape[:3])
+        return gradient_struct(
+            self._types,
+            self._zeros(n_nodes, self._types.vector(trial.model.n_floats)),
+            self._zeros(n_tiles(n_nodes), wp.uint8),
+            self._zeros((workers.count, len(trial.weights))),
+        )
+
+    def _adjoint(self, trial: Trial, kernel: wp.Kernel, variant: Any) -> AdjointLaunch:
+        length = float(np.linalg.norm(BOX_MAX - BOX_MIN))
+        return AdjointLaunch(
+            kernel,
+            variant,
+            trial.steps.most(math.inf if trial.contraction != "none" else length),
+            trial.n_rays,
+            self._workers,
+        )
+
+    def _array(self, values: np.ndarray, dtype: Any = None) -> wp.array:
+        dtype = dtype or self._types.real
+        values = np.ascontiguousarray(values, self._dtype)
+        return wp.array(values, dtype=dtype, device=self._workers.device)
+
+    def _zeros(self, shape: int | tuple[int, ...], dtype: Any = None) -> wp.array:
+        return wp.zeros(shape, dtype=dtype or self._types.real, device=self._workers.device)
+
+
+def _found(gradient: Any, trial: Trial) -> Found:
+    """What was added.
+
+    NaN in tiles that hold gradient and are not flagged: the optimiser would not see them.
+    """
+    found = gradient.values.numpy().astype(np.float64)
+    flags = np.pad(gradient.touched.numpy(), (1, 0)) != 0
+    tile = 1 + np.arange(len(found)) // tiles.TILE
+    seen = flags[tile] | flags[tile - 1]
+    found[found.any(axis=1) & ~seen] = np.nan
+    weights = gradient.weights.numpy().astype(np.float64).sum(axis=0)
+    return Found(values=found.reshape(trial.raw.shape), weights=weights)

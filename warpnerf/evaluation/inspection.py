@@ -1,0 +1,317 @@
+"""What was understood of a scene before anything is trained, what it will take, and what is odd."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warpnerf.checks import InputError, require_at_least, require_positive
+from warpnerf.config import PRESETS, TRAINING_BYTES, SceneKind, TrainConfig
+from warpnerf.model.models import Model
+from warpnerf.scenes.camera import Camera
+from warpnerf.scenes.load import load_scene
+from warpnerf.scenes.scene import Scene, find_focus, share_aimed_at, up_direction
+from warpnerf.scenes.survey import Survey, survey
+
+MIN_SHARE_AIMED = 0.5
+"""Share of cameras that aim at the focus, below which it is no common one."""
+
+FAR_OFF = 10.0
+"""A camera this many times the median distance away from the median place is likely a mistake."""
+
+SECONDS_PER_RAY, SECONDS_PER_SAMPLE, SECONDS_PER_NODE = 1.2e-6, 22e-9, 16e-9
+"""Of one core, in a step for what is visited and in an update for each node in use: measured on an
+AMD EPYC."""
+
+SAMPLES_AND_OCCUPIED: dict[SceneKind, tuple[int, float]] = {
+    "object": (12, 0.3),
+    "bounded": (50, 0.8),
+    "unbounded": (190, 0.6),
+}
+"""Samples per ray, and the share of nodes in use: means of lego, builtin:room-sparse and fox late
+in training with the preset fast."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cost:
+    """What training with a preset takes on the CPU."""
+
+    memory: int
+    """Bytes, of grid, optimiser, gradients and photographs; a run needs some more."""
+    seconds: float
+    """Within a factor of two or three: machines and scenes differ."""
+    threads: int
+    """For so many threads."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Inspection:
+    """What was understood of a scene, and what is odd about it."""
+
+    scene: Scene
+    """As it was loaded."""
+    format: str
+    """Of its files."""
+    content_distance: float
+    """In use: the scene's estimate, or the one that was given; scene units."""
+    up: np.ndarray
+    """[3] unit vector, estimated from the cameras."""
+    focus: np.ndarray | None
+    """[3] the point that the training cameras look at, scene units; None where there is none."""
+    oddities: tuple[str, ...]
+    """What may be a mistake, a sentence each."""
+    costs: dict[str, Cost]
+    """By preset."""
+
+    def facts(self) -> dict[str, Any]:
+        """All of it in plain numbers and texts, for JSON."""
+        scene = self.scene
+        lenses = scene.cameras
+        return {
+            "name": scene.name,
+            "format": self.format,
+            "views": len(scene.views),
+            "splits": {split: len(indices) for split, indices in sorted(scene.splits.items())},
+            "sizes": [[*size, count] for size, count in _sizes(lenses)],
+            "focal_length": _range([f for c in lenses for f in (c.fx, c.fy)]),
+            "field_of_view": [_degrees(lenses, "width", "fx"), _degrees(lenses, "height", "fy")],
+            "principal_point": [
+                _range([c.cx / c.width for c in lenses]),
+                _range([c.cy / c.height for c in lenses]),
+            ],
+            "distortion": {
+                name: _range([getattr(c, name) for c in lenses])
+                for name in ("k1", "k2", "k3", "p1", "p2")
+                if any(getattr(c, name) for c in lenses)
+            },
+            "up": [round(float(x), 4) + 0.0 for x in self.up],  # no -0
+            "focus": None if self.focus is None else self.focus.tolist(),
+            "box_min": scene.box_min.tolist(),
+            "box_max": scene.box_max.tolist(),
+            "unbounded": scene.unbounded,
+            "content_distance": self.content_distance,
+            "how": list(scene.notes),
+            "costs": {preset: asdict(cost) for preset, cost in self.costs.items()},
+            "odd": list(self.oddities),
+        }
+
+    def to_json(self) -> str:
+        """The facts."""
+        return json.dumps(self.facts(), indent=2) + "\n"
+
+    def __str__(self) -> str:
+        """The facts in lines to read."""
+        facts, scene = self.facts(), self.scene
+        splits = ", ".join(f"{n} {split}" for split, n in facts["splits"].items())
+        sizes = [
+            f"{w} x {h}" + (f" ({n})" if n < len(scene.views) else "") for w, h, n in facts["sizes"]
+        ]
+        across, along = facts["field_of_view"]
+        x, y = facts["principal_point"]
+        box = " x ".join(f"{edge:.4g}" for edge in scene.box_max - scene.box_min)
+        bent = [f"{name} {_span(values, 3)}" for name, values in facts["distortion"].items()]
+        rows = [
+            ("format", self.format),
+            ("views", f"{len(scene.views)}: {splits}"),
+            ("pixels", ", ".join(sizes[:4]) + (", ..." if len(sizes) > 4 else "")),
+            ("focal length", f"{_span(facts['focal_length'])} pixels"),
+            ("field of view", f"{_span(across, 3)} x {_span(along, 3)} degrees"),
+            ("principal point", f"{_span(x, 3)} of the width, {_span(y, 3)} of the height"),
+            ("distortion", ", ".join(bent) or "none"),
+            ("up", "  ".join(f"{value:.3g}" for value in facts["up"])),
+            (
+                "box",
+                f"{box} scene units, "
+                + ("space outside folded in" if scene.unbounded else "nothing outside"),
+            ),
+            ("content distance", f"{self.content_distance:.4g} scene units"),
+        ]
+        rows += [("how", note) for note in scene.notes]
+        for preset, cost in self.costs.items():
+            rows.append(
+                (
+                    f"training, {preset}",
+                    f"at least {cost.memory / 2**30:.2g} GiB of memory; very roughly "
+                    f"{_duration(cost.seconds)} on {cost.threads} CPU threads",
+                )
+            )
+        rows += [("odd", oddity) for oddity in self.oddities] or [("odd", "nothing")]
+        return "\n".join([scene.name, *(f"  {name:17} {text}" for name, text in rows)])
+
+
+def inspect(
+    path: str | Path,
+    *,
+    downscale: int = 1,
+    content_distance: float | None = None,
+    near: float = 0.0,
+    model: Model | None = None,
+    threads: int = 2,
+) -> Inspection:
+    """Look a scene over: what was understood, what is odd, and what training would take.
+
+    Args:
+        path: As for ``load_scene``.
+        downscale: As for ``load_scene``.
+        content_distance: The one that training will be given, scene units; None: the estimate.
+        near: The near plane that training will be given, scene units.
+        model: That will be trained; None: that of the presets.
+        threads: CPU threads that training would have.
+
+    Raises:
+        InputError: The scene cannot be loaded; where frames are to blame, it says how many are.
+    """
+    require_at_least("near", near, 0.0)
+    if content_distance is not None:
+        require_positive("content_distance", content_distance)
+    found = survey(path)
+    try:
+        scene = load_scene(path, downscale=downscale)
+    except InputError as error:
+        others = [place for place in found.refused if place not in str(error)]
+        if not others:
+            raise
+        named = ", ".join(others[:5]) + (", ..." if len(others) > 5 else "")
+        raise InputError(f"{error} Poses refused likewise: {len(others)} more ({named}).") from None
+    distance = scene.content_distance if content_distance is None else content_distance
+    return Inspection(
+        scene=scene,
+        format=found.format,
+        content_distance=distance,
+        up=up_direction(scene.training_cameras),
+        focus=_focus(scene.training_cameras),
+        oddities=(*scene.warnings, *_oddities(scene, found, distance, near)),
+        costs={
+            name: _cost(scene, replace(preset, model=model or preset.model), threads)
+            for name, preset in PRESETS.items()
+        },
+    )
+
+
+def _oddities(scene: Scene, found: Survey, content_distance: float, near: float) -> list[str]:
+    odd = list(found.oddities)
+    cameras = scene.training_cameras
+    if found.files:  # built-in scenes look everywhere, and know their true distances
+        odd += _odd_directions(cameras)
+    odd += _odd_places(scene)
+    nearest = max(near, _distance_to_box(scene))
+    if nearest >= content_distance:
+        why = "the near plane" if nearest == near else "the box"
+        odd.append(
+            f"the scaling has nothing to do: {why} begins {nearest:.4g} scene units "
+            "from the cameras, but gradients are only scaled nearer than the content distance "
+            f"{content_distance:.4g}"
+        )
+    return odd
+
+
+def _focus(cameras: Sequence[Camera]) -> np.ndarray | None:
+    """The point that most cameras have in the middle of their image."""
+    focus = find_focus(cameras)
+    if focus.guessed or share_aimed_at(cameras, focus.point) < MIN_SHARE_AIMED:
+        return None
+    return focus.point
+
+
+def _odd_directions(cameras: Sequence[Camera]) -> list[str]:
+    """Cameras that have nothing in common to look at."""
+    odd = []
+    aimed = share_aimed_at(cameras, find_focus(cameras).point)
+    turned = [_turned(camera) for camera in cameras]
+    if _focus(cameras) is None and _focus(turned) is not None:
+        odd.append(
+            "all cameras look away from the point that they surround: if they should look at it, "
+            "the poses are in OpenCV axes (looking along +z); negate their y and z columns"
+        )
+    elif _focus(cameras) is None:
+        odd.append(
+            f"no common focus: {aimed:.0%} of the training cameras have one point in the middle of "
+            "their image, so content distance and box are guesses; give --content-distance"
+        )
+    return odd
+
+
+def _turned(camera: Camera) -> Camera:
+    """The same camera, had its pose been in OpenCV axes."""
+    return replace(camera, c2w=camera.c2w * np.array([1.0, -1.0, -1.0, 1.0]))
+
+
+def _odd_places(scene: Scene) -> list[str]:
+    """Cameras that stand on their heads, or far away from all others."""
+    odd = []
+    up = up_direction(scene.cameras)
+    rolled = [view.name for view in scene.views if view.camera.c2w[:, 1] @ up < -0.3]
+    if rolled:
+        odd.append(
+            f"upside down against the others: {len(rolled)} of {len(scene.views)} cameras (first: "
+            f"{rolled[0]})"
+        )
+    places = np.array([camera.position for camera in scene.cameras])
+    away = np.linalg.norm(places - np.median(places, axis=0), axis=1)
+    limit = FAR_OFF * float(np.median(away))
+    lost = [view.name for view, far in zip(scene.views, away, strict=True) if far > limit]
+    if lost:
+        odd.append(
+            f"far away from all others: {len(lost)} of {len(places)} cameras (first: {lost[0]}), "
+            "which may be wrongly posed"
+        )
+    return odd
+
+
+def _distance_to_box(scene: Scene) -> float:
+    """From the nearest training camera to what is sampled, scene units."""
+    if scene.unbounded:
+        return 0.0
+    places = np.array([camera.position for camera in scene.training_cameras])
+    outside = np.maximum(0.0, np.maximum(scene.box_min - places, places - scene.box_max))
+    return float(np.linalg.norm(outside, axis=1).min())
+
+
+def _cost(scene: Scene, config: TrainConfig, threads: int) -> Cost:
+    voxels = config.grid.voxels
+    images = sum(view.image.nbytes for view in scene.views)
+    pixels = sum(camera.width * camera.height for camera in scene.training_cameras)
+    memory = TRAINING_BYTES * config.model.n_floats * voxels + images + 4 * pixels
+
+    samples, occupied = SAMPLES_AND_OCCUPIED[scene.kind]
+    finer = (voxels / PRESETS["fast"].grid.voxels) ** (1.0 / 3.0) / config.march.step_voxels
+    share = (np.arange(1000) + 0.5)[:, None] / 1000  # of the training, evenly
+    nodes = voxels * 0.5 ** (share < config.grid.grow_at).sum(axis=1)
+    steps_an_update = 2.0 ** (share >= config.optim.accumulation(scene.kind)).sum(axis=1)
+    step = config.rays_per_step * (SECONDS_PER_RAY + finer * samples * SECONDS_PER_SAMPLE)
+    step += float((nodes / steps_an_update).mean()) * occupied * SECONDS_PER_NODE
+    step *= config.model.relative_time
+    return Cost(memory=memory, seconds=config.steps * step / threads, threads=threads)
+
+
+def _sizes(cameras: Sequence[Camera]) -> list[tuple[tuple[int, int], int]]:
+    return Counter((camera.width, camera.height) for camera in cameras).most_common()
+
+
+def _range(values: Sequence[float]) -> list[float]:
+    return [float(min(values)), float(max(values))]
+
+
+def _degrees(cameras: Sequence[Camera], size: str, focal: str) -> list[float]:
+    """The range of fields of view, without distortion."""
+    halves = [math.atan(0.5 * getattr(c, size) / getattr(c, focal)) for c in cameras]
+    return _range([math.degrees(2.0 * half) for half in halves])
+
+
+def _span(values: Sequence[float], digits: int = 4) -> str:
+    low, high = (f"{value:.{digits}g}" for value in values)
+    return low if low == high else f"{low} to {high}"
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 90.0:
+        return f"{10.0 * math.ceil(seconds / 10.0):.0f} s"
+    minutes = math.ceil(seconds / 60.0)
+    return f"{minutes} min" if minutes < 90 else f"{seconds / 3600.0:.1f} h"

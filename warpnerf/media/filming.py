@@ -1,0 +1,146 @@
+"""A field on film: colour and depth, through the cameras of a path or of photographs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from warpnerf.checks import InputError
+from warpnerf.media.camera_path import path_lens
+from warpnerf.media.pictures import colour_and_depth, write_png
+from warpnerf.media.video import write_video
+from warpnerf.rendering.field import Field
+from warpnerf.scenes.camera import Camera
+
+N_LOOKS = 9
+"""Cameras of a path that a range of depths is taken from."""
+
+LOOK_SIZE = 96
+"""Pixels along the longer side of such a look."""
+
+
+def render_video(
+    field: Field,
+    cameras: Sequence[Camera],
+    path: str | Path,
+    *,
+    fps: float = 30.0,
+    depths: tuple[float, float] | None = None,
+    on_frame: Callable[[int], None] | None = None,
+) -> Path:
+    """Render a video: colour and depth side by side, with a legend of the depths' colours.
+
+    Args:
+        field: What to look at.
+        cameras: From ``camera_path``, or any of one size; one for each frame.
+        path: .mp4 (.gif where PyAV is missing), .gif, or a new folder for PNG files.
+        fps: Frames per second.
+        depths: What gets the first and the last colour, scene units; None: see ``depth_range``.
+        on_frame: Called with the number of frames that are done.
+
+    Returns:
+        Where it went.
+
+    Raises:
+        InputError: No camera, cameras of different sizes, a path that cannot be written to, or
+            depths in the wrong order.
+        OSError: It cannot be written; what was there before is left as it was.
+    """
+    if not cameras:
+        raise InputError("a video needs at least one camera.")
+    if len({(camera.width, camera.height) for camera in cameras}) > 1:
+        raise InputError("the cameras of a video must all have one width and one height.")
+    near, far = depth_range(field, cameras) if depths is None else checked_depths(depths)
+
+    def frames() -> Iterator[np.ndarray]:
+        for number, camera in enumerate(cameras):
+            yield colour_and_depth(field.render(camera), near, far)
+            if on_frame is not None:
+                on_frame(number + 1)
+
+    return write_video(path, frames(), fps)
+
+
+def render_stills(
+    field: Field,
+    cameras: dict[str, Camera],
+    folder: str | Path,
+    *,
+    depths: tuple[float, float] | None = None,
+    on_frame: Callable[[int], None] | None = None,
+) -> None:
+    """Render pictures of colour and depth, as in a video.
+
+    Args:
+        field: What to look at.
+        cameras: By the names of the files, which go into the folder.
+        folder: Made if it does not exist; files of the same names are replaced.
+        depths: As for ``render_video``.
+        on_frame: Called with the number of pictures that are done.
+
+    Raises:
+        InputError: No camera, or depths in the wrong order.
+        OSError: A picture cannot be written; each is there whole or not at all.
+    """
+    if not cameras:
+        raise InputError("stills need at least one camera.")
+    shown = depth_range(field, list(cameras.values())) if depths is None else checked_depths(depths)
+    folder = Path(folder)
+    folder.mkdir(exist_ok=True)
+    for number, (name, camera) in enumerate(cameras.items()):
+        write_png(folder / name, colour_and_depth(field.render(camera), *shown))
+        if on_frame is not None:
+            on_frame(number + 1)
+
+
+def depth_range(field: Field, cameras: Sequence[Camera]) -> tuple[float, float]:
+    """Depths between which nearly all lies that some of the cameras see, scene units.
+
+    That is the ``range_of`` the opaque pixels of all these cameras together, so that it serves a
+    whole set of pictures.
+    """
+    seen = []
+    picks = np.unique(np.linspace(0, len(cameras) - 1, N_LOOKS).astype(int))
+    for camera in (cameras[pick] for pick in picks):
+        share = min(1.0, LOOK_SIZE / max(camera.width, camera.height))
+        size = (max(1, round(share * camera.width)), max(1, round(share * camera.height)))
+        look = field.render(path_lens([camera], size))
+        solid = look.opacity > 0.5
+        seen.append(look.depth[solid] / look.opacity[solid])
+    return range_of(np.concatenate(seen))
+
+
+def range_of(depths: np.ndarray) -> tuple[float, float]:
+    """Percentiles 2 and 98 of depths [n], scene units, so that few far ones do not stretch it.
+
+    Rounded outward to two digits, so that a legend can say them; 0 and 1 where there are none.
+    """
+    if not depths.size:
+        return 0.0, 1.0
+    low, high = np.percentile(depths, [2.0, 98.0])
+    near, digits = _rounded(low, math.floor)
+    far, _ = _rounded(high, math.ceil)
+    return near, max(far, round(near + 10.0**-digits, digits))
+
+
+def _rounded(depth: float, rounding: Callable[[float], int]) -> tuple[float, int]:
+    """A depth of two digits, and how many of them are behind the point; negative: before it."""
+    digits = 1 - math.floor(math.log10(max(depth, 1e-30)))
+    return round(rounding(round(depth * 10.0**digits, 6)) * 10.0**-digits, digits), digits
+
+
+def checked_depths(depths: tuple[float, float]) -> tuple[float, float]:
+    """The same depths.
+
+    Raises:
+        InputError: They are not finite, or the first is not below the second.
+    """
+    near, far = depths
+    if not 0.0 <= near < far < np.inf:
+        raise InputError(
+            f"a range of depths goes from at least 0 up to something farther, not {near:g} {far:g}."
+        )
+    return near, far

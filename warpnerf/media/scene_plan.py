@@ -1,0 +1,202 @@
+"""A plan of a scene: cameras, box and content distance from above and from the side."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from warpnerf.evaluation.inspection import Inspection
+from warpnerf.media.pictures import FAINT, INK, font
+from warpnerf.scenes.camera import Camera
+
+_FINE = 2  # pixels are drawn twice as large, then averaged
+_PANEL = 640 * _FINE
+_MARGIN = 64 * _FINE
+_HEADER = 92 * _FINE
+_TRAIN, _TEST = (38, 96, 168), (214, 96, 30)
+_SIGHT, _SIGHT_END = (206, 226, 204), (56, 140, 66)
+_GRID, _BOX = (232, 232, 236), (120, 40, 130)
+_FRUSTUM = 0.035
+"""Length of a camera's pyramid, in widths of a panel."""
+
+Colour = tuple[int, int, int]
+
+
+def plan_picture(inspection: Inspection) -> np.ndarray:
+    """Draw cameras as pyramids, how far their content is, and the box, in the scene's units.
+
+    Up in the view from the side is the axis of the scene nearest to what is up for the cameras.
+
+    Args:
+        inspection: Of the scene.
+
+    Returns:
+        [H, W, 3] uint8.
+    """
+    scene = inspection.scene
+    up = int(np.abs(inspection.up).argmax())
+    standing = inspection.up[up] > 0.0
+    right, ahead = (up + 1) % 3, (up + 2) % 3
+    if not standing:
+        right, ahead = ahead, right
+    box = np.stack([scene.box_min, scene.box_max])
+    ends = [c.position + inspection.content_distance * c.forward for c in scene.training_cameras]
+    points = np.concatenate([box, [c.position for c in scene.cameras], ends])
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    extent = 1.08 * float(np.ptp(points, axis=0).max())
+
+    size = (2 * (_PANEL + _MARGIN) + _MARGIN // 2, _HEADER + _PANEL + _MARGIN // 2)
+    sheet = Image.new("RGB", size, "white")
+    draw = ImageDraw.Draw(sheet)
+    _header(draw, inspection)
+    for number, (title, axes, signs) in enumerate(
+        (
+            ("from above", (right, ahead), (1.0, 1.0)),
+            ("from the side", (right, up), (1.0, 1.0 if standing else -1.0)),
+        )
+    ):
+        left = _MARGIN + number * (_PANEL + _MARGIN)
+        panel = _Panel(draw, (left, _HEADER), axes, signs, middle, extent)
+        panel.frame(title)
+        for camera, end in zip(scene.training_cameras, ends, strict=True):
+            panel.line([camera.position, end], _SIGHT)
+        panel.box(box)
+        for split, colour in (("train", _TRAIN), ("test", _TEST)):
+            for index in scene.splits[split]:
+                panel.camera(scene.views[index].camera, colour)
+        for end in ends:
+            panel.dot(end, _SIGHT_END)
+        if inspection.focus is not None:
+            panel.cross(inspection.focus, INK)
+    return np.asarray(sheet.resize((size[0] // _FINE, size[1] // _FINE), Image.Resampling.BOX))
+
+
+def _header(draw: ImageDraw.ImageDraw, inspection: Inspection) -> None:
+    scene = inspection.scene
+    draw.text((_MARGIN, 12 * _FINE), scene.name, INK, font(24 * _FINE))
+    legend: list[tuple[str, Colour]] = [
+        (f"{len(scene.splits['train'])} training cameras", _TRAIN),
+        (f"{len(scene.splits['test'])} test cameras", _TEST),
+        (f"content distance {inspection.content_distance:.4g} in sight", _SIGHT_END),
+        ("box" + (", space outside folded in" if scene.unbounded else ""), _BOX),
+    ]
+    if inspection.focus is not None:
+        legend.append(("+ what the cameras look at", INK))
+    x, y = float(_MARGIN), 52.0 * _FINE
+    type_face = font(15 * _FINE)
+    for text, colour in legend:
+        if not text.startswith("+"):
+            draw.rectangle((x, y - 6 * _FINE, x + 12 * _FINE, y + 6 * _FINE), fill=colour)
+            x += 18 * _FINE
+        draw.text((x, y), text, INK, type_face, anchor="lm")
+        x += draw.textlength(text, type_face) + 26 * _FINE
+
+
+class _Panel:
+    """One view: two axes of the scene on paper."""
+
+    def __init__(
+        self,
+        draw: ImageDraw.ImageDraw,
+        corner: tuple[int, int],
+        axes: tuple[int, int],
+        signs: tuple[float, float],
+        middle: np.ndarray,
+        extent: float,
+    ) -> None:
+        """Place it on the sheet.
+
+        Args:
+            draw: The sheet.
+            corner: Left and top, pixels.
+            axes: Of the scene, to the right and up on paper.
+            signs: Of these.
+            middle: [3] scene units, what is in the middle.
+            extent: Of each side, scene units.
+        """
+        self._draw = draw
+        self._left, self._top = corner
+        self._axes, self._signs = axes, signs
+        self._middle, self._extent = middle, extent
+        self._scale = _PANEL / extent
+
+    def frame(self, title: str) -> None:
+        """Grid, ticks and labels."""
+        small, draw = font(13 * _FINE), self._draw
+        step = _nice_step(self._extent / 8.0)
+        low = self._middle - 0.5 * self._extent
+        bottom = self._top + _PANEL
+        for paper, axis in enumerate(self._axes):
+            first = math.ceil(low[axis] / step)
+            for number in range(first, math.floor((low[axis] + self._extent) / step) + 1):
+                point = self._middle.copy()
+                point[axis] = number * step
+                at = self._at(point)[paper]
+                text = f"{number * step:.6g}"
+                if paper == 0:
+                    draw.line((at, self._top, at, bottom), _GRID, _FINE)
+                    draw.text((at, bottom + 6 * _FINE), text, FAINT, small, anchor="mt")
+                else:
+                    draw.line((self._left, at, self._left + _PANEL, at), _GRID, _FINE)
+                    draw.text((self._left - 6 * _FINE, at), text, FAINT, small, anchor="rm")
+        draw.rectangle((self._left, self._top, self._left + _PANEL, bottom), None, FAINT, _FINE)
+        across, along = ("xyz"[axis] for axis in self._axes)
+        draw.text((self._left, self._top - 8 * _FINE), title, INK, font(17 * _FINE), anchor="ls")
+        draw.text(
+            (self._left + _PANEL, self._top - 8 * _FINE),
+            f"{across} to the right, {along} {'up' if self._signs[1] > 0 else 'down'}; scene units",
+            FAINT,
+            small,
+            anchor="rs",
+        )
+
+    def line(self, points: Sequence[np.ndarray], colour: Colour, width: int = 1) -> None:
+        """A line through points [3]."""
+        self._draw.line([self._at(point) for point in points], colour, width * _FINE)
+
+    def box(self, corners: np.ndarray) -> None:
+        """The outline of a box from corners [2, 3]."""
+        (x0, y0), (x1, y1) = self._at(corners[0]), self._at(corners[1])
+        outline = (min(x0, x1), min(y0, y1), max(x0, x1), max(y0, y1))
+        self._draw.rectangle(outline, None, _BOX, 2 * _FINE)
+
+    def camera(self, camera: Camera, colour: Colour) -> None:
+        """A pyramid whose base is the image."""
+        length = _FRUSTUM * self._extent
+        x, y = 0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy
+        shrink = length / math.sqrt(1.0 + x * x + y * y)
+        base = [
+            camera.position + shrink * camera.c2w[:, :3] @ np.array([i * x, j * y, -1.0])
+            for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))
+        ]
+        self.line([*base, base[0]], colour)
+        for corner in base:
+            self.line([camera.position, corner], colour)
+
+    def dot(self, point: np.ndarray, colour: Colour) -> None:
+        """A small disc."""
+        (x, y), r = self._at(point), 2.0 * _FINE
+        self._draw.ellipse((x - r, y - r, x + r, y + r), fill=colour)
+
+    def cross(self, point: np.ndarray, colour: Colour) -> None:
+        """A plus sign."""
+        (x, y), r = self._at(point), 9 * _FINE
+        self._draw.line((x - r, y, x + r, y), colour, 2 * _FINE)
+        self._draw.line((x, y - r, x, y + r), colour, 2 * _FINE)
+
+    def _at(self, point: np.ndarray) -> tuple[float, float]:
+        """Where a point [3] is on the sheet, pixels."""
+        x, y = (
+            sign * float(point[axis] - self._middle[axis]) * self._scale
+            for axis, sign in zip(self._axes, self._signs, strict=True)
+        )
+        return self._left + 0.5 * _PANEL + x, self._top + 0.5 * _PANEL - y
+
+
+def _nice_step(least: float) -> float:
+    """The smallest of 1, 2, 5 times a power of ten that is not below ``least``."""
+    power = 10.0 ** math.floor(math.log10(least))
+    return next(power * factor for factor in (1.0, 2.0, 5.0, 10.0) if power * factor >= least)

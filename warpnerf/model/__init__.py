@@ -1,0 +1,1 @@
+"""What is trained: named models, their parameters, the voxel grid."""

@@ -1,0 +1,292 @@
+"""The voxel grid on its device: values, their place in the world, and what of it is free."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import warp as wp
+from warpnerf_kernels.base import types
+from warpnerf_kernels.base.types import Box, Density, FreeSpace, real, vec3
+from warpnerf_kernels.fields import dense
+from warpnerf_kernels.sampling import occupancy
+from warpnerf_kernels.sampling.steps import March
+from warpnerf_kernels.space import contraction
+
+from warpnerf.checks import InputError
+from warpnerf.config import MAX_VOXELS, TRAINING_BYTES, Contraction
+from warpnerf.runtime.memory import usable_memory
+from warpnerf.runtime.parallel import NODES, Workers
+
+CONTRACTIONS = {"none": contraction.NONE, "linf": contraction.LINF, "l2": contraction.L2}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class VoxelGrid:
+    """A dense grid [X, Y, Z] of raw values, z fastest, nodes on the box's faces."""
+
+    values: wp.array
+    """[X * Y * Z] vectors: raw density, raw features, padding to a power of two."""
+    size: tuple[int, int, int]
+    """X, Y, Z."""
+    box_min: np.ndarray
+    """[3] float64, lower corner, scene units."""
+    box_max: np.ndarray
+    """[3] float64, upper corner."""
+    contraction: Contraction = "none"
+    """How space outside the box is folded into a shell around it."""
+    border: float = 0.0
+    """Width of that shell, in half edges of the box; 0 without contraction."""
+    density_shift: float = 0.0
+    """sigma = density_scale softplus(raw density + density_shift)."""
+    density_scale: float = 1.0
+    """1 / scene unit."""
+
+    @property
+    def voxel_size(self) -> np.ndarray:
+        """Distance between nodes inside the box, [3] scene units."""
+        extent = (self.box_max - self.box_min) * (1.0 + self.border)
+        return extent / (np.array(self.size) - 1)
+
+    @property
+    def diagonal(self) -> float:
+        """Of the box, scene units."""
+        return float(np.linalg.norm(self.box_max - self.box_min))
+
+    @property
+    def n_floats(self) -> int:
+        """Numbers of a node."""
+        return int(self.values.dtype._length_)
+
+    @cached_property
+    def struct(self) -> Any:
+        """The grid as kernels take it."""
+        return grid_struct(dense, self.values, self.size, self.border)
+
+    @cached_property
+    def box(self) -> Box:
+        """Its box as kernels take it."""
+        return box_struct(types, self.box_min, self.box_max, self.border)
+
+    @cached_property
+    def density(self) -> Density:
+        """From raw to density, as kernels take it."""
+        return density_struct(types, self.density_shift, self.density_scale)
+
+    def resized(
+        self,
+        workers: Workers,
+        size: tuple[int, int, int],
+        box: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> VoxelGrid:
+        """The same field on another grid, trilinearly read off this one.
+
+        Args:
+            workers: Where to work.
+            size: Nodes of the new grid.
+            box: Corners of the new grid, within this one's; None: the same. Not with contraction.
+        """
+        box_min, box_max = box or (self.box_min, self.box_max)
+        values = wp.empty(math.prod(size), dtype=self.values.dtype, device=workers.device)
+        grid = replace(self, values=values, size=size, box_min=box_min, box_max=box_max)
+        self.resample(dense.resample_kernel(self.n_floats), self.values, grid, values, workers)
+        return grid
+
+    def resample(
+        self, kernel: wp.Kernel, source: wp.array, other: VoxelGrid, out: wp.array, workers: Workers
+    ) -> None:
+        """Read an array over this grid's nodes at another's.
+
+        Args:
+            kernel: ``dense.resample_kernel``, or one like it.
+            source: [n_nodes]
+            other: The other grid.
+            out: [other n_nodes] written.
+            workers: Where to work.
+        """
+        old = (np.array(self.size) - 1) / (self.box_max - self.box_min)
+        new = (other.box_max - other.box_min) / (np.array(other.size) - 1)
+        scale, offset = vec3(*(old * new)), vec3(*(old * (other.box_min - self.box_min)))
+        workers.launch(
+            kernel,
+            out.shape[0],
+            *(source, wp.vec3i(*self.size), scale, offset),
+            *(wp.vec3i(*other.size), out),
+        )
+
+
+def grid_struct(
+    dense: ModuleType, values: wp.array, size: tuple[int, int, int], border: float
+) -> Any:
+    """A kernel's Grid, in the precision of the given ``warpnerf_kernels.fields.dense``."""
+    grid = dense.grid_type(values.dtype._length_)()
+    grid.values = values
+    grid.size = wp.vec3i(*size)
+    middle = 0.5 * (np.array(size) - 1)
+    grid.to_nodes = dense.vec3(*(middle / (1.0 + border)))
+    grid.middle = dense.vec3(*middle)
+    return grid
+
+
+def box_struct(types: ModuleType, box_min: np.ndarray, box_max: np.ndarray, border: float) -> Any:
+    """A kernel's Box, in the precision of the given ``warpnerf_kernels.base.types``."""
+    box = types.Box()
+    box.centre = types.vec3(*(0.5 * (box_min + box_max)))
+    box.half = types.vec3(*(0.5 * (box_max - box_min)))
+    box.border = border
+    return box
+
+
+def density_struct(types: ModuleType, shift: float, scale: float) -> Any:
+    """A kernel's Density, likewise."""
+    density = types.Density()
+    density.shift = shift
+    density.scale = scale
+    return density
+
+
+def free_struct(
+    types: ModuleType, distance: wp.array, size: tuple[int, int, int], border: float
+) -> Any:
+    """A kernel's FreeSpace over a grid with this border, in the precision of ``types``."""
+    free = types.FreeSpace()
+    free.distance = distance
+    free.size = wp.vec3i(*size)
+    free.to_cells = types.vec3(*(0.5 * np.array(size) / (1.0 + border)))
+    return free
+
+
+def grid_size(extent: np.ndarray, voxels: int) -> tuple[int, int, int]:
+    """Nodes along each axis so that voxels are cubes and about `voxels` in all.
+
+    Args:
+        extent: [3] edges of the domain, scene units.
+        voxels: Nodes in all.
+    """
+    edge = (np.prod(extent) / voxels) ** (1.0 / 3.0)
+    size = np.maximum(2, np.round(extent / edge).astype(int) + 1)
+    return int(size[0]), int(size[1]), int(size[2])
+
+
+def training_bytes(size: tuple[int, int, int], n_floats: int) -> int:
+    """Memory that training a grid takes: values, two moments together, and a gradient."""
+    return math.prod(size) * n_floats * TRAINING_BYTES
+
+
+def require_memory(size: tuple[int, int, int], n_floats: int, device: wp.Device) -> None:
+    """Raise InputError if training a grid of this size does not fit the memory of the device."""
+    if math.prod(size) >= MAX_VOXELS:
+        raise InputError(
+            f"grid.voxels must give fewer than {MAX_VOXELS} nodes, not {math.prod(size)}; use "
+            "fewer voxels."
+        )
+    needed = training_bytes(size, n_floats)
+    total = device.total_memory if device.is_cuda else usable_memory()
+    where = device if device.is_cuda else "this machine"
+    if total is not None and needed > total:
+        raise InputError(
+            f"grid.voxels: a grid of {size[0]} x {size[1]} x {size[2]} nodes of {n_floats} numbers "
+            f"needs {needed / 2**30:.1f} GiB to train, but {where} has {total / 2**30:.1f} GiB; "
+            "use fewer voxels, or a model with fewer features."
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FreeCells:
+    """Which cells of a grid's domain hold nothing visible: distances to the nearest that does."""
+
+    distance: wp.array
+    """[MX * MY * MZ] uint8, cells to the nearest occupied one; 0 there."""
+    size: tuple[int, int, int]
+    """MX, MY, MZ."""
+    border: float
+    """That of the grid; with a single cell of no matter."""
+
+    @staticmethod
+    def none(workers: Workers) -> FreeCells:
+        """All space is occupied."""
+        return FreeCells(
+            distance=wp.zeros(1, dtype=wp.uint8, device=workers.device),
+            size=(1, 1, 1),
+            border=0.0,
+        )
+
+    @staticmethod
+    def of(grid: VoxelGrid, workers: Workers, march: March, alpha_min: float) -> FreeCells:
+        """Look a grid over.
+
+        Args:
+            grid: The grid.
+            workers: Where to work.
+            march: How rays are stepped: opacity is judged over the longest step there can be.
+            alpha_min: The least opacity that counts as visible.
+        """
+        device = workers.device
+        size = tuple(max(1, (n - 1) // 2) for n in grid.size)
+        span = 1 if device.is_cuda else size[2]  # a core takes a row
+
+        def launch(kernel: wp.Kernel, n: int, *arguments: Any) -> None:
+            workers.launch(kernel, n // span, span, *arguments, chunk=max(1, NODES // span))
+
+        shape = [*grid.size[:2], size[2]]
+        highest = wp.empty(math.prod(shape), dtype=real, device=device)
+        launch(
+            occupancy.find_highest_kernel(grid.n_floats),
+            highest.size,
+            grid.struct,
+            size[2],
+            highest,
+        )
+        for axis in (1, 0):  # from nodes to cells
+            shape[axis] = size[axis]
+            joined = wp.empty(math.prod(shape), dtype=real, device=device)
+            launch(
+                occupancy.join_highest,
+                joined.size,
+                grid.size[axis],
+                size[axis],
+                math.prod(shape[axis + 1 :]),
+                highest,
+                joined,
+            )
+            highest = joined
+        n, cells = math.prod(size), wp.vec3i(*size)
+        distance = wp.empty(n, dtype=wp.uint8, device=device)
+        spread = wp.empty_like(distance)
+        launch(
+            occupancy.mark_occupied,
+            n,
+            grid.box,
+            grid.density,
+            highest,
+            cells,
+            march,
+            CONTRACTIONS[grid.contraction],
+            alpha_min,
+            distance,
+        )
+        for axis in range(3):
+            launch(occupancy.spread_distance, n, cells, axis, distance, spread)
+            distance, spread = spread, distance
+        return FreeCells(distance=distance, size=(size[0], size[1], size[2]), border=grid.border)
+
+    @cached_property
+    def struct(self) -> FreeSpace:
+        """Free space as kernels take it."""
+        return free_struct(types, self.distance, self.size, self.border)
+
+    def share(self) -> float:
+        """The share of cells that are occupied, [0, 1]."""
+        return float(np.mean(self.distance.numpy() == 0))
+
+    def occupied_range(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Lowest and highest corner of the occupied cells, each [3] as shares of the domain."""
+        occupied = np.argwhere(self.distance.numpy().reshape(self.size) == 0)
+        if not len(occupied):
+            return None
+        size = np.array(self.size)
+        return occupied.min(0) / size, (occupied.max(0) + 1) / size

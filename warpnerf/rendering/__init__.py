@@ -1,0 +1,1 @@
+"""Rays through a model, forward and back."""

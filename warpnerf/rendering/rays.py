@@ -1,0 +1,206 @@
+"""Rays of cameras, and batches of rays through random pixels of photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import warp as wp
+from warpnerf_kernels.base.types import mat33, real, vec2, vec3
+from warpnerf_kernels.launch import assembly
+from warpnerf_kernels.space import camera as kernels
+
+from warpnerf.checks import InputError
+from warpnerf.runtime.parallel import Packed, Workers
+from warpnerf.scenes.camera import Camera
+from warpnerf.scenes.scene import View
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RayBatch:
+    """Rays on a device, and what they should see."""
+
+    origins: wp.array
+    """[n_rays] vec3, scene units."""
+    directions: wp.array
+    """[n_rays] vec3 of unit length."""
+    offsets: wp.array
+    """[n_rays] or [1]: where in its step a sample sits, [0, 1)."""
+    background: wp.array
+    """[n_rays] or [1] vec3, rgb in [0, 1]."""
+    content_distance: wp.array
+    """[n_rays] or [1], scene units."""
+    target_rgb: wp.array
+    """[n_rays] vec3 in [0, 1]."""
+
+    @property
+    def count(self) -> int:
+        """n_rays."""
+        return self.origins.shape[0]
+
+    @cached_property
+    def struct(self) -> assembly.Rays:
+        """The rays as kernels take them."""
+        return rays_struct(
+            assembly,
+            self.origins,
+            self.directions,
+            self.offsets,
+            self.background,
+            self.content_distance,
+        )
+
+
+def rays_struct(
+    assembly: ModuleType,
+    origins: wp.array,
+    directions: wp.array,
+    offsets: wp.array,
+    background: wp.array,
+    content_distance: wp.array | None = None,
+) -> Any:
+    """Rays as kernels take them, in the precision of the given ``launch.assembly``."""
+    rays = assembly.Rays()
+    rays.origins, rays.directions, rays.offsets = origins, directions, offsets
+    rays.background = background
+    if content_distance is not None:
+        rays.content_distance = content_distance
+    return rays
+
+
+def view_struct(camera: Camera, first_pixel: int = 0) -> kernels.View:
+    """A camera as kernels take it."""
+    view = kernels.View()
+    view.rotation = mat33(*camera.c2w[:, :3].ravel())
+    view.position = vec3(*camera.c2w[:, 3])
+    view.focal = vec2(camera.fx, camera.fy)
+    view.principal = vec2(camera.cx, camera.cy)
+    view.radial = vec3(camera.k1, camera.k2, camera.k3)
+    view.tangential = vec2(camera.p1, camera.p2)
+    view.width = camera.width
+    view.first_pixel = first_pixel
+    return view
+
+
+def camera_rays(camera: Camera, workers: Workers) -> tuple[wp.array, wp.array]:
+    """The rays through all pixel centres, row by row.
+
+    Returns:
+        origins [H * W] vec3 in scene units, and directions [H * W] vec3 of unit length.
+    """
+    n = camera.width * camera.height
+    origins = wp.empty(n, dtype=vec3, device=workers.device)
+    directions = wp.empty(n, dtype=vec3, device=workers.device)
+    workers.launch(kernels.camera_rays, n, view_struct(camera), origins, directions)
+    return origins, directions
+
+
+class PixelSampler:
+    """Photographs on a device, from which batches of random pixels are drawn."""
+
+    def __init__(
+        self,
+        views: Sequence[View],
+        content_distance: float,
+        background: tuple[float, float, float] | None,
+        n_rays: int,
+        jitter: bool,
+        seed: int,
+        workers: Workers,
+    ) -> None:
+        """Load the photographs.
+
+        Args:
+            views: What to draw from.
+            content_distance: Of every ray, scene units.
+            background: rgb in [0, 1]; None: a random colour for each ray.
+            n_rays: Rays in the batch of one step.
+            jitter: Whether samples are shifted by a random part of a step.
+            seed: Of all that is random here; what is drawn repeats after 2^32 rays.
+            workers: Where to work.
+        """
+        self._workers = workers
+        self._n_rays = n_rays
+        self._seed = int(np.random.SeedSequence(seed).generate_state(1)[0] >> 1)
+        self._random_background = background is None
+        self._background = vec3(*(background or (0.0, 0.0, 0.0)))
+        self._jitter = jitter
+        firsts = np.cumsum([0] + [v.camera.width * v.camera.height for v in views])
+        if firsts[-1] >= 2**31:
+            raise InputError(
+                f"the training views have {firsts[-1]} pixels, 2^31 or more; use --downscale."
+            )
+        self._views = wp.array(
+            [
+                view_struct(v.camera, int(first))
+                for v, first in zip(views, firsts[:-1], strict=True)
+            ],
+            dtype=kernels.View,
+            device=workers.device,
+        )
+        pixels = np.full((firsts[-1], 4), 255, np.uint8)
+        for view, first, end in zip(views, firsts[:-1], firsts[1:], strict=True):
+            channels = view.image.shape[2]
+            pixels[first:end, :channels] = view.image.reshape(-1, channels)
+        self._pixels = wp.array(pixels, dtype=wp.vec4ub, device=workers.device)
+
+        self._content_distances = wp.full(
+            len(views), content_distance, dtype=real, device=workers.device
+        )
+        self._batch = _room(n_rays, workers)
+        self._packed = Packed()
+
+    def draw(self, step: int, n_steps: int = 1) -> RayBatch:
+        """The batches of some steps as one, each a function of its step and the seed.
+
+        Args:
+            step: The first.
+            n_steps: How many.
+
+        Returns:
+            n_steps times as many rays as a step has, in the same arrays from one call to the next
+            as long as there are as many.
+        """
+        if self._batch.count != n_steps * self._n_rays:
+            self._batch = _room(n_steps * self._n_rays, self._workers)
+        batch = self._batch
+        self._workers.launch(
+            kernels.sample_pixels,
+            batch.count,
+            self._views,
+            self._pixels,
+            self._content_distances,
+            self._seed,
+            (step * self._n_rays) % 2**32,
+            self._background,
+            int(self._random_background),
+            int(self._jitter),
+            batch.origins,
+            batch.directions,
+            batch.offsets,
+            batch.background,
+            batch.content_distance,
+            batch.target_rgb,
+            packed=self._packed,
+        )
+        return batch
+
+
+def _room(n_rays: int, workers: Workers) -> RayBatch:
+    """Arrays for that many rays, not filled yet."""
+
+    def empty(dtype: type) -> wp.array:
+        return wp.empty(n_rays, dtype=dtype, device=workers.device)
+
+    return RayBatch(
+        origins=empty(vec3),
+        directions=empty(vec3),
+        offsets=empty(real),
+        background=empty(vec3),
+        content_distance=empty(real),
+        target_rgb=empty(vec3),
+    )

@@ -1,0 +1,157 @@
+"""Compiled kernels on disk: where Warp keeps them, and what if it cannot or they are damaged.
+
+Warp compiles a kernel once and reads it from its cache ever after. It does not check what it reads,
+and a flipped bit in machine code ends in a crash or in wrong numbers; so a file SHA256SUMS lies
+beside each compiled module here, in the format of the tool ``sha256sum``. A cache that cannot be
+written, made, or believed is left for a temporary one, once in a process and with a warning.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import hashlib
+import logging
+import os
+import shutil
+import tempfile
+import threading
+import warnings
+from pathlib import Path
+
+import warp as wp
+
+from warpnerf.checks import InputError
+
+SUMS = "SHA256SUMS"
+COMPILED = (".o", ".cubin", ".ptx", ".meta")
+
+_log = logging.getLogger("warpnerf")
+_loading = threading.Lock()
+"""Warp would load a module twice where two threads ask for it, and free the code of one of them."""
+_temporary: Path | None = None
+_said = False
+
+
+class DamagedKernelError(Exception):
+    """A compiled kernel is not what was written."""
+
+
+def start() -> None:
+    """Start Warp, without a banner.
+
+    Raises:
+        InputError: Neither its cache nor a temporary folder can be made.
+    """
+    wp.config.log_level = wp.LOG_ERROR
+    try:
+        wp.init()
+    except OSError as error:
+        _leave_cache(error)
+        wp.init()
+
+
+def load(kernel: wp.Kernel, device: wp.Device) -> None:
+    """Compile a kernel's module for a device, or fetch it from the cache. Any thread may ask.
+
+    Raises:
+        InputError: The cache cannot be used, nor can a temporary folder be made.
+    """
+    with _loading:
+        try:
+            _load(kernel.module, device)
+        except Exception as error:  # whatever came of it: Warp raises plain exceptions
+            mistaken = type(error).__name__.startswith("WarpCodegen")  # the kernel, not the cache
+            if mistaken or _temporary is not None:
+                raise
+            _leave_cache(error)
+            kernel.module.unload()  # forgets that it failed
+            _load(kernel.module, device)
+
+
+def _load(module: wp.Module, device: wp.Device) -> None:
+    block_dim = 256 if device.is_cuda else 1
+    folder = Path(wp.config.kernel_cache_dir) / module.get_module_identifier(block_dim)
+    _verify(folder)
+    if not _is_compiled(folder, device):
+        _say_once()
+    module.load(device, block_dim=block_dim)
+    _seal(folder)
+
+
+def is_compiled(kernel: wp.Kernel, device: wp.Device) -> bool:
+    """Whether a kernel's module is in the cache for a device, as far as names of files tell."""
+    block_dim = 256 if device.is_cuda else 1
+    name = kernel.module.get_module_identifier(block_dim)
+    return _is_compiled(Path(wp.config.kernel_cache_dir) / name, device)
+
+
+def _is_compiled(folder: Path, device: wp.Device) -> bool:
+    pattern = f"*.sm{device.arch}*.*" if device.is_cuda else "*.o"
+    return any(path.suffix in COMPILED for path in folder.glob(pattern))
+
+
+def _say_once() -> None:
+    """Say what takes so long, once in a process."""
+    global _said
+    if not _said:
+        _log.info("compiling kernels (once; later runs start at once)")
+    _said = True
+
+
+def _leave_cache(error: Exception) -> None:
+    """Use a temporary folder from now on, which is removed when the process ends."""
+    global _temporary
+    cache = wp.config.kernel_cache_dir
+    try:
+        _temporary = Path(tempfile.mkdtemp(prefix="warpnerf-kernels-"))
+    except OSError as again:
+        raise InputError(
+            f"kernels cannot be compiled: the cache {cache} cannot be used ({error}), nor a "
+            f"temporary folder ({again}); set WARP_CACHE_PATH to a folder that can be written."
+        ) from None
+    atexit.register(shutil.rmtree, _temporary, ignore_errors=True)
+    wp.config.kernel_cache_dir = str(_temporary)
+    warnings.warn(
+        f"the cache of compiled kernels {cache} cannot be used ({error}), so kernels are compiled "
+        "into a temporary folder, for this time only; make the cache writable, delete what is "
+        "damaged in it, or set WARP_CACHE_PATH to another folder",
+        RuntimeWarning,
+        stacklevel=2,
+    )
+
+
+def _verify(folder: Path) -> None:
+    """Raise DamagedKernelError where a file is not as it was when it was sealed."""
+    try:
+        sums = (folder / SUMS).read_text()
+    except FileNotFoundError:  # not compiled yet, or by another program
+        return
+    except (OSError, ValueError) as error:
+        raise DamagedKernelError(f"{SUMS} in {folder.name} cannot be read") from error
+    now = _sums(folder)
+    for line in sums.splitlines():
+        digest, _, name = line.partition("  ")
+        if (folder / name).exists() and now.get(name) != digest:
+            raise DamagedKernelError(f"{folder.name} in it is damaged")
+
+
+def _seal(folder: Path) -> None:
+    """Note the checksums of what is there, if it is there and can be written to."""
+    new = folder / f"{SUMS}.{os.getpid()}.{threading.get_ident()}"
+    try:
+        text = "".join(f"{digest}  {name}\n" for name, digest in _sums(folder).items())
+        if not (folder / SUMS).exists() or (folder / SUMS).read_text() != text:
+            new.write_text(text)
+            new.replace(folder / SUMS)
+    except OSError:
+        with contextlib.suppress(OSError):  # a read-only file system refuses even that
+            new.unlink(missing_ok=True)
+
+
+def _sums(folder: Path) -> dict[str, str]:
+    return {
+        path.name: hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.iterdir())
+        if path.suffix in COMPILED
+    }

@@ -1,0 +1,1 @@
+"""Scenes: photographs, cameras, and the formats they come in."""

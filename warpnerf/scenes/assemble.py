@@ -1,0 +1,278 @@
+"""From the frames of a scene file to a Scene: find the images, read, downscale, split, estimate."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from warpnerf.checks import InputError
+from warpnerf.runtime.memory import usable_cores, usable_memory
+from warpnerf.scenes.files import find_image
+from warpnerf.scenes.images import read_image
+from warpnerf.scenes.lens import Lens
+from warpnerf.scenes.scene import Scene, View, estimate_extent
+
+COPIED_BYTES = 8
+"""Per pixel: with alpha for the device, and on the way there once more."""
+
+HOLD_OUT = 8
+"""Without a split in the file every 8th image is for testing, as in LLFF and Mip-NeRF 360."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Frame:
+    """One entry of a scene file, checked, its image found but not read."""
+
+    name: str
+    """The image's path relative to the scene's folder, with /."""
+    path: Path
+    """The image."""
+    c2w: np.ndarray
+    """[3, 4] float64, OpenGL axes, scene units."""
+    lens: Lens
+
+
+def find_images(
+    folder: Path, file: Path, file_paths: Sequence[str]
+) -> tuple[dict[int, Path], list[str]]:
+    """Find the images of a scene file's frames; leave out the missing ones and the repeated ones.
+
+    Returns:
+        The image of each frame that is kept, by the frame's index, and warnings of the others.
+
+    Raises:
+        InputError: A path leaves the folder, or no image is there.
+    """
+    found: dict[int, Path] = {}
+    seen: set[Path] = set()
+    missing: list[str] = []
+    repeated: list[str] = []
+    for index, file_path in enumerate(file_paths):
+        path = find_image(folder, file_path, field=f"{file}: $.frames[{index}].file_path")
+        if path is None:
+            missing.append(file_path)
+        elif path in seen:
+            repeated.append(file_path)
+        else:
+            found[index] = path
+            seen.add(path)
+    if not file_paths:
+        raise InputError(f"{file}: $.frames: is empty; a scene needs posed images.")
+    if not found:
+        raise InputError(
+            f"{file}: $.frames[0].file_path: no image of {len(missing)} frames is in the folder "
+            f"(first: {missing[0]}); put the images next to the file."
+        )
+    warnings = []
+    if missing:
+        warnings.append(
+            f"{file.name}: left out {len(missing)} of {len(file_paths)} frames for want of an "
+            f"image (first: {missing[0]})"
+        )
+    if repeated:
+        warnings.append(
+            f"{file.name}: left out {len(repeated)} of {len(file_paths)} frames for naming an "
+            f"image again (first: {repeated[0]})"
+        )
+    return found, warnings
+
+
+def assemble(
+    *,
+    folder: Path,
+    file: Path,
+    frames: Sequence[Frame],
+    splits: Mapping[str, set[str]],
+    warnings: Sequence[str],
+    downscale: int,
+) -> Scene:
+    """Read the images and make the scene.
+
+    Args:
+        folder: The scene's folder; its name is the scene's.
+        file: The scene file, for messages.
+        frames: Frames with different names.
+        splits: Names for "train", "test" and "val"; what is left out is filled in, see
+            ``complete_splits``.
+        warnings: Of what is odd so far; the result's begin with them.
+        downscale: Edge of the blocks of pixels that become one.
+
+    Raises:
+        InputError: An image, the split or the placement of the cameras is of no use.
+    """
+    frames = sorted(frames, key=lambda frame: frame.name)
+    complete, notes = complete_splits(file, [frame.name for frame in frames], splits)
+    used = set().union(*complete.values())
+    frames = [frame for frame in frames if frame.name in used]
+
+    first = _read_view(frames[0], downscale)
+    _require_memory(file, first, len(frames), downscale)
+    # Decoders release the interpreter lock. The first error cancels what is not yet read.
+    with ThreadPoolExecutor(usable_cores()) as pool:
+        views = [first, *pool.map(lambda frame: _read_view(frame, downscale), frames[1:])]
+
+    index = {view.name: i for i, view in enumerate(views)}
+    indices = {
+        split: tuple(sorted(index[name] for name in names)) for split, names in complete.items()
+    }
+    training = [views[i] for i in indices["train"]]
+    see_through = sum(_has_transparency(view.image) for view in training)
+    unbounded = see_through < len(training) / 2
+    try:
+        extent = estimate_extent([view.camera for view in training], unbounded=unbounded)
+    except InputError as error:
+        raise InputError(f"{file}: $.frames[].transform_matrix: {error}") from None
+    return Scene(
+        name=folder.resolve().name,
+        views=views,
+        splits=indices,
+        box_min=extent.box_min,
+        box_max=extent.box_max,
+        unbounded=unbounded,
+        content_distance=extent.content_distance,
+        notes=(*notes, *extent.notes),
+        warnings=(*warnings, *_oddities(views, complete)),
+    )
+
+
+def complete_splits(
+    file: Path, names: Sequence[str], splits: Mapping[str, set[str]]
+) -> tuple[dict[str, set[str]], list[str]]:
+    """Fill in the splits that a file leaves out.
+
+    Without a training split, it is all images of no other split. Without a test split, every 8th
+    training image is for testing instead, counted by name from the first.
+
+    Returns:
+        Names for "train" and "test", and "val" where it is given; notes.
+
+    Raises:
+        InputError: No image is left to train on.
+    """
+    notes = []
+    given = {split: set(members) for split, members in splits.items() if members}
+    train = given.get("train", set(names) - set().union(*given.values()))
+    test = given.get("test", set())
+    if not test:
+        test = set(sorted(train)[::HOLD_OUT])
+        train = train - test
+        notes.append(f"the file has no test split: every {HOLD_OUT}th image is for testing")
+    if not train:
+        raise InputError(f"{file}: $.frames: no image is left to train on; add photographs.")
+    complete = {"train": train, "test": test}
+    if "val" in given:
+        complete["val"] = given["val"]
+    unused = set(names) - set().union(*complete.values())
+    if unused:
+        notes.append(
+            f"in no split and not used: {len(unused)} of {len(names)} images (first: {min(unused)})"
+        )
+    return complete, notes
+
+
+def _require_memory(file: Path, first: View, n_images: int, downscale: int) -> None:
+    """Raise InputError if images like the first would not fit: they are kept, and copied to train.
+
+    Without this, a system that promises more memory than it has ends the process without a word.
+    """
+    height, width, channels = first.image.shape
+    needed = n_images * height * width * (channels + COPIED_BYTES)
+    usable = usable_memory()
+    if usable is not None and needed > usable:
+        factor = math.ceil(downscale * math.sqrt(needed / usable))
+        raise InputError(
+            f"{file}: $.frames: {n_images} images of {width}x{height} pixels need "
+            f"{needed / 2**30:.1f} GiB, but there is {usable / 2**30:.1f} GiB of memory; use "
+            f"--downscale {factor}, or fewer images."
+        )
+
+
+def _oddities(views: Sequence[View], splits: Mapping[str, set[str]]) -> list[str]:
+    """Warnings of photographs that can be used, and yet are likely not what was meant."""
+    warnings = []
+    shared = splits["train"] & splits["test"]
+    if shared:
+        warnings.append(
+            f"used for training and for testing: {len(shared)} of {len(views)} images (first: "
+            f"{min(shared)}), so test scores are too good"
+        )
+    sizes = {(view.camera.width, view.camera.height): view.name for view in reversed(views)}
+    if len(sizes) > 1:
+        shown = ", ".join(f"{name} {w}x{h}" for (w, h), name in sorted(sizes.items())[:2])
+        warnings.append(
+            f"images of {len(sizes)} sizes (first: {shown}): each frame needs a lens of its own "
+            "if the lens is given in pixels"
+        )
+    copies = _copies(views)
+    if copies:
+        warnings.append(
+            f"the same photograph from the same place: {len(copies)} of {len(views)} images "
+            f"(first: {copies[0][1]} is {copies[0][0]} again)"
+        )
+    return warnings
+
+
+def _copies(views: Sequence[View]) -> list[tuple[str, str]]:
+    """Pairs of names whose poses and pixels are the same, each view with the first of its kind."""
+    pairs = []
+    first_at: dict[bytes, list[View]] = {}
+    for view in views:
+        others = first_at.setdefault(view.camera.c2w.tobytes(), [])
+        again = next((o for o in others if np.array_equal(o.image, view.image)), None)
+        if again is None:
+            others.append(view)
+        else:
+            pairs.append((again.name, view.name))
+    return pairs
+
+
+def _read_view(frame: Frame, downscale: int) -> View:
+    image = read_image(frame.path)
+    height, width = image.shape[:2]
+    camera = frame.lens.camera(width=width, height=height, c2w=frame.c2w, image=frame.name)
+    if downscale > min(width, height):
+        raise InputError(
+            f"downscale is {downscale}, but {frame.path} has {width}x{height} pixels; choose a "
+            "smaller factor."
+        )
+    if downscale > 1:
+        camera, image = camera.downscaled(downscale), box_filter(image, downscale)
+    return View(name=frame.name, camera=camera, image=image)
+
+
+def box_filter(image: np.ndarray, factor: int) -> np.ndarray:
+    """Average an image over blocks of ``factor`` by ``factor`` pixels, rounded to nearest.
+
+    Colour is weighted by alpha, so that what is behind transparent pixels does not bleed in.
+
+    Args:
+        image: [H, W, 3] or [H, W, 4] uint8, straight alpha.
+        factor: Edge of a block; pixels at the right and bottom that fill none are cropped.
+
+    Returns:
+        [H // factor, W // factor, 3 or 4] uint8, straight alpha.
+    """
+    height, width, channels = image.shape[0] // factor, image.shape[1] // factor, image.shape[2]
+    blocks = image[: height * factor, : width * factor].reshape(
+        height, factor, width, factor, channels
+    )
+    if channels == 3:
+        return _divide(blocks.sum(axis=(1, 3), dtype=np.uint64), factor**2)
+    alpha = blocks[..., 3:].astype(np.uint64)
+    total = alpha.sum(axis=(1, 3))
+    rgb = _divide((blocks[..., :3] * alpha).sum(axis=(1, 3)), np.maximum(total, 1))
+    return np.concatenate([rgb, _divide(total, factor**2)], axis=2)
+
+
+def _divide(total: np.ndarray, count: np.ndarray | int) -> np.ndarray:
+    divisor = np.asarray(count, dtype=np.uint64)
+    return ((total + divisor // np.uint64(2)) // divisor).astype(np.uint8)
+
+
+def _has_transparency(image: np.ndarray) -> bool:
+    return image.shape[2] == 4 and bool((image[:, :, 3] < 255).any())

@@ -1,0 +1,217 @@
+"""JSON and paths that others wrote: nothing here trusts a path, a size or a number in them.
+
+Their images are read in ``images``, as distrustfully.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import stat
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path, PureWindowsPath
+from typing import Any, TypeVar
+
+import msgspec
+
+from warpnerf.checks import InputError
+
+T = TypeVar("T")
+
+MAX_JSON_BYTES = 256 * 2**20
+MAX_DIGITS = 300
+"""Of an integer: no float holds more."""
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+"""Tried in this order where a scene file leaves the extension out."""
+
+
+def read_json(
+    path: Path,
+    schema: type[T],
+    prepare: Callable[[Any], Any] = lambda tree: tree,
+    dec_hook: Callable[[type, Any], Any] | None = None,
+) -> T:
+    """Read a JSON file into a msgspec structure.
+
+    ``prepare`` may change what was read before it is converted; ``dec_hook`` is msgspec's.
+
+    A byte-order mark is accepted. Numbers that are not finite, a key given twice and brackets too
+    deep to parse are not, wherever they stand.
+
+    Raises:
+        InputError: The file cannot be read, is not JSON, or does not fit the structure.
+    """
+    require_regular_file(path)
+    try:
+        if path.stat().st_size > MAX_JSON_BYTES:
+            raise InputError(
+                f"{path}: is larger than {MAX_JSON_BYTES >> 20} MiB, so no scene file; name "
+                "another one."
+            )
+        text = path.read_bytes()
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read: {error.strerror or error}; change that, or name another file."
+        ) from None
+    if not text.strip():
+        raise InputError(f"{path}: is empty; copy or export it again.")
+    try:
+        # The standard parser, because msgspec's takes the last of two equal keys.
+        tree = json.loads(text, object_pairs_hook=_distinct_keys, parse_int=_parse_int)
+        place = _first_not_finite(tree)
+        if place is not None:
+            raise InputError(
+                f"{path}: {place}: is not a finite number, or too large for one; correct it."
+            )
+        return msgspec.convert(prepare(tree), schema, dec_hook=dec_hook)
+    except InputError:
+        raise
+    except msgspec.ValidationError as error:
+        raise InputError(f"{path}: {_as_clause(str(error))}; correct or add that field.") from None
+    except RecursionError:
+        raise InputError(f"{path}: brackets nested too deeply; export the file again.") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: is not text in UTF-8; export it as JSON in UTF-8.") from None
+    except ValueError as error:
+        raise InputError(f"{path}: is not valid JSON: {error}; correct it there.") from None
+
+
+def _distinct_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    table = dict(pairs)
+    if len(table) < len(pairs):
+        twice = Counter(key for key, _ in pairs).most_common(1)[0][0]
+        raise ValueError(f"the key {_key(twice)} is given twice in one object")
+    return table
+
+
+def _parse_int(text: str) -> int | float:
+    return int(text) if len(text) <= MAX_DIGITS else math.inf
+
+
+def _first_not_finite(tree: Any) -> str | None:
+    """Where in a parsed file the first number stands that is NaN or infinite, as $.a[0].b."""
+    waiting = [("$", tree)]
+    while waiting:
+        place, node = waiting.pop()
+        if isinstance(node, float) and not math.isfinite(node):
+            return place
+        if isinstance(node, dict):
+            inside = [(f"{place}.{_key(key)}", value) for key, value in node.items()]
+        elif isinstance(node, list):
+            inside = [(f"{place}[{index}]", value) for index, value in enumerate(node)]
+        else:
+            continue
+        waiting += reversed(inside)
+    return None
+
+
+def _key(key: str) -> str:
+    return key if key.isidentifier() and len(key) < 40 else _quoted(key)
+
+
+def _as_clause(message: str) -> str:
+    """Make msgspec's message part of a sentence; it leaves out the place when that is the top."""
+    if " - at `" not in message:
+        message += " - at `$`"
+    return message[0].lower() + message[1:].replace(" - at ", ", at ")
+
+
+def require_regular_file(path: Path) -> None:
+    """Refuse what is missing, folders, and pipes and devices, which would block or never end.
+
+    Raises:
+        InputError: The path leads to no regular file.
+    """
+    try:
+        mode = path.stat().st_mode
+    except (OSError, ValueError) as error:
+        why = "does not exist" if isinstance(error, FileNotFoundError) else f"{error}"
+        raise InputError(f"{path}: cannot be read: {why}; name a file.") from None
+    if not stat.S_ISREG(mode):
+        kind = "a folder" if stat.S_ISDIR(mode) else "a pipe or a device"
+        raise InputError(f"{path}: is {kind}, not a file; name a file.")
+
+
+def exists(path: Path) -> bool:
+    """Whether something is there; false, not an error, where that cannot be found out."""
+    return os.path.exists(path)  # noqa: PTH110, whose way out raises
+
+
+def resolve_inside(folder: Path, relative: str, *, field: str) -> Path:
+    r"""Join a path out of a scene file to the scene's folder.
+
+    Separators may be / or \. An absolute path is accepted where it points into the folder. The
+    result need not exist.
+
+    Args:
+        folder: The scene's folder.
+        relative: The path as the scene file has it.
+        field: File and field that the path comes from, for the message.
+
+    Raises:
+        InputError: The path leaves the folder: by .., by being absolute, or through a link.
+    """
+    text = relative.replace("\\", "/")
+    # Control characters in a name are no file's of ours, and would steer a terminal.
+    if not text or any(ord(c) < 0x20 or 0x7F <= ord(c) < 0xA0 for c in text):
+        raise InputError(
+            f"{field}: {_quoted(relative)} is not a path; name a file in the scene's folder."
+        )
+    try:
+        if Path(text).is_absolute():
+            text = os.path.relpath(text, Path.cwd() / folder)
+        inside = os.path.normpath(text).replace("\\", "/")
+        outside = PureWindowsPath(inside).drive or inside == ".." or inside.startswith(("../", "/"))
+        path = folder / inside
+        root, target = os.path.realpath(folder), os.path.realpath(path)
+        linked = not outside and os.path.commonpath([root, target]) != root
+    except ValueError:  # half a surrogate pair, or another drive
+        raise InputError(
+            f"{field}: {_quoted(relative)} is not a path; name a file that exists."
+        ) from None
+    if outside or linked:
+        how = "follows a link out of" if linked else "leaves"
+        raise InputError(
+            f"{field}: {_quoted(relative)} {how} the scene's folder {folder}; copy the file into "
+            "that folder."
+        )
+    return path
+
+
+def find_image(folder: Path, file_path: str, *, field: str) -> Path | None:
+    """Find the image that a frame names, adding an extension where the frame leaves it out.
+
+    Returns:
+        The image's path inside the folder, or None where there is no such file.
+
+    Raises:
+        InputError: The path leaves the folder, or cannot be followed to its end.
+    """
+    for suffix in ("", *IMAGE_SUFFIXES):
+        path = resolve_inside(folder, file_path + suffix, field=field)
+        if os.path.isfile(path):  # noqa: PTH113, never raises
+            return path
+    path = resolve_inside(folder, file_path, field=field)
+    try:
+        path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except OSError as error:  # links in a circle, a name too long, no permission
+        raise InputError(
+            f"{field}: {_quoted(file_path)} cannot be opened: {error.strerror}; name a file that "
+            "can be read."
+        ) from None
+    return path
+
+
+def printable(text: str) -> str:
+    """Text out of a file for a terminal: what would steer it is spelled out."""
+    return text if text.isprintable() else _quoted(text)
+
+
+def _quoted(text: str) -> str:
+    """Text out of a file for a message: cut where long, control characters spelled out."""
+    return json.dumps(text[:100])

@@ -1,0 +1,150 @@
+"""Images that others wrote, by what Pillow says their pixels are; none is believed to be whole."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageFile, TiffImagePlugin, UnidentifiedImageError
+
+from warpnerf.checks import InputError
+from warpnerf.scenes.files import require_regular_file
+
+MAX_PIXELS = 2**27
+"""134 megapixels: more than cameras make, less than a small file can be made to unpack to."""
+
+# Named one by one, so that a file cannot choose a plugin that starts another program (EPS).
+IMAGE_FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF", "PPM")
+
+EIGHT_BIT_MODES = ("1", "L", "P", "RGB", "YCbCr", "LA", "PA", "RGBA")
+SIXTEEN_BIT_GRAY = ("I;16", "I;16L", "I;16B", "I;16N")
+OTHER_BYTE = {
+    mode + order: mode + other
+    for mode in ("RGB;16", "RGBA;16")
+    for order, other in (("L", "B"), ("B", "L"), ("N", "B" if sys.byteorder == "little" else "L"))
+}
+"""Raw modes of 16-bit colour, of which Pillow keeps one byte without a word, and those by which it
+keeps the other byte: L, B and N stand for little-endian, big-endian and this machine's."""
+
+TIFF_BITS = 258
+TIFF_ORIENTATION = 274
+
+
+def read_image(path: Path) -> np.ndarray:
+    """Read an image as 8-bit colour, its pixels as they are stored, without an EXIF rotation.
+
+    What the pixels mean is decided by Pillow's mode, never by the count of channels. Gray becomes
+    rgb, a palette its colours; 16 bits are rounded to 8.
+
+    Returns:
+        [H, W, 3] uint8 rgb, or [H, W, 4] uint8 rgb with straight alpha where the file has alpha.
+
+    Raises:
+        InputError: Not a regular file, not a whole image, or of a kind that 8-bit rgb cannot hold.
+        MemoryError: It does not fit.
+    """
+    require_regular_file(path)
+    _refuse_pointer(path)
+    Image.init()  # else a format whose plugin is not loaded yet is a KeyError
+    try:
+        with Image.open(path, formats=IMAGE_FORMATS) as image:
+            _check_kind(path, image)
+            if _raw_mode(image) not in OTHER_BYTE:
+                return _to_eight_bit(image)
+            with Image.open(path, formats=IMAGE_FORMATS) as again:
+                return _sixteen_bit_colour(image, again)
+    except (InputError, MemoryError):
+        raise
+    except (Image.DecompressionBombError, Image.DecompressionBombWarning):
+        raise _too_large(path) from None
+    except UnidentifiedImageError:
+        known = ", ".join(IMAGE_FORMATS)
+        raise InputError(
+            f"{path}: is not an image in a known format ({known}), or is damaged at its start; "
+            "convert it to PNG or JPEG, or copy it again."
+        ) from None
+    except Exception as error:  # decoders raise nearly anything on a damaged file
+        raise InputError(
+            f"{path}: is cut short or damaged ({error or type(error).__name__}); copy it again."
+        ) from None
+
+
+def _refuse_pointer(path: Path) -> None:
+    """Name the two files that most often stand where an image should."""
+    try:
+        with path.open("rb") as file:
+            start = file.read(24)
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read: {error.strerror or error}; change that, or name another file."
+        ) from None
+    if not start:
+        raise InputError(f"{path}: is empty (0 bytes); copy it again.")
+    if start.startswith(b"version https://git-lfs"):
+        raise InputError(f"{path}: is a Git LFS pointer, not an image; run `git lfs pull`.")
+
+
+def _check_kind(path: Path, image: ImageFile.ImageFile) -> None:
+    """Refuse what would be read as something else than it shows; the pixels are not decoded yet."""
+    if image.width * image.height > MAX_PIXELS:
+        raise _too_large(path)
+    # MPO is how phones store one photograph with a preview or a depth map behind it.
+    if getattr(image, "is_animated", False) and image.format != "MPO":
+        raise InputError(f"{path}: holds several frames; save the one to use as PNG or JPEG.")
+    if image.format == "TIFF" and image.getexif().get(TIFF_ORIENTATION, 1) != 1:
+        raise InputError(f"{path}: carries a rotation tag, which Pillow obeys; save it as PNG.")
+    raw = _raw_mode(image)
+    if raw in SIXTEEN_BIT_GRAY or (raw in OTHER_BYTE and "transparency" not in image.info):
+        return
+    if image.mode in EIGHT_BIT_MODES and ";16" not in raw and not _is_deep_tiff(image):
+        return
+    name = f"16-bit {image.mode}" if image.mode in EIGHT_BIT_MODES else image.mode
+    raise InputError(f"{path}: its pixels are {name}; convert it to 8-bit RGB or RGBA.")
+
+
+def _raw_mode(image: ImageFile.ImageFile) -> str:
+    """How the pixels lie in the file, in Pillow's words; empty where it does not say."""
+    arguments: Any = image.tile[0][3] if image.tile else ""
+    if isinstance(arguments, tuple):
+        arguments = arguments[0] if arguments else ""
+    return str(arguments)
+
+
+def _is_deep_tiff(image: ImageFile.ImageFile) -> bool:
+    """Whether a TIFF has more than 8 bits per channel: one by planes is read as if it had not."""
+    return (
+        isinstance(image, TiffImagePlugin.TiffImageFile)
+        and max(image.tag_v2.get(TIFF_BITS, (8,))) > 8
+    )
+
+
+def _sixteen_bit_colour(image: ImageFile.ImageFile, again: ImageFile.ImageFile) -> np.ndarray:
+    """16-bit colour, from reading the file twice: one byte of each value, then the other."""
+    again.tile = [tile._replace(args=_other_byte(tile.args)) for tile in again.tile]
+    first, second = np.asarray(image, np.uint32), np.asarray(again, np.uint32)
+    return _rounded(256 * first + second)
+
+
+def _other_byte(arguments: Any) -> Any:
+    if isinstance(arguments, tuple):
+        return (OTHER_BYTE[arguments[0]], *arguments[1:])
+    return OTHER_BYTE[arguments]
+
+
+def _to_eight_bit(image: Image.Image) -> np.ndarray:
+    image.load()
+    if image.mode in EIGHT_BIT_MODES:
+        return np.array(image.convert("RGBA" if image.has_transparency_data else "RGB"))
+    return np.repeat(_rounded(np.asarray(image, np.uint32))[:, :, None], 3, axis=2)
+
+
+def _rounded(values: np.ndarray) -> np.ndarray:
+    """16 bits to 8: the ends stay the ends."""
+    return ((values + 128) // 257).astype(np.uint8)
+
+
+def _too_large(path: Path) -> InputError:
+    limit = MAX_PIXELS // 10**6
+    return InputError(f"{path}: has more than {limit} million pixels; scale it down first.")

@@ -1,0 +1,76 @@
+"""One door to every scene: ``load_scene``."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from warpnerf.checks import InputError
+from warpnerf.scenes.blender import SPLITS, load_blender, split_file
+from warpnerf.scenes.files import exists
+from warpnerf.scenes.scene import Scene
+from warpnerf.scenes.transforms import load_transforms
+
+__all__ = ["load_scene"]
+
+BUILTIN = "builtin:"
+BUILTIN_NAMES = ("room", "room-sparse")
+
+
+def load_scene(path: str | Path, *, downscale: int = 1) -> Scene:
+    """Load a scene: photographs, cameras, split, and the extent estimated from the cameras.
+
+    A folder is tried as Blender / NeRF-synthetic (transforms_train.json), then as instant-ngp or
+    nerfstudio (transforms.json).
+
+    Args:
+        path: A folder, a transforms*.json in it, or "builtin:" and the name of a built-in scene.
+        downscale: Edge of the blocks of pixels that become one; 1 keeps the images as they are.
+
+    Returns:
+        The scene; distances are the file's own.
+
+    Raises:
+        InputError: Nothing there can be loaded, or something in it is wrong; the message names the
+            file and the field.
+    """
+    if isinstance(downscale, bool) or not isinstance(downscale, int) or downscale < 1:
+        raise InputError(f"downscale must be a whole number of at least 1, not {downscale!r}.")
+    if isinstance(path, str) and path.startswith(BUILTIN):
+        return _load_builtin(path.removeprefix(BUILTIN), downscale)
+    path = Path(path)
+    if not exists(path):
+        known = ", ".join(BUILTIN + name for name in BUILTIN_NAMES)
+        raise InputError(
+            f"{path}: does not exist; give a scene's folder, or a built-in scene ({known})."
+        )
+    if path.is_dir():
+        return _load_folder(path, downscale)
+    if path.name in [split_file(split) for split in SPLITS]:
+        return load_blender(path.parent, downscale=downscale)
+    if re.fullmatch(r"transforms.*\.json", path.name):
+        return load_transforms(path, downscale=downscale)
+    raise InputError(f"{path}: is not a scene; give its folder or a transforms*.json in it.")
+
+
+def _load_folder(folder: Path, downscale: int) -> Scene:
+    if exists(folder / split_file("train")):
+        return load_blender(folder, downscale=downscale)
+    if exists(folder / "transforms.json"):
+        return load_transforms(folder / "transforms.json", downscale=downscale)
+    raise InputError(
+        f"{folder}: no scene found: the folder has neither {split_file('train')} (Blender) nor "
+        "transforms.json (instant-ngp, nerfstudio); convert a COLMAP model with colmap2nerf.py or "
+        "ns-process-data."
+    )
+
+
+def _load_builtin(name: str, downscale: int) -> Scene:
+    if name not in BUILTIN_NAMES:
+        known = " and ".join(BUILTIN + known for known in BUILTIN_NAMES)
+        raise InputError(f"{BUILTIN}{name}: no such built-in scene; there are {known}.")
+    from warpnerf.scenes.builtin.room import (
+        room_scene,  # a ray tracer: loaded only where it is used
+    )
+
+    return room_scene(downscale=downscale, sparse=name == "room-sparse")

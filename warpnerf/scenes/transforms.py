@@ -1,0 +1,138 @@
+"""transforms.json as instant-ngp and nerfstudio write it.
+
+``transform_matrix`` is camera to world in OpenGL axes, as everywhere in this project; distances are
+used as the file has them. ``aabb_scale``, ``scale`` and ``offset`` place the scene in instant-ngp's
+own unit cube, ``applied_transform`` tells where the poses came from: neither changes the picture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from warpnerf.checks import InputError
+from warpnerf.scenes.assemble import Frame, assemble, find_images
+from warpnerf.scenes.files import find_image, read_json
+from warpnerf.scenes.lens import LensFields, read_lens
+from warpnerf.scenes.poses import check_pose
+from warpnerf.scenes.scene import Scene
+
+IGNORED = {
+    "mask_path": "masked pixels are trained on like all others",
+    "white_transparent": "white stays opaque",
+    "black_transparent": "black stays opaque",
+    "mask_color": "that colour stays opaque",
+    "rolling_shutter": "each image is taken at one instant",
+}
+"""Keys that would change the picture, and what happens without them."""
+
+
+class PictureKeys(LensFields):
+    """A lens, and the keys that are named in a warning because they are not used."""
+
+    mask_path: object = None
+    white_transparent: object = None
+    black_transparent: object = None
+    mask_color: object = None
+    rolling_shutter: object = None
+
+
+class FrameEntry(PictureKeys, kw_only=True):
+    """One posed image."""
+
+    file_path: str
+    transform_matrix: list[list[float]]
+
+
+class TransformsFile(PictureKeys, kw_only=True):
+    """The whole file; other keys are allowed and not read."""
+
+    frames: list[FrameEntry]
+    train_filenames: list[str] | None = None
+    val_filenames: list[str] | None = None
+    test_filenames: list[str] | None = None
+
+
+def load_transforms(file: Path, *, downscale: int = 1) -> Scene:
+    """Load a scene from a transforms.json.
+
+    The split is the file's ``{train,val,test}_filenames``, else every 8th image is for testing.
+
+    Args:
+        file: The file; image paths in it are relative to its folder and stay inside it.
+        downscale: Edge of the blocks of pixels that become one.
+
+    Raises:
+        InputError: Something in the file or its images is wrong; the message names it.
+    """
+    folder = file.parent
+    data, frames, warnings = read_frames(file)
+    names = {frame.name for frame in frames}
+    splits: dict[str, set[str]] = {}
+    for split in ("train", "val", "test"):
+        listed = getattr(data, f"{split}_filenames") or []
+        members, absent = _listed_names(folder, file, split, listed, names)
+        if listed and not members:
+            raise InputError(
+                f"{file}: $.{split}_filenames: names no image that is among the frames (first: "
+                f"{listed[0]}); correct the list or remove it."
+            )
+        if absent:
+            warnings.append(
+                f"{file.name}: not among the frames: {len(absent)} of {len(listed)} "
+                f"{split}_filenames (first: {absent[0]})"
+            )
+        splits[split] = members
+    return assemble(
+        folder=folder,
+        file=file,
+        frames=frames,
+        splits=splits,
+        warnings=warnings,
+        downscale=downscale,
+    )
+
+
+def read_frames(file: Path) -> tuple[TransformsFile, list[Frame], list[str]]:
+    """Read a file of frames and check everything but the images' pixels.
+
+    Returns:
+        The file's content, the frames whose images are there, and warnings of the others.
+
+    Raises:
+        InputError: As ``load_transforms``.
+    """
+    data = read_json(file, TransformsFile)
+    found, warnings = find_images(file.parent, file, [entry.file_path for entry in data.frames])
+    frames = []
+    for index, path in found.items():
+        entry = data.frames[index]
+        place = f"$.frames[{index}]"
+        frames.append(
+            Frame(
+                name=path.relative_to(file.parent).as_posix(),
+                path=path,
+                c2w=check_pose(entry.transform_matrix, field=f"{file}: {place}.transform_matrix"),
+                lens=read_lens(file, [(place, entry), ("$", data)]),
+            )
+        )
+    for key, consequence in IGNORED.items():
+        if getattr(data, key) or any(getattr(entry, key) for entry in data.frames):
+            warnings.append(f"{file.name}: {key} is not used: {consequence}")
+    return data, frames, warnings
+
+
+def _listed_names(
+    folder: Path, file: Path, split: str, listed: Sequence[str], names: set[str]
+) -> tuple[set[str], list[str]]:
+    """Sort a list of file names into those of frames, by frame name, and the others."""
+    members: set[str] = set()
+    absent: list[str] = []
+    for index, text in enumerate(listed):
+        path = find_image(folder, text, field=f"{file}: $.{split}_filenames[{index}]")
+        name = path.relative_to(folder).as_posix() if path else None
+        if name in names:
+            members.add(str(name))
+        else:
+            absent.append(text)
+    return members, absent

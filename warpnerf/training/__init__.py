@@ -1,0 +1,1 @@
+"""Training: schedule, optimiser, checkpoints, the folder of a run."""

@@ -1,0 +1,133 @@
+"""A training between two updates, as a value: all that it takes to go on exactly as before."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warpnerf.checks import InputError
+from warpnerf.config import TrainConfig
+from warpnerf.model.models import Model
+from warpnerf.rendering.field import Field
+from warpnerf.scenes.scene import Scene
+
+MAY_CHANGE = ("device", "threads", "checkpoint_every")
+"""Fields of TrainConfig that a resumed training may change: what is computed stays the same. The
+first two change how sums are rounded, and so the last bits."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """Where training stands."""
+
+    step: int
+    """Steps done."""
+    fraction: float
+    """Of the whole training, [0, 1]."""
+    seconds: float
+    """Of training, those before a resumption included; compiling does not count."""
+    loss: float
+    """Of the last update: mean over its rays of the squared error, summed over channels."""
+    psnr: float
+    """Of the last update's rays, dB."""
+    samples_per_ray: float
+    """Visited steps per ray of the last update."""
+    size: tuple[int, int, int]
+    """Nodes of the grid."""
+    occupied: float
+    """Share of cells that are not free, [0, 1]."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrainingState:
+    """A training between two updates. Batches are functions of seed and step: no random state."""
+
+    config: TrainConfig
+    """How it trains; on the CPU with the number of threads that it used."""
+    scene_digest: str
+    """``scene_digest`` of what it trains on."""
+    content_distance: float
+    """The one in use, scene units."""
+    reach: float
+    """From the outermost camera to the farthest corner of the first box, scene units."""
+    grown: int
+    """How often the grid has grown."""
+    updates: int
+    """How often the optimiser has updated the grid."""
+    progress: Progress
+    """Where it stands: steps done, seconds, loss."""
+    field: Field
+    """Grid, weights, free space; live arrays if from a trainer, which its next update changes."""
+    optimiser: dict[str, dict[str, wp.array]]
+    """What the optimiser keeps of each parameter, by its name; likewise."""
+
+    def require_same(self, scene: Scene, config: TrainConfig) -> None:
+        """Raise InputError unless a training of this scene and configuration would go on as begun.
+
+        Raises:
+            InputError: A field that decides the result differs, or the photographs do.
+        """
+        self.require_same_config(config)
+        if scene_digest(scene) != self.scene_digest:
+            raise InputError(
+                f"{scene.name} is not what the training to be resumed has seen: its photographs, "
+                "cameras or split have changed; bring them back, or start a new training."
+            )
+
+    def require_same_config(self, config: TrainConfig) -> None:
+        """Raise InputError unless a configuration would go on as begun; see MAY_CHANGE.
+
+        Raises:
+            InputError: A field that decides the result differs.
+        """
+        for name, asked, begun in differences(config, self.config):
+            raise InputError(
+                f"{name} is {asked}, but the training to be resumed has {begun}, and the result "
+                f"would be that of neither; leave {name} as it was, or start a new training."
+            )
+
+
+def differences(ours: TrainConfig, theirs: TrainConfig) -> Iterator[tuple[str, Any, Any]]:
+    """Name and both values of each field that decides the result and differs."""
+    for name, value, other in _pairs("", ours, theirs):
+        if value != other and name not in MAY_CHANGE:
+            yield name, value, other
+
+
+def _pairs(prefix: str, ours: Any, theirs: Any) -> Iterator[tuple[str, Any, Any]]:
+    for field in fields(ours):
+        name, value, other = field.name, getattr(ours, field.name), getattr(theirs, field.name)
+        if is_dataclass(value) and type(value) is type(other):
+            yield from _pairs(f"{prefix}{name}.", value, other)
+        elif isinstance(value, Model):
+            yield f"{prefix}{name}", value.name, other.name
+        else:
+            yield f"{prefix}{name}", value, other
+
+
+def scene_digest(scene: Scene) -> str:
+    """SHA-256 over what training draws from: pixels and cameras of the training views.
+
+    Poses count to 1e-5 of the content distance, and pixels of the camera to 1e-3: another machine
+    may round what it computes of them otherwise.
+    """
+    digest = hashlib.sha256()
+    for index in scene.splits["train"]:
+        view = scene.views[index]
+        camera = view.camera
+        lens = (camera.fx, camera.fy, camera.cx, camera.cy)
+        distortion = (camera.k1, camera.k2, camera.k3, camera.p1, camera.p2)
+        numbers = (
+            np.round(lens, 3),
+            np.round([*distortion, *camera.c2w[:, :3].ravel()], 5),
+            np.round(camera.position / scene.content_distance, 5),
+        )
+        digest.update(f"{view.image.shape}".encode())
+        digest.update((np.concatenate(numbers) + 0.0).tobytes())  # no -0
+        digest.update(np.ascontiguousarray(view.image).data)
+    return digest.hexdigest()

@@ -1,0 +1,473 @@
+"""Training: one update of the grid, and the schedule of all. No files, no terminal."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import warp as wp
+from warpnerf_kernels.base.types import vector
+
+from warpnerf.checks import InputError
+from warpnerf.config import Contraction, TrainConfig
+from warpnerf.model.grid import FreeCells, VoxelGrid, grid_size, require_memory
+from warpnerf.model.models import Model
+from warpnerf.model.parameters import Parameter, first_weights, parameters_of
+from warpnerf.rendering.field import Field
+from warpnerf.rendering.rays import PixelSampler
+from warpnerf.rendering.render import Steps, TrainingPass
+from warpnerf.runtime.memory import give_back
+from warpnerf.runtime.parallel import Workers
+from warpnerf.scenes.scene import Scene
+from warpnerf.training.optim import RULES, adam_step, add_total_variation, first_states
+from warpnerf.training.state import Progress, TrainingState, scene_digest
+from warpnerf.training.warmup import training_kernels
+
+FAR_BOXES = 64.0
+"""How far an unbounded scene is sampled, in half edges of its box; beyond lies the background."""
+
+REPORT_EVERY = 25
+"""Steps between two reports, which come after an update."""
+
+FIRST_LOOK = 200
+"""Steps before the first look for free space and the first growth: what is left out then stays out,
+so densities must have had time to show."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrainResult:
+    """What training leaves."""
+
+    field: Field
+    """The trained scene."""
+    content_distance: float
+    """The one that was used, scene units."""
+    progress: Progress
+    """The last report."""
+
+
+def train(
+    scene: Scene,
+    config: TrainConfig | None = None,
+    *,
+    on_progress: Callable[[Progress], None] | None = None,
+    on_checkpoint: Callable[[TrainingState], None] | None = None,
+    resume: TrainingState | None = None,
+) -> TrainResult:
+    """Train a voxel grid on a scene's training views.
+
+    Each step draws random pixels, marches their rays, and runs one hand-written adjoint back into
+    the grid that scales each sample's gradient by its distance from the camera
+    (Philip & Deschaintre 2023). kernels/README.md derives it.
+
+    Args:
+        scene: From ``load_scene``.
+        config: How to train; None: as the training to be resumed, or else the defaults, which are
+            the preset "fast".
+        on_progress: Called every ``REPORT_EVERY`` steps and at the end.
+        on_checkpoint: Called every ``config.checkpoint_every`` seconds and at the end with what
+            ``save_checkpoint`` takes, whose arrays the next update changes.
+        resume: Where to go on, from ``load_checkpoint``. On the CPU and with the same number of
+            threads, the result is that of a training that was never interrupted, bit for bit.
+
+    Returns:
+        The field, and how training ended.
+
+    Raises:
+        InputError: The device is missing, the grid would not fit the memory, or scene or
+            configuration are not those of the training to be resumed.
+        FloatingPointError: The loss, or a value in the grid, is no longer a finite number.
+    """
+    if config is None:
+        config = TrainConfig() if resume is None else resume.config
+    trainer = Trainer(scene, config, resume)
+    progress = trainer.run(on_progress, on_checkpoint)
+    return TrainResult(
+        field=trainer.field(), content_distance=trainer.content_distance, progress=progress
+    )
+
+
+class Trainer:
+    """A training run between two updates: the grid, its optimiser, and what comes next."""
+
+    def __init__(
+        self, scene: Scene, config: TrainConfig, resume: TrainingState | None = None
+    ) -> None:
+        """Set up the first update, or the next one of a training to be resumed.
+
+        Raises:
+            InputError: The device is missing, the grid would not fit the memory, or scene or
+                configuration are not those of the training to be resumed.
+        """
+        if resume is not None:
+            resume.require_same(scene, config)
+        self.config = config
+        self.workers = Workers(config.device, config.threads)
+        self.steps_done = 0
+        self.content_distance = (
+            scene.content_distance
+            if config.content_distance == "auto"
+            else float(config.content_distance)
+        )
+        _require_samples(scene, config)
+        self._reach = _reach(scene)
+        if resume is not None:  # estimates anew may be rounded otherwise
+            self.content_distance, self._reach = resume.content_distance, resume.reach
+        self._scene_digest = scene_digest(scene)
+        views = [scene.views[i] for i in scene.splits["train"]]
+        behind = config.background
+        if behind == "auto":
+            behind = "white" if scene.has_alpha else "black"
+        self._background = _COLOURS[behind] if isinstance(behind, str) else behind
+        self._sampler = PixelSampler(
+            views,
+            self.content_distance,
+            None if behind == "random" else self._background,
+            config.rays_per_step,
+            config.march.jitter,
+            config.seed,
+            self.workers,
+        )
+        self._accumulation = config.optim.accumulation(scene.kind)
+        self._grown = 0
+        self._updates = 0
+        assert isinstance(config.model, Model)
+        self.model = config.model
+        self.grid = self._first_grid(scene)
+        self.weights = first_weights(self.model, config.seed, self.workers)
+        self.optimiser = first_states(self.parameters(), self.workers)
+        self.free = FreeCells.none(self.workers)
+        self._report_due = False
+        self._started: float | None = None
+        self._seconds = 0.0
+        self._progress: Progress | None = None
+        if resume is not None:
+            self._restore(resume)
+        self._occupied = self.free.share()
+        self._pass = self._training_pass()
+
+    def run(
+        self,
+        on_progress: Callable[[Progress], None] | None = None,
+        on_checkpoint: Callable[[TrainingState], None] | None = None,
+        stop: Callable[[], bool] = lambda: False,
+    ) -> Progress:
+        """Update until the training is done, or ``stop`` says so; callbacks are those of ``train``.
+
+        Raises:
+            FloatingPointError: The loss, or a value in the grid, is no longer a finite number.
+        """
+        saved_step, saved_at = self.steps_done, time.monotonic()
+        while self.fraction < 1.0 and not stop():
+            self.update()
+            if self.report_due:
+                progress = self.report()
+                if on_progress is not None:
+                    on_progress(progress)
+            late = time.monotonic() - saved_at >= self.config.checkpoint_every
+            if on_checkpoint is not None and late:
+                on_checkpoint(self.state())
+                saved_step, saved_at = self.steps_done, time.monotonic()
+        if on_checkpoint is not None and self.steps_done > saved_step:
+            on_checkpoint(self.state())
+        return self.report()
+
+    @property
+    def fraction(self) -> float:
+        """How much of the training is done: of its steps, or of its time where that is further."""
+        done = self.steps_done / self.config.steps
+        if self.config.time_limit is not None:
+            done = max(done, self._seconds / self.config.time_limit)
+        return min(done, 1.0)
+
+    @property
+    def report_due(self) -> bool:
+        """Whether it is time for a report."""
+        return self._report_due or self.fraction >= 1.0
+
+    def update(self) -> None:
+        """Draw the batches of some steps, and update the grid by the gradients of their losses.
+
+        When due, the grid grows and free space is looked for before.
+        """
+        config = self.config
+        if self._started is None:  # compiling is not training
+            for kernel in self._kernels():
+                self.workers.load(kernel)
+        fraction = self.fraction
+        self._grow(fraction)
+        if self._updates % config.occupancy_every == 0:
+            self._look_for_free_space()
+        before = self.steps_done
+        n_steps = min(self._steps_an_update(fraction), config.steps - before)
+        batch = self._sampler.draw(before, n_steps)
+        self._pass.run(self.free, batch, n_steps)
+        if self._updates % config.optim.tv_every == 0:
+            add_total_variation(
+                self.parameters(),
+                self.grid,
+                self._pass.gradients,
+                config.grid.voxels,
+                n_steps,
+                config.optim,
+                self.workers,
+            )
+        self.steps_done += n_steps
+        self._updates += 1
+        adam_step(
+            self.parameters(),
+            self.optimiser,
+            self._pass.gradients,
+            self._updates,
+            config.optim.decay**fraction * n_steps**0.25,
+            config.optim,
+            self.workers,
+        )
+        self._report_due = self.steps_done // REPORT_EVERY > before // REPORT_EVERY
+        if self._started is None:  # nor is the first update, in which memory is first touched
+            self._started = time.perf_counter() - self._seconds
+        self._seconds = time.perf_counter() - self._started
+
+    def report(self) -> Progress:
+        """Where training stands.
+
+        Raises:
+            FloatingPointError: The loss is not finite.
+        """
+        if self._progress is not None and self._progress.step == self.steps_done:
+            return self._progress
+        n_rays = self._pass.n_rays
+        loss = float(self._pass.error.numpy()[:n_rays].mean())
+        if not math.isfinite(loss):
+            raise self._not_finite("the loss is")
+        self._progress = Progress(
+            step=self.steps_done,
+            fraction=self.fraction,
+            seconds=self._seconds,
+            loss=loss,
+            psnr=-10.0 * math.log10(max(loss / 3.0, 1e-12)),
+            samples_per_ray=float(self._pass.n_samples.numpy()[:n_rays].mean()),
+            size=self.grid.size,
+            occupied=self._occupied,
+        )
+        return self._progress
+
+    def state(self) -> TrainingState:
+        """All that it takes to go on, in the trainer's own arrays, which the next update changes.
+
+        Raises:
+            FloatingPointError: The loss, or a value in the grid, is not finite: nothing to go on
+                from.
+        """
+        progress = self.report()
+        for parameter in self.parameters():
+            if not np.isfinite(parameter.values.numpy()).all():
+                raise self._not_finite(f"{parameter.name} of the model are")
+        threads = self.config.threads if self.workers.device.is_cuda else self.workers.count
+        return TrainingState(
+            config=replace(self.config, threads=threads),
+            scene_digest=self._scene_digest,
+            content_distance=self.content_distance,
+            reach=self._reach,
+            grown=self._grown,
+            updates=self._updates,
+            progress=progress,
+            field=self.field(),
+            optimiser=self.optimiser,
+        )
+
+    def _not_finite(self, what: str) -> FloatingPointError:
+        return FloatingPointError(
+            f"{what} not finite after step {self.steps_done}; choose a content distance that fits "
+            "the scene, the clamped scaling, or lower learning rates."
+        )
+
+    def _restore(self, state: TrainingState) -> None:
+        """Take over copies of a state's arrays, and where it stands."""
+
+        def copy(array: wp.array) -> wp.array:
+            return wp.clone(array, device=self.workers.device)
+
+        field = state.field
+        self.grid = replace(field.grid, values=copy(field.grid.values))
+        self.free = replace(field.free, distance=copy(field.free.distance))
+        self.weights = copy(field.weights)
+        self.optimiser = {
+            name: {key: copy(array) for key, array in arrays.items()}
+            for name, arrays in state.optimiser.items()
+        }
+        self._grown = state.grown
+        self._updates = state.updates
+        self._progress = state.progress
+        self.steps_done = state.progress.step
+        self._seconds = state.progress.seconds
+
+    def field(self) -> Field:
+        """The scene as it stands."""
+        return Field(
+            model=self.model,
+            grid=self.grid,
+            weights=self.weights,
+            free=self.free,
+            steps=self.march_steps(),
+            background=self._background,
+            workers=self.workers,
+        )
+
+    def march_steps(self) -> Steps:
+        """How rays are marched through the grid as it stands."""
+        march = self.config.march
+        step = march.step_voxels * float(self.grid.voxel_size.min())
+        half = float(0.5 * (self.grid.box_max - self.grid.box_min).max())
+        folded = self.grid.contraction != "none"
+        far = march.far
+        if far is None:
+            far = march.near + FAR_BOXES * half + self._reach if folded else math.inf
+        n_linear = max(0, math.ceil((self._reach - march.near) / step))
+        return Steps(
+            near=march.near,
+            far=min(far, 1e30),
+            step=step,
+            n_linear=n_linear if folded else 0,
+            growth=march.growth if folded else 0.0,
+            transmittance_min=march.transmittance_min,
+        )
+
+    def _first_grid(self, scene: Scene) -> VoxelGrid:
+        config = self.config.grid
+        contraction = _contraction(scene, self.config)
+        border = 0.0 if contraction == "none" else config.border
+        extent = (scene.box_max - scene.box_min) * (1.0 + border)
+        final = grid_size(extent, config.voxels)
+        require_memory(final, self.model.n_floats, self.workers.device)
+        size = grid_size(extent, self._voxels(0))
+        voxel = float((extent / (np.array(final) - 1)).min())
+        n = math.prod(size)
+        return VoxelGrid(
+            values=wp.zeros(n, dtype=vector(self.model.n_floats), device=self.workers.device),
+            size=size,
+            box_min=scene.box_min,
+            box_max=scene.box_max,
+            contraction=contraction,
+            border=border,
+            # softplus(shift) is the optical depth of a voxel of the final grid.
+            density_shift=math.log(math.expm1(-math.log1p(-config.alpha_init))),
+            density_scale=1.0 / voxel,
+        )
+
+    def _voxels(self, grown: int) -> int:
+        """Nodes after that many growing steps."""
+        left = len(self.config.grid.grow_at) - grown
+        return max(8, self.config.grid.voxels >> left)
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """What is trained."""
+        return parameters_of(self.model, self.grid, self.weights, self.config.optim)
+
+    def _steps_an_update(self, fraction: float) -> int:
+        """Steps whose losses are added up for one, after that share of the training."""
+        return 1 << sum(fraction >= at for at in self._accumulation)
+
+    def _training_pass(self) -> TrainingPass:
+        return TrainingPass(
+            self.config.rays_per_step << len(self._accumulation),
+            self.model,
+            self.grid,
+            self.weights,
+            self.march_steps(),
+            self.config.scaling,
+            self.config.jacobian,
+            self.workers,
+        )
+
+    def _kernels(self) -> list[wp.Kernel]:
+        return training_kernels(
+            self.model,
+            self.grid.contraction,
+            self.config.scaling,
+            self.config.jacobian,
+            self.workers.device,
+        )
+
+    def _grow(self, fraction: float) -> None:
+        """Carry grid and optimiser over to more nodes, once the schedule says so."""
+        grown = sum(fraction >= at for at in self.config.grid.grow_at)
+        if grown == self._grown or self.steps_done < FIRST_LOOK:
+            return
+        box = self._tight_box()
+        extent = (box[1] - box[0]) * (1.0 + self.grid.border)
+        size = grid_size(extent, self._voxels(grown))
+        del self._pass  # gives its memory back before more is asked for
+        grid = self.grid.resized(self.workers, size, box)
+        for parameter in self.parameters():
+            state = self.optimiser[parameter.name]
+            resized = RULES[parameter.kind].resized(state, self.grid, grid, self.workers)
+            self.optimiser[parameter.name] = resized
+        self.grid = grid
+        self._grown = grown
+        give_back()
+        self._pass = self._training_pass()
+        self._look_for_free_space()
+
+    def _tight_box(self) -> tuple[np.ndarray, np.ndarray]:
+        """The box around what is occupied, where space is bounded; never larger than before."""
+        box_min, box_max = self.grid.box_min, self.grid.box_max
+        if self.grid.contraction != "none":
+            return box_min, box_max
+        self._look_for_free_space()
+        occupied = self.free.occupied_range()
+        if occupied is None:
+            return box_min, box_max
+        extent = box_max - box_min
+        return box_min + occupied[0] * extent, box_min + occupied[1] * extent
+
+    def _look_for_free_space(self) -> None:
+        """Find what need not be sampled; not in the first steps, when nothing has grown yet."""
+        if self.steps_done < FIRST_LOOK:
+            return
+        self.free = FreeCells.of(
+            self.grid, self.workers, self.march_steps().struct(), self.config.alpha_min
+        )
+        self._occupied = self.free.share()
+
+
+_COLOURS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "random": (1.0, 1.0, 1.0)}
+
+
+def _contraction(scene: Scene, config: TrainConfig) -> Contraction:
+    if config.grid.contraction == "auto":
+        return "linf" if scene.unbounded else "none"
+    return config.grid.contraction
+
+
+def _require_samples(scene: Scene, config: TrainConfig) -> None:
+    """Raise InputError where march.near and march.far leave no sample inside the box to any ray."""
+    positions = np.array([camera.position for camera in scene.training_cameras])
+    outside = np.maximum(0.0, np.maximum(scene.box_min - positions, positions - scene.box_max))
+    across = np.maximum(np.abs(scene.box_min - positions), np.abs(scene.box_max - positions))
+    begin = float(np.linalg.norm(outside, axis=1).min())
+    end = float(np.linalg.norm(across, axis=1).max())
+    march = config.march
+    if _contraction(scene, config) != "none":
+        begin = 0.0  # space outside the box is sampled too
+    if march.near >= end:
+        raise InputError(
+            f"march.near is {march.near:g}, but the scene's box ends {end:.4g} scene units from "
+            "the farthest camera, so nothing of it would be sampled; use a smaller --near."
+        )
+    if march.far is not None and march.far <= begin:
+        raise InputError(
+            f"march.far is {march.far:g}, but the scene's box begins {begin:.4g} scene units from "
+            "the nearest camera, so nothing of it would be sampled; use a larger one."
+        )
+
+
+def _reach(scene: Scene) -> float:
+    """Distance from the outermost training camera to the farthest corner of the box."""
+    corner = 0.5 * float(np.linalg.norm(scene.box_max - scene.box_min))
+    centre = 0.5 * (scene.box_min + scene.box_max)
+    cameras = [scene.views[i].camera.position for i in scene.splits["train"]]
+    return corner + max(float(np.linalg.norm(p - centre)) for p in cameras)

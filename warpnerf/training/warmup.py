@@ -1,0 +1,121 @@
+"""Which kernels a training needs, and having them compiled before anyone waits for them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import get_args
+
+import warp as wp
+from warpnerf_kernels.fields import dense
+from warpnerf_kernels.launch import assembly
+from warpnerf_kernels.optim import adam, total_variation
+from warpnerf_kernels.sampling import occupancy
+from warpnerf_kernels.space import camera
+
+from warpnerf.config import PRESETS, Contraction, Jacobian, Scaling
+from warpnerf.model.models import Model
+from warpnerf.rendering.render import variant_of
+from warpnerf.runtime import kernel_cache
+from warpnerf.runtime.parallel import Workers
+
+
+@dataclass(frozen=True, kw_only=True)
+class Warmed:
+    """A kernel that is ready."""
+
+    name: str
+    """What it is, in words."""
+    compiled: bool
+    """Whether it had to be compiled; else it was in the cache."""
+    seconds: float
+    """How long that took."""
+
+
+def training_kernels(
+    model: Model, contraction: Contraction, scaling: Scaling, jacobian: Jacobian, device: wp.Device
+) -> list[wp.Kernel]:
+    """The kernels of a training from its first step to its last; at least one for each module.
+
+    Kernels that share a module with one of these are compiled along with it.
+    """
+    n_floats, packed = model.n_floats, not device.is_cuda
+    variant = variant_of(model, "float32", contraction, scaling, jacobian, packed)
+    return [
+        camera.sample_pixels,
+        assembly.render_train_kernel(variant),
+        total_variation.total_variation_backward_kernel(n_floats),
+        adam.adam_kernel(n_floats),
+        adam.adam_weights,
+        adam.resample_moments_kernel(n_floats),
+        occupancy.find_highest_kernel(n_floats),
+        occupancy.mark_occupied,
+        dense.resample_kernel(n_floats),
+    ]
+
+
+def rendering_kernels(model: Model, contraction: Contraction, device: wp.Device) -> list[wp.Kernel]:
+    """The kernels that look at a field; likewise."""
+    packed = not device.is_cuda
+    variant = variant_of(model, "float32", contraction, "none", "none", packed)
+    return [camera.camera_rays, assembly.render_forward_kernel(variant)]
+
+
+def warm_up(
+    device: str = "cpu",
+    on_kernel: Callable[[Warmed], None] = lambda kernel: None,
+    model: Model | None = None,
+) -> list[Warmed]:
+    """Compile whatever training and rendering with the presets need, in every scaling.
+
+    Args:
+        device: Where they are to run: cpu, cuda, cuda:1, ...
+        on_kernel: Called with each kernel that is ready.
+        model: For which model; None: that of the presets.
+
+    Returns:
+        All of them.
+
+    Raises:
+        InputError: The device does not exist, or kernels can be kept nowhere.
+    """
+    workers = Workers(device, 1)
+    model = model or PRESETS["fast"].model
+    wanted: dict[wp.Module, tuple[str, wp.Kernel]] = {}
+    for contraction in _contractions():
+        for kernel in rendering_kernels(model, contraction, workers.device):
+            wanted.setdefault(kernel.module, (_words(kernel, contraction), kernel))
+        for jacobian in dict.fromkeys(preset.jacobian for preset in PRESETS.values()):
+            for scaling in get_args(Scaling):
+                kernels = training_kernels(model, contraction, scaling, jacobian, workers.device)
+                for kernel in kernels:
+                    words = _words(kernel, contraction, scaling)
+                    wanted.setdefault(kernel.module, (words, kernel))
+    done = []
+    for name, kernel in wanted.values():
+        compiled = not kernel_cache.is_compiled(kernel, workers.device)
+        start = time.perf_counter()
+        workers.load(kernel)
+        seconds = time.perf_counter() - start
+        done.append(Warmed(name=name, compiled=compiled, seconds=seconds))
+        on_kernel(done[-1])
+    return done
+
+
+def _contractions() -> list[Contraction]:
+    """Those of the presets; "auto" is none for bounded scenes and linf for others."""
+    found: dict[Contraction, None] = {}
+    for preset in PRESETS.values():
+        chosen = preset.grid.contraction
+        found |= dict.fromkeys(("none", "linf") if chosen == "auto" else (chosen,))
+    return list(found)
+
+
+def _words(kernel: wp.Kernel, contraction: Contraction, scaling: Scaling | None = None) -> str:
+    """A kernel's name, and what it is compiled for where it has a module to itself."""
+    name = str(kernel.key).rpartition("__")[2].replace("_", " ")
+    if not name.startswith("render"):
+        return name
+    space = "" if contraction == "none" else ", space folded in"
+    return name + space + (f", scaling {scaling}" if scaling else "")
