@@ -1,6 +1,6 @@
 """What the scaling does: builtin:room-sparse, trained with and without it, near plane 0.
 
-The model is rgb, as in the paper: colour cannot hide what a floater does.
+The model is rgb: colour that depends on the direction of view can hide a floater from cameras.
 
 Measured on the trained fields: PSNR and depth error on the test views, and density where no surface
 can be, nearer to a training camera than anything in the room: the mean optical depth of a ray from

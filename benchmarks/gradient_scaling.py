@@ -141,11 +141,11 @@ class WarpAdjoint:
         launch = AdjointLaunch(
             assembly.render_backward_kernel(variant),
             variant,
-            self._steps.most(self._grid.diagonal),
+            self._model.most_steps(self._steps, self._grid.diagonal),
             self._batch.count,
             self._workers,
         )
-        share_deferred(self._passes["none"].launch, launch)
+        share_sink(self._passes["none"].launch, launch)
         arguments = (
             self._scene,
             self._batch.struct,
@@ -171,14 +171,14 @@ def share_memory(of: TrainingPass, to: TrainingPass) -> None:
         if isinstance(value, wp.array | Gradients):
             vars(to)[name] = value
     to._scene = of._scene
-    if of.launch.deferred is not None:
+    if of.launch.sink is not None:
         to._scratch.packs, to._scratch.rows = of._scratch.packs, of._scratch.rows
-    share_deferred(of.launch, to.launch)
+    share_sink(of.launch, to.launch)
 
 
-def share_deferred(of: AdjointLaunch, to: AdjointLaunch) -> None:
+def share_sink(of: AdjointLaunch, to: AdjointLaunch) -> None:
     """Have two launches leave records in the same place, with where workers meet."""
-    to.deferred = of.deferred
+    to.sink = of.sink
 
 
 def check(ours: WarpAdjoint, theirs: dict[Scaling, Candidate]) -> None:

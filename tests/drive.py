@@ -113,6 +113,16 @@ class Rendered:
     n_samples: NDArray[np.int32]  # [n_rays]
 
 
+def in_float32(p: Problem) -> Problem:
+    """The same with numbers that float32 holds, so that only arithmetic can differ."""
+    rounded = {
+        name: value.astype(np.float32).astype(np.float64)
+        for name, value in vars(p).items()
+        if isinstance(value, np.ndarray) and value.dtype == np.float64
+    }
+    return replace(p, **rounded)
+
+
 class Kernels:
     """The rendering kernels in one precision, on one device."""
 
@@ -190,8 +200,8 @@ class Kernels:
         return variant_of(p.model, self.precision, p.contraction, scaling, jacobian, self.packed)
 
     def scratch(self, variant: Any, capacity: int, workers: Workers | None = None) -> Any:
-        """Room for `capacity` packs of each worker, of which there must be one."""
-        return scratch_struct(variant, max(capacity, 1), workers or self.workers, self.assembly)
+        """Room to keep so many packs of each worker."""
+        return scratch_struct(variant, capacity, workers or self.workers, self.assembly)
 
     def seen(self, p: Problem) -> Any:
         """What the forward launch writes."""
@@ -254,7 +264,7 @@ class Kernels:
     def adjoint(self, p: Problem, kernel: wp.Kernel, variant: Any) -> AdjointLaunch:
         """How to launch a kernel that ends in a gradient."""
         length = float(np.linalg.norm(p.box_max - p.box_min))
-        most = p.steps.most(math.inf if p.contraction != "none" else length)
+        most = p.model.most_steps(p.steps, math.inf if p.contraction != "none" else length)
         return AdjointLaunch(kernel, variant, most, p.n_rays, self.workers)
 
     def no_gradient(self, p: Problem) -> Any:
@@ -275,14 +285,15 @@ class Kernels:
     def train(
         self, p: Problem, scaling: str = "none", jacobian: str = "none", capacity: int = 64
     ) -> tuple[Float64, Float64]:
-        """Squared errors [n_rays], and the gradient [X, Y, Z, n_floats] of their mean."""
+        """Losses of rays [n_rays], and the gradient [X, Y, Z, n_floats] of their mean."""
         return self.both_train(p, scaling, jacobian, capacity)[:2]
 
     def both_train(
         self, p: Problem, scaling: str = "none", jacobian: str = "none", capacity: int = 64
     ) -> tuple[Float64, Float64, Float64]:
         """That, and the gradient of the weights."""
-        error, n_samples = self.zeros(p.n_rays), self.zeros(p.n_rays, wp.int32)
+        error, loss = self.zeros(p.n_rays), self.zeros(p.n_rays)
+        n_samples = self.zeros(p.n_rays, wp.int32)
         gradient = self.no_gradient(p)
         variant = self.variant(p, scaling, jacobian)
         launch = self.adjoint(p, self.assembly.render_train_kernel(variant), variant)
@@ -295,10 +306,11 @@ class Kernels:
             1.0 / p.n_rays,
             self.scratch(variant, capacity, launch.workers),
             error,
+            loss,
             n_samples,
         )
         found = found_gradient(gradient).reshape(p.raw.shape)
-        return error.numpy(), found, gradient.weights.numpy().sum(axis=0)
+        return error.numpy() + loss.numpy(), found, gradient.weights.numpy().sum(axis=0)
 
 
 def found_gradient(gradient: Any) -> Float64:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import reference
 import torch
-from drive import RGB, Float64, Kernels, Problem, make_problem, oracle
+from drive import RGB, Float64, Kernels, Problem, in_float32, make_problem, oracle
 from torch import Tensor
 
 from warpnerf.model.models import Deferred, Features, Model, Rgb, SphericalHarmonics, n_weights
@@ -121,16 +121,6 @@ def _gradients(
         outputs, (raw, weights), adjoints, allow_unused=True, materialize_grads=True
     )
     return of_raw.numpy(), of_weights.numpy()
-
-
-def in_float32(p: Problem) -> Problem:
-    """The same with numbers that float32 holds, so that only arithmetic can differ."""
-    rounded = {
-        name: value.astype(np.float32).astype(np.float64)
-        for name, value in vars(p).items()
-        if isinstance(value, np.ndarray) and value.dtype == np.float64
-    }
-    return replace(p, **rounded)
 
 
 def smooth_problems(model: Model, n: int, first: int = 0, **changes: Any) -> Iterator[Problem]:

@@ -112,6 +112,7 @@ def test_throughput(tmp_path):
     assert plot.exists() or "no plot: matplotlib is not installed" in printed
 
 
+@pytest.mark.slow
 def test_throughput_of_other_models(tmp_path):
     options = ("--grids", "8", "--rays", "64", "--steps", "16", "--rounds", "2", "--threads", "1")
     options += ("--without", "torch.compile", "numba", "--models", "sh", "deferred", "features")
@@ -180,6 +181,7 @@ def test_models(tmp_path):
             assert row["over_rgb"]["low"] == row["over_rgb"]["high"] == 1.0
 
 
+@pytest.mark.slow
 def test_heads(tmp_path):
     options = ("builtin:room-sparse", "--downscale", "8", "--time-limit", "2", "--points", "3")
     options += ("--models", "rgb", "deferred", "--seeds", "0", "1")
@@ -265,6 +267,7 @@ def test_a_round_counts_where_nobody_else_had_the_cores():
     assert threads.undisturbed([{1: (2.0, 1.0), 2: (2.1, 1.9)}]) == []
 
 
+@pytest.mark.slow
 def test_footprint(tmp_path):
     options = ("builtin:room-sparse", "--downscale", "8", "--steps", "30", "--starts", "2")
     record, printed = run("footprint.py", tmp_path / "record.json", *options)
@@ -281,6 +284,7 @@ def test_footprint(tmp_path):
         assert memory["over_arrays"] == memory["peak_bytes"] / memory["arrays_bytes"]
 
 
+@pytest.mark.slow
 def test_schedules(tmp_path):
     scene = ("builtin:room-sparse", "--downscale", "8")
     options = (*scene, "--seeds", "1", "2", "--time-limit", "1.5")
@@ -303,6 +307,7 @@ def test_ray_order(tmp_path, on_cpu):
     assert printed.count("builtin:room-sparse") == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["rgb", "features"])
 def test_compiled_torch_agrees(model):
     """Apart from the rest, for it takes long to compile."""
@@ -318,7 +323,10 @@ def test_compiled_torch_agrees(model):
     assert set(differences) == {"warpnerf, 2 threads", "torch.compile, 1 threads"}
 
 
-@pytest.mark.parametrize("model", ["sh", "deferred", "features"])
+@pytest.mark.parametrize(
+    "model",
+    [*(pytest.param(name, marks=pytest.mark.slow) for name in ("sh", "features")), "deferred"],
+)
 def test_numba_agrees(model):
     """Likewise."""
     found, missing = candidates.find("cpu", model)

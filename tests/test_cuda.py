@@ -39,7 +39,10 @@ def test_every_kernel_compiles_for_cuda(
         variation.total_variation_forward_kernel(n),
         variation.total_variation_backward_kernel(n),
         precision.load(name, "fields.dense").resample_kernel(n),
-        precision.load(name, "sampling.occupancy").find_highest_kernel(n),
+        precision.load(name, "fields.dense_bound").find_highest_kernel(n),
+        precision.load(name, "sampling.occupancy").mark_occupied_kernel(
+            precision.load(name, "sampling.steps").STEPS
+        ),
         precision.load(name, "launch.probe").probe(n).read_forward,
         precision.load(name, "launch.probe").probe(n).read_backward,
     ]

@@ -1,4 +1,4 @@
-"""Trials say of the kernels what the tests' own driver says."""
+"""Problems say of the kernels what the tests' own driver says."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from warpnerf.evaluation.gradient_check import (
     BOX_MAX,
     BOX_MIN,
     DENSITY_SHIFT,
-    Trial,
-    TrialKernels,
+    ProblemKernels,
+    RayProblem,
     folded,
-    make_trial,
+    make_problem,
     of_model,
     partly_free,
     stopping_early,
@@ -22,37 +22,37 @@ from warpnerf.model.models import Deferred, Features
 from warpnerf.runtime.parallel import Workers
 
 PATHS = {
-    "plain": lambda trial: trial,
+    "plain": lambda problem: problem,
     "stopping early": stopping_early,
     "partly free": partly_free,
     "folded": folded,
-    "deferred": lambda trial: of_model(trial, Deferred()),
-    "features": lambda trial: of_model(trial, Features(width=16, hidden_layers=1)),
+    "deferred": lambda problem: of_model(problem, Deferred()),
+    "features": lambda problem: of_model(problem, Features(width=16, hidden_layers=1)),
 }
 
 
-def problem(trial: Trial) -> Problem:
+def for_driver(problem: RayProblem) -> Problem:
     return Problem(
-        raw=trial.raw,
+        raw=problem.raw,
         box_min=BOX_MIN,
         box_max=BOX_MAX,
-        origins=trial.origins,
-        directions=trial.directions,
-        background=trial.background,
-        target=trial.target,
-        adj_rgb=trial.rgb_slope,
-        adj_opacity=trial.opacity_slope,
-        adj_depth=trial.depth_slope,
-        steps=trial.steps,
-        offsets=trial.offsets,
-        content_distance=trial.content_distance,
-        contraction=trial.contraction,
-        border=trial.border,
+        origins=problem.origins,
+        directions=problem.directions,
+        background=problem.background,
+        target=problem.target,
+        adj_rgb=problem.rgb_slope,
+        adj_opacity=problem.opacity_slope,
+        adj_depth=problem.depth_slope,
+        steps=problem.steps,
+        offsets=problem.offsets,
+        content_distance=problem.content_distance,
+        contraction=problem.contraction,
+        border=problem.border,
         density_shift=DENSITY_SHIFT,
-        density_scale=trial.density_scale,
-        free=trial.free,
-        model=trial.model,
-        weights=trial.weights,
+        density_scale=problem.density_scale,
+        free=problem.free,
+        model=problem.model,
+        weights=problem.weights,
     )
 
 
@@ -63,40 +63,40 @@ def problem(trial: Trial) -> Problem:
         for name, path in PATHS.items()
     ],
 )
-def test_trials_are_the_problems_of_the_tests(path, kernels64: Kernels, device: str) -> None:
-    trial = path(make_trial(3))
-    ours = TrialKernels("float64", Workers(device, 1))
-    seen, expected = ours.see(trial), kernels64.forward(problem(trial))
+def test_problems_are_those_of_the_tests(path, kernels64: Kernels, device: str) -> None:
+    problem = path(make_problem(3))
+    ours = ProblemKernels("float64", Workers(device, 1))
+    seen, expected = ours.see(problem), kernels64.forward(for_driver(problem))
     assert seen.n_samples.sum() > 100
     assert np.array_equal(seen.n_samples, expected.n_samples)
     assert_close(seen.rgb, expected.rgb, 1e-14)
     assert_close(seen.depth, expected.depth, 1e-14)
     assert_close(seen.opacity, expected.opacity, 1e-14)
     for scaling in ("none", "clamped"):
-        found = ours.gradient(trial, scaling)
-        error, trained = ours.train(trial, scaling)
-        values, weights = kernels64.both_backward(problem(trial), scaling)
+        found = ours.gradient(problem, scaling)
+        error, trained = ours.train(problem, scaling)
+        values, weights = kernels64.both_backward(for_driver(problem), scaling)
         expected_error, trained_values, trained_weights = kernels64.both_train(
-            problem(trial), scaling
+            for_driver(problem), scaling
         )
         assert_close(error, expected_error, 1e-14)
         assert_close(found.values, values, 1e-13)
         assert_close(trained.values, trained_values, 1e-13)
-        assert found.weights.shape == trained.weights.shape == trial.weights.shape
-        if trial.weights.size:
+        assert found.weights.shape == trained.weights.shape == problem.weights.shape
+        if problem.weights.size:
             assert_close(found.weights, weights, 1e-13)
             assert_close(trained.weights, trained_weights, 1e-13)
 
 
 def test_paths_leave_samples_out(device: str) -> None:
-    kernels = TrialKernels("float64", Workers(device, 1))
-    whole = kernels.see(make_trial(0)).n_samples.sum()
-    assert kernels.see(stopping_early(make_trial(0))).n_samples.sum() < whole
-    assert kernels.see(partly_free(make_trial(0))).n_samples.sum() < whole
+    kernels = ProblemKernels("float64", Workers(device, 1))
+    whole = kernels.see(make_problem(0)).n_samples.sum()
+    assert kernels.see(stopping_early(make_problem(0))).n_samples.sum() < whole
+    assert kernels.see(partly_free(make_problem(0))).n_samples.sum() < whole
 
 
 def test_rounded_numbers_are_those_of_float32() -> None:
-    trial = make_trial(0).rounded()
-    assert trial.raw.dtype == np.float64
-    assert np.array_equal(trial.raw.astype(np.float32), trial.raw)
-    assert np.abs(trial.raw - make_trial(0).raw).max() > 0.0
+    problem = make_problem(0).rounded()
+    assert problem.raw.dtype == np.float64
+    assert np.array_equal(problem.raw.astype(np.float32), problem.raw)
+    assert np.abs(problem.raw - make_problem(0).raw).max() > 0.0

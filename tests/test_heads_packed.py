@@ -47,16 +47,16 @@ with_mlp = pytest.mark.parametrize("model", [DEFERRED, DEFERRED_SMALL, FEATURES]
 @pytest.fixture(autouse=True)
 def _(on_cpu: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Memory begins with what shows where it is read before it is written."""
-    make_deferred = adjoint._make_deferred
+    make_sink = adjoint._make_sink
 
     def unwritten(*given: Any) -> Any:
-        made = make_deferred(*given)
+        made = make_sink(*given)
         made.records.numpy().view(np.uint8).fill(255)  # not a number
         for numbers in (made.n_records, made.addressed, made.n_addressed):
             numbers.fill_(1 << 24)  # in no one's memory
         return made
 
-    monkeypatch.setattr(adjoint, "_make_deferred", unwritten)
+    monkeypatch.setattr(adjoint, "_make_sink", unwritten)
 
 
 def of(threads: int) -> Stale:
@@ -128,7 +128,7 @@ def test_capacity_changes_nothing(model: Model) -> None:
     """
     for seed in range(4):
         for p in (long(model, seed), early(long(model, seed))):
-            in_one_slot = of(1).both_train(p, "clamped", capacity=1)
+            in_one_slot = of(1).both_train(p, "clamped", capacity=0)
             for capacity in (2, 5, 17, 40, 200):
                 kept = of(1).both_train(p, "clamped", capacity=capacity)
                 for ours, theirs in zip(kept[:2], in_one_slot[:2], strict=True):

@@ -145,7 +145,8 @@ def marked_by(
     alpha_min: float,
     span: int,
 ) -> Any:
-    occupancy, grid = kernels.module("sampling.occupancy"), kernels.grid(p)
+    occupancy, bound = kernels.module("sampling.occupancy"), kernels.module("fields.dense_bound")
+    grid = kernels.grid(p)
 
     def launch(kernel: wp.Kernel, shape: tuple[int, ...], *arguments: Any) -> Any:
         out = kernels.zeros(int(np.prod(shape)))
@@ -153,15 +154,13 @@ def marked_by(
         return out
 
     x, y, _ = p.raw.shape[:3]
-    highest = launch(
-        occupancy.find_highest_kernel(p.raw.shape[3]), (x, y, cells[2]), grid, cells[2]
-    )
-    join = occupancy.join_highest
+    highest = launch(bound.find_highest_kernel(p.raw.shape[3]), (x, y, cells[2]), grid, cells[2])
+    join = bound.join_highest
     highest = launch(join, (x, *cells[1:]), y, cells[1], cells[2], highest)
     highest = launch(join, cells, x, cells[0], cells[1] * cells[2], highest)
     out = wp.zeros(highest.size, dtype=wp.uint8, device=kernels.device)
     kernels.workers.launch(
-        occupancy.mark_occupied,
+        occupancy.mark_occupied_kernel(kernels.module("sampling.steps").STEPS),
         highest.size // span,
         span,
         kernels.box(p),

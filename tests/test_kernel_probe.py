@@ -10,14 +10,14 @@ import reference
 import torch
 from drive import N_SEEDS, assert_close
 
-from warpnerf.evaluation.gradient_check import TrialKernels, make_trial, of_model
+from warpnerf.evaluation.gradient_check import ProblemKernels, make_problem, of_model
 from warpnerf.model.models import Deferred, Model, Rgb
 from warpnerf.runtime.parallel import Workers
 
 
 @pytest.mark.parametrize("model", [Rgb(), Deferred()], ids=lambda model: model.name)
 def test_gather_and_its_transpose_against_the_oracle(model: Model, device: str) -> None:
-    kernels = TrialKernels("float64", Workers(device, 2))
+    kernels = ProblemKernels("float64", Workers(device, 2))
     for seed in range(N_SEEDS):
         rng = np.random.default_rng(seed)
         size = rng.integers(2, 7, size=3)
@@ -30,5 +30,5 @@ def test_gather_and_its_transpose_against_the_oracle(model: Model, device: str) 
         expected = reference.trilinear(grid, u)
         assert_close(kernels.gather(values, points), expected.detach(), 1e-14)
         (gradient,) = torch.autograd.grad(expected, grid, torch.tensor(out))
-        trial = replace(of_model(make_trial(0), model), raw=values)
-        assert_close(kernels.scatter(trial, points, out), gradient, 1e-14)
+        problem = replace(of_model(make_problem(0), model), raw=values)
+        assert_close(kernels.scatter(problem, points, out), gradient, 1e-14)

@@ -15,7 +15,7 @@ from warpnerf_kernels.cpu import schedule
 
 from warpnerf.rendering import adjoint
 from warpnerf.rendering.render import Steps
-from warpnerf.runtime.parallel import Packed
+from warpnerf.runtime.parallel import LaunchCache
 
 PLANES = 5
 """Of nodes along x, in the problems here."""
@@ -24,16 +24,16 @@ PLANES = 5
 @pytest.fixture(autouse=True)
 def _(on_cpu: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Memory begins with what shows where it is read before it is written."""
-    make_deferred = adjoint._make_deferred
+    make_sink = adjoint._make_sink
 
     def unwritten(variant: Any, n_packs: int, n_workers: int) -> Any:
-        made = make_deferred(variant, n_packs, n_workers)
+        made = make_sink(variant, n_packs, n_workers)
         made.records.numpy().view(np.uint8).fill(255)  # not a number
         for numbers in (made.addressed, made.n_records, made.n_addressed):
             numbers.fill_(1 << 24)  # in no one's memory
         return made
 
-    monkeypatch.setattr(adjoint, "_make_deferred", unwritten)
+    monkeypatch.setattr(adjoint, "_make_sink", unwritten)
     leave_chunks_unwritten(monkeypatch)
 
 
@@ -97,7 +97,7 @@ def test_nothing_is_left_of_what_is_all_one_s_own(monkeypatch: pytest.MonkeyPatc
     p = one_sample_each(nodes, (PLANES, 7, 6))
     launches = launches_of(monkeypatch)
     gradient = of(2).backward(p)
-    made = launches[0].deferred
+    made = launches[0].sink
     assert made is not None
     assert made.n_records.numpy()[:, 0].tolist() == [0, n // 2]
     assert made.n_addressed.numpy()[:, :2].tolist() == [[0, 0], [n // 2, 0]]
@@ -134,7 +134,7 @@ def test_only_tiles_around_a_sample_are_flagged(threads: int) -> None:
 
 def most_steps(p: Problem) -> int:
     length = float(np.linalg.norm(p.box_max - p.box_min))
-    return p.steps.most(length if p.contraction == "none" else math.inf)
+    return p.model.most_steps(p.steps, length if p.contraction == "none" else math.inf)
 
 
 @pytest.mark.parametrize("near", [0.0, 0.5])
@@ -180,7 +180,7 @@ def test_fewer_workers_where_there_is_no_room_for_all(monkeypatch: pytest.Monkey
     monkeypatch.setattr(adjoint, "SAMPLES", 4 * (most_steps(p) + LANES + schedule.RAY))
     launches = launches_of(monkeypatch)
     assert_close(of(3).backward(p), of(1).backward(p), 3e-6)
-    made = launches[0].deferred
+    made = launches[0].sink
     assert made is not None and made.records.shape[0] == 2
 
 
@@ -192,17 +192,17 @@ def test_nothing_is_added_where_a_worker_is_missing(
     p = problem(2)
     whole = of(1).backward(p)
     kernels = of(threads)
-    start = Packed.launch
+    start = LaunchCache.launch
     for missing in range(threads):
 
-        def fails(packed: Packed, worker: int, *given: Any, missing: int = missing) -> None:
+        def fails(cache: LaunchCache, worker: int, *given: Any, missing: int = missing) -> None:
             if worker == missing:
                 raise KeyboardInterrupt
-            start(packed, worker, *given)
+            start(cache, worker, *given)
 
         gradient = kernels.no_gradient(p)
         with monkeypatch.context() as patch:
-            patch.setattr(Packed, "launch", fails)
+            patch.setattr(LaunchCache, "launch", fails)
             with pytest.raises(KeyboardInterrupt):
                 kernels.add_backward(p, gradient)
         assert not gradient.values.numpy().any()
@@ -219,11 +219,11 @@ def test_there_is_room_for_all_records(monkeypatch: pytest.MonkeyPatch) -> None:
     p = replace(p, steps=Steps(near=0.0, far=4.0, step=0.004))
     launches = launches_of(monkeypatch)
     of(3).backward(p)
-    work = int(launches[0].deferred.chunk.work.numpy().sum())
+    work = int(launches[0].sink.chunk.work.numpy().sum())
     monkeypatch.setattr(adjoint, "SAMPLES", work + 3 * (most_steps(p) + LANES + schedule.RAY) + 2)
     kernels = of(3)
     kernels.backward(p)
-    made = launches[1].deferred
+    made = launches[1].sink
     assert made is not None
     most, room = made.n_records.numpy()[:, 0].max(), made.records.shape[1]
     assert 0.9 * room < most <= room
@@ -237,7 +237,7 @@ def test_nothing_is_left_where_each_takes_its_own_rays(monkeypatch: pytest.Monke
     p = one_sample_each(nodes, (PLANES, 7, 6))
     launches = launches_of(monkeypatch)
     gradient = of(2).backward(p)
-    made = launches[0].deferred
+    made = launches[0].sink
     assert made is not None
     assert made.n_records.numpy()[:, 0].tolist() == [0, 0]
     assert_close(gradient, of(1).backward(p), 3e-6)
@@ -252,19 +252,24 @@ def test_workers_add_to_no_planes_but_their_own(
     whole = of(1).backward(p)
     kernels = of(threads)
     own = [kernels.no_gradient(p) for _ in range(threads)]
-    start = Packed.launch
+    start = LaunchCache.launch
 
     def launch(
-        packed: Packed, worker: int, kernel: wp.Kernel, n: int, arguments: list[Any], device: Any
+        cache: LaunchCache,
+        worker: int,
+        kernel: wp.Kernel,
+        n: int,
+        arguments: list[Any],
+        device: Any,
     ) -> None:
         shared = arguments[-1]
         alone = type(shared)()
         for name in ("records", "n_records", "addressed", "n_addressed", "chunk"):
             setattr(alone, name, getattr(shared, name))
         alone.gradient = own[worker]
-        start(packed, worker, kernel, n, [*arguments[:-1], alone], device)
+        start(cache, worker, kernel, n, [*arguments[:-1], alone], device)
 
-    monkeypatch.setattr(Packed, "launch", launch)
+    monkeypatch.setattr(LaunchCache, "launch", launch)
     kernels.backward(p)
     n_planes = -(-PLANES // threads)
     found = [gradient.values.numpy().reshape(whole.shape) for gradient in own]

@@ -15,7 +15,7 @@ from warpnerf.evaluation.near_field import (
     MAX_PIXELS,
     MAX_PULLED,
     coarse,
-    measure_nearness,
+    measure_near_field,
     pulled_back,
 )
 from warpnerf.model.grid import FreeCells
@@ -57,7 +57,7 @@ def scene_inside(n: int = 3) -> Scene:
 @pytest.mark.parametrize("sigma", [0.01, 0.4, 3.0])
 def test_mass_of_even_density(sigma: float) -> None:
     """The integral of sigma up to the limit, whatever lies behind."""
-    found = measure_nearness(even_field(sigma), scene_inside())
+    found = measure_near_field(even_field(sigma), scene_inside())
     assert found.within == WITHIN
     assert found.near_mass == pytest.approx(sigma * WITHIN, rel=0.01)
 
@@ -65,7 +65,7 @@ def test_mass_of_even_density(sigma: float) -> None:
 def test_rays_that_end_near() -> None:
     """In thin matter light gets far; in dense matter, not; in empty space there is none to end."""
     for sigma, share in ((1e-3, 0.0), (0.5, 0.0), (20.0, 1.0)):
-        assert measure_nearness(even_field(sigma), scene_inside()).near_rays == share
+        assert measure_near_field(even_field(sigma), scene_inside()).near_rays == share
 
 
 def test_what_hangs_before_one_of_four_cameras_counts_for_a_quarter() -> None:
@@ -73,14 +73,14 @@ def test_what_hangs_before_one_of_four_cameras_counts_for_a_quarter() -> None:
     scene = scene_inside(4)
     away = replace(scene.views[0].camera, c2w=scene.views[0].camera.c2w + [[0, 0, 0, 9.0]] * 3)
     views = [replace(view, camera=away) for view in scene.views[:3]]
-    found = measure_nearness(field, replace(scene, views=[*views, scene.views[3]]))
+    found = measure_near_field(field, replace(scene, views=[*views, scene.views[3]]))
     assert found.near_rays == 0.25
     assert found.near_mass == pytest.approx(0.25 * 20.0 * WITHIN, rel=0.01)
 
 
 def test_without_new_photographs_nothing_is_pulled_back() -> None:
     field = tiny_field()
-    found = measure_nearness(field, scene_of(field, depth=False))
+    found = measure_near_field(field, scene_of(field, depth=False))
     assert (found.pulled_back, found.pulled_psnr, found.pulled_views) == (None, None, None)
     assert list(found.to_dict()) == ["within", "near_mass", "near_rays"]
     assert "pulled" not in str(found)
@@ -96,7 +96,7 @@ def test_pulled_back_cameras_see_what_their_photographs_show() -> None:
             return None
         return np.round(255.0 * field.render(camera).rgb).astype(np.uint8)
 
-    found = measure_nearness(field, replace(scene_inside(40), photograph=photograph))
+    found = measure_near_field(field, replace(scene_inside(40), photograph=photograph))
     assert len(cameras) <= MAX_PULLED
     assert found.pulled_views == len(cameras) - 1
     assert found.pulled_back == 1.0
@@ -108,7 +108,7 @@ def test_pulled_back_cameras_see_what_their_photographs_show() -> None:
     def black(camera):
         return np.zeros((30, 40, 3), np.uint8)
 
-    wrong = measure_nearness(field, replace(scene_inside(), photograph=black))
+    wrong = measure_near_field(field, replace(scene_inside(), photograph=black))
     assert wrong.pulled_psnr is not None and wrong.pulled_psnr < 20.0
 
 

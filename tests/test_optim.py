@@ -117,9 +117,10 @@ def test_weights_are_updated_by_the_sum_of_the_workers_gradients(
     device_threads: int, device: str
 ) -> None:
     """Against the oracle's Adam; what has no gradient stays, and gradients are zeroed."""
-    model, workers = Features(width=16, hidden_layers=1), Workers(device, device_threads)
+    model = Features(width=16, hidden_layers=1, learning_rate_mlp=0.03)
+    workers = Workers(device, device_threads)
     grid = grid_of(np.zeros((2, 2, 2, model.n_floats)), workers)
-    config = OptimConfig(learning_rate_mlp=0.03, epsilon=1e-4)
+    config = OptimConfig(epsilon=1e-4)
     parameters = learned(model, grid, config, workers)
     states = first_states(parameters, workers)
     gradients = Gradients.zeros(model, 8, workers)
@@ -135,7 +136,7 @@ def test_weights_are_updated_by_the_sum_of_the_workers_gradients(
         before = parameters[1].values.numpy().copy()
         adam_step(parameters, states, gradients, update, factor, config, workers)
         total = torch.tensor(given.astype(float).sum(axis=0)[:n])
-        rate = torch.tensor(factor * config.learning_rate_mlp, dtype=torch.float64)
+        rate = torch.tensor(factor * model.learning_rate_mlp, dtype=torch.float64)
         tensors = [torch.tensor(a) for a in (values, mean, square)]
         values, mean, square = (
             t.numpy()
@@ -156,9 +157,7 @@ def test_weights_are_updated_by_the_sum_of_the_workers_gradients(
 def test_each_number_of_a_node_has_its_rate(device: str) -> None:
     """In the first update, Adam moves each entry by its rate, whatever the gradient."""
     model, workers = DEFERRED, Workers(device, 2)
-    config = OptimConfig(
-        learning_rate_density=0.4, learning_rate_rgb=0.3, learning_rate_features=0.2, epsilon=1e-9
-    )
+    config = OptimConfig(learning_rate_density=0.4, learning_rate_rgb=0.3, epsilon=1e-9)
     grid = grid_of(np.zeros((2, 3, 2, model.n_floats)), workers)
     parameters = learned(model, grid, config, workers)
     gradients = Gradients.zeros(model, 12, workers)

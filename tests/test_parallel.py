@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import warp as wp
 from drive import Kernels, make_problem
-from warpnerf_kernels.cpu.barrier import meet
+from warpnerf_kernels.cpu.barrier import wait_for_all
 
 from warpnerf.checks import InputError
-from warpnerf.runtime.parallel import NODES, RAYS, Packed, Thread, Workers
+from warpnerf.runtime.parallel import NODES, RAYS, LaunchCache, Thread, Workers
 
 
 @wp.kernel(enable_backward=False)
@@ -58,8 +58,8 @@ def test_workers_own_contiguous_shares(on_cpu: None) -> None:
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3])
-def test_what_is_packed_follows_what_changes(threads: int, device: str) -> None:
-    workers, packed = Workers(device, threads), Packed()
+def test_what_is_kept_follows_what_changes(threads: int, device: str) -> None:
+    workers, cache = Workers(device, threads), LaunchCache()
 
     def array(*values: float) -> wp.array:
         return wp.array(values, dtype=float, device=workers.device)
@@ -77,31 +77,35 @@ def test_what_is_packed_follows_what_changes(threads: int, device: str) -> None:
     ):
         line.slope, line.start = slope, start
         to.fill_(-100.0)
-        workers.launch(draw_line, n, line, factor, to, chunk=6, packed=packed)
+        workers.launch(draw_line, n, line, factor, to, chunk=6, cache=cache)
         expected = factor * (start.numpy()[0] + slope * np.arange(n))
         np.testing.assert_array_equal(to.numpy(), [*expected, *[-100.0] * (50 - n)])
 
 
-def test_what_stays_the_same_is_packed_once(monkeypatch: pytest.MonkeyPatch, on_cpu: None) -> None:
-    workers, packed = Workers("cpu", 2), Packed()
+def test_what_stays_the_same_is_converted_once(
+    monkeypatch: pytest.MonkeyPatch, on_cpu: None
+) -> None:
+    workers, cache = Workers("cpu", 2), LaunchCache()
     visits = wp.zeros(10, dtype=wp.int32, device="cpu")
     owner = wp.zeros(10, dtype=wp.int32, device="cpu")
-    kept = Packed()
-    workers.launch(count_visits, 10, visits, packed=packed)
-    workers.launch_owned(note_worker, 10, owner, packed=kept)
+    kept = LaunchCache()
+    workers.launch(count_visits, 10, visits, cache=cache)
+    workers.launch_owned(note_worker, 10, owner, cache=kept)
     monkeypatch.setattr(wp, "launch", None)
     for _ in range(3):
-        workers.launch(count_visits, 10, visits, packed=packed)
+        workers.launch(count_visits, 10, visits, cache=cache)
     owner.fill_(7)
-    workers.launch_owned(note_worker, 10, owner, packed=kept)
+    workers.launch_owned(note_worker, 10, owner, cache=kept)
     assert (visits.numpy() == 4).all()
     assert np.array_equal(owner.numpy(), np.repeat([0, 1], 5))
 
 
-def test_what_was_interrupted_is_packed_anew(monkeypatch: pytest.MonkeyPatch, on_cpu: None) -> None:
-    workers, packed = Workers("cpu", 1), Packed()
+def test_what_was_interrupted_is_converted_anew(
+    monkeypatch: pytest.MonkeyPatch, on_cpu: None
+) -> None:
+    workers, cache = Workers("cpu", 1), LaunchCache()
     visits, others = (wp.zeros(10, dtype=wp.int32, device="cpu") for _ in range(2))
-    workers.launch(count_visits, 10, visits, packed=packed)
+    workers.launch(count_visits, 10, visits, cache=cache)
 
     def interrupted(command: wp.Launch, n: int) -> None:
         raise KeyboardInterrupt
@@ -109,8 +113,8 @@ def test_what_was_interrupted_is_packed_anew(monkeypatch: pytest.MonkeyPatch, on
     with monkeypatch.context() as patch:
         patch.setattr(wp.Launch, "set_dim", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            workers.launch(count_visits, 5, others, packed=packed)
-    workers.launch(count_visits, 10, visits, packed=packed)
+            workers.launch(count_visits, 5, others, cache=cache)
+    workers.launch(count_visits, 10, visits, cache=cache)
     assert (visits.numpy() == 2).all() and not others.numpy().any()
 
 
@@ -118,32 +122,32 @@ def test_what_was_interrupted_is_packed_anew(monkeypatch: pytest.MonkeyPatch, on
 def add_up_together(
     first: int,
     worker: int,
-    n_meetings: int,
-    meeting: wp.array(dtype=wp.int32),
+    n_waits: int,
+    barrier: wp.array(dtype=wp.int32),
     numbers: wp.array(dtype=wp.int32),
     out_sum: wp.array2d(dtype=wp.int32),
 ):
     n_workers = numbers.shape[0]
-    for i in range(n_meetings):
+    for i in range(n_waits):
         numbers[worker] = numbers[worker] + worker + 1
-        if not meet(meeting, n_workers):
+        if not wait_for_all(barrier, n_workers):
             return
         for other in range(n_workers):
             out_sum[worker, i] += numbers[other]
-        if not meet(meeting, n_workers):
+        if not wait_for_all(barrier, n_workers):
             return
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3, 7])
-def test_workers_meet(threads: int, on_cpu: None) -> None:
+def test_workers_wait_for_each_other(threads: int, on_cpu: None) -> None:
     """More of them than cores, again and again: none goes on before all have come."""
-    workers, packed = Workers("cpu", threads), Packed()
+    workers, cache = Workers("cpu", threads), LaunchCache()
     expected = threads * (threads + 1) // 2 * np.arange(1, 51)
     for _ in range(20):
         numbers = wp.zeros(threads, dtype=wp.int32, device="cpu")
         sums = wp.zeros((threads, 50), dtype=wp.int32, device="cpu")
         workers.launch_owned(
-            add_up_together, threads, 50, workers.barrier, numbers, sums, packed=packed
+            add_up_together, threads, 50, workers.barrier, numbers, sums, cache=cache
         )
         assert (sums.numpy() == expected).all()
 
@@ -152,23 +156,23 @@ def test_workers_meet(threads: int, on_cpu: None) -> None:
 def test_nobody_waits_for_who_does_not_come(
     missing: int, monkeypatch: pytest.MonkeyPatch, on_cpu: None
 ) -> None:
-    workers, packed = Workers("cpu", 3), Packed()
+    workers, cache = Workers("cpu", 3), LaunchCache()
     numbers = wp.zeros(3, dtype=wp.int32, device="cpu")
     sums = wp.zeros((3, 1), dtype=wp.int32, device="cpu")
 
     def launch() -> None:
-        workers.launch_owned(add_up_together, 3, 1, workers.barrier, numbers, sums, packed=packed)
+        workers.launch_owned(add_up_together, 3, 1, workers.barrier, numbers, sums, cache=cache)
 
     launch()
-    start = Packed.launch
+    start = LaunchCache.launch
 
-    def fails(packed: Packed, worker: int, *given: Any) -> None:
+    def fails(cache: LaunchCache, worker: int, *given: Any) -> None:
         if worker == missing:
             raise KeyboardInterrupt
-        start(packed, worker, *given)
+        start(cache, worker, *given)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Packed, "launch", fails)
+        patch.setattr(LaunchCache, "launch", fails)
         with pytest.raises(KeyboardInterrupt):
             launch()
     assert (sums.numpy() == 6).all()
@@ -179,11 +183,11 @@ def test_nobody_waits_for_who_does_not_come(
 @pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="no such signal here")
 def test_interrupted_anywhere(on_cpu: None) -> None:
     """Launches that follow are whole."""
-    workers, packed = Workers("cpu", 3), Packed()
+    workers, cache = Workers("cpu", 3), LaunchCache()
     numbers = wp.zeros(3, dtype=wp.int32, device="cpu")
     sums = wp.zeros((3, 1), dtype=wp.int32, device="cpu")
     arguments = (add_up_together, 3, 1, workers.barrier, numbers, sums)
-    workers.launch_owned(*arguments, packed=packed)
+    workers.launch_owned(*arguments, cache=cache)
     before = signal.signal(signal.SIGALRM, signal.default_int_handler)
     interrupted = 0
     try:
@@ -191,13 +195,13 @@ def test_interrupted_anywhere(on_cpu: None) -> None:
             try:
                 signal.setitimer(signal.ITIMER_REAL, seconds)
                 for _ in range(100):
-                    workers.launch_owned(*arguments, packed=packed)
+                    workers.launch_owned(*arguments, cache=cache)
             except KeyboardInterrupt:
                 interrupted += 1
             signal.setitimer(signal.ITIMER_REAL, 0)
             numbers.zero_()
             sums.zero_()
-            workers.launch_owned(*arguments, packed=packed)
+            workers.launch_owned(*arguments, cache=cache)
             assert (sums.numpy() == 6).all()
     finally:
         signal.signal(signal.SIGALRM, before)
@@ -206,31 +210,31 @@ def test_interrupted_anywhere(on_cpu: None) -> None:
 
 def test_an_interrupt_is_interrupted(monkeypatch: pytest.MonkeyPatch, on_cpu: None) -> None:
     """Who is left in a launch is waited for by the next one."""
-    workers, packed = Workers("cpu", 2), Packed()
+    workers, cache = Workers("cpu", 2), LaunchCache()
     numbers = wp.zeros(2, dtype=wp.int32, device="cpu")
     sums = wp.zeros((2, 1), dtype=wp.int32, device="cpu")
     arguments = (add_up_together, 2, 1, workers.barrier, numbers, sums)
-    workers.launch_owned(*arguments, packed=packed)
-    start, came, go_on = Packed.launch, threading.Event(), threading.Event()
+    workers.launch_owned(*arguments, cache=cache)
+    start, came, go_on = LaunchCache.launch, threading.Event(), threading.Event()
 
-    def late(packed: Packed, worker: int, *given: Any) -> None:
+    def late(cache: LaunchCache, worker: int, *given: Any) -> None:
         if worker == 0:
             came.wait()
             raise KeyboardInterrupt
         came.set()
         go_on.wait()
-        start(packed, worker, *given)
+        start(cache, worker, *given)
 
     def interrupted(thread: Thread) -> None:
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(Packed, "launch", late)
+        patch.setattr(LaunchCache, "launch", late)
         patch.setattr(Thread, "wait", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            workers.launch_owned(*arguments, packed=packed)
+            workers.launch_owned(*arguments, cache=cache)
     threading.Timer(0.2, go_on.set).start()
-    workers.launch_owned(*arguments, packed=packed)
+    workers.launch_owned(*arguments, cache=cache)
     assert numbers.numpy().tolist() == [2, 6]  # the second worker was there one more time
     assert (sums.numpy() == 3 + 8).all()
 
@@ -252,12 +256,12 @@ def test_launches_from_several_threads_take_turns(on_cpu: None) -> None:
 
 
 def test_one_keeps_what_several_kernels_take(on_cpu: None) -> None:
-    workers, packed = Workers("cpu", 2), Packed()
+    workers, cache = Workers("cpu", 2), LaunchCache()
     visits = wp.zeros(10, dtype=wp.int32, device="cpu")
     owner = wp.zeros(10, dtype=wp.int32, device="cpu")
     for _ in range(2):
-        workers.launch(count_visits, 10, visits, packed=packed)
-        workers.launch_owned(note_worker, 10, owner, packed=packed)
+        workers.launch(count_visits, 10, visits, cache=cache)
+        workers.launch_owned(note_worker, 10, owner, cache=cache)
     assert (visits.numpy() == 2).all()
     assert np.array_equal(owner.numpy(), np.repeat([0, 1], 5))
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import warp as wp
-from drive import Kernels, Problem, assert_close, make_problem
+from drive import Kernels, Problem, assert_close, in_float32, make_problem
 from seams.constant_features import OneColour
 from seams.given_distances import AtDistances
 from seams.grey import Grey
@@ -16,7 +16,7 @@ from test_kernel_render import early, masked
 from tiny_scenes import ring, tiny_scene
 
 from warpnerf.config import GridConfig, OptimConfig, TrainConfig
-from warpnerf.model.models import Model, model_of
+from warpnerf.model.models import Model, model_of, parts_of
 from warpnerf.runtime.parallel import Workers
 from warpnerf.scenes.scene import Scene
 from warpnerf.training import trainer
@@ -64,6 +64,22 @@ def test_gradient_against_central_differences(model: Model, kernels64: Kernels) 
                 expected.append((8.0 * near - far) / (12.0 * h))
         assert len(found) >= 6
         assert_close(found, expected, 1e-7)
+
+
+@each_seam
+def test_gradient_on_the_cpu(model: Model, kernels64: Kernels) -> None:
+    """In float32, by the form and the workers that training takes, against float64."""
+    kernels = Kernels("float32", "cpu", threads=3, packed=True)
+    for seed in range(4):
+        p = in_float32(problem(model, seed))
+        exact, found = kernels64.train(p, "clamped"), kernels.train(p, "clamped")
+        assert_close(found[0], exact[0], 1e-5)
+        assert_close(found[1], exact[1], 2e-5)
+
+
+@pytest.mark.parametrize("name", ["loss", "loss with sums", "two losses"])
+def test_losses_have_the_vector_form(name: str) -> None:
+    assert parts_of(MODELS[name], "float32").have_packs
 
 
 def test_losses_add_up(kernels64: Kernels) -> None:

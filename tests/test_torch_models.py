@@ -6,14 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from drive import Problem, assert_close
+from drive import Problem, assert_close, in_float32
 from drive_models import (
     DEFERRED,
     DEFERRED_SMALL,
     FEATURES,
     FEATURES_SMALL,
     SH,
-    in_float32,
     layers_of,
     name_of,
     oracle_both,

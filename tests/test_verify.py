@@ -13,7 +13,7 @@ import pytest
 
 from warpnerf.checks import InputError
 from warpnerf.evaluation import verify as checks
-from warpnerf.evaluation.gradient_check import Found, TrialKernels
+from warpnerf.evaluation.gradient_check import Found, ProblemKernels
 from warpnerf.evaluation.verify import Result, relative_error, report, verify
 from warpnerf.model.models import Deferred, Model
 from warpnerf.runtime.parallel import Workers
@@ -75,34 +75,34 @@ def weights_times(factor: float) -> Spoil:
 
 
 def without_scaling(method: Callable[..., Any]) -> Callable[..., Any]:
-    return lambda self, trial, scaling="none": method(self, trial)
+    return lambda self, problem, scaling="none": method(self, problem)
 
 
 def never_above_one(method: Callable[..., Any]) -> Callable[..., Any]:
-    return lambda self, trial, scaling="none": method(
-        self, trial, "quadratic" if scaling == "clamped" else scaling
+    return lambda self, problem, scaling="none": method(
+        self, problem, "quadratic" if scaling == "clamped" else scaling
     )
 
 
 def brighter_when_scaled(method: Callable[..., Any]) -> Callable[..., Any]:
-    def train(self: TrialKernels, trial: Any, scaling: str = "none") -> Any:
-        error, gradient = method(self, trial, scaling)
+    def train(self: ProblemKernels, problem: Any, scaling: str = "none") -> Any:
+        error, gradient = method(self, problem, scaling)
         return (np.nextafter(error, 1.0) if scaling == "clamped" else error), gradient
 
     return train
 
 
 def sum_for_mean(method: Callable[..., Any]) -> Callable[..., Any]:
-    def train(self: TrialKernels, trial: Any, scaling: str = "none") -> Any:
-        error, gradient = method(self, trial, scaling)
-        return error, multiplied(gradient, trial.n_rays)
+    def train(self: ProblemKernels, problem: Any, scaling: str = "none") -> Any:
+        error, gradient = method(self, problem, scaling)
+        return error, multiplied(gradient, problem.n_rays)
 
     return train
 
 
 def coarse_when_packed(method: Callable[..., Any]) -> Callable[..., Any]:
-    def see(self: TrialKernels, trial: Any) -> Any:
-        seen = method(self, trial)
+    def see(self: ProblemKernels, problem: Any) -> Any:
+        seen = method(self, problem)
         return replace(seen, depth=seen.depth * (1.0 + 1e-3 * self._packed))
 
     return see
@@ -136,7 +136,7 @@ def test_each_can_fail(
     if not any("features" in word for word in words):
         monkeypatch.setattr(checks, "VIEW_DEPENDENT", (Deferred(),))
     assert failing(device, *words) == set()
-    monkeypatch.setattr(TrialKernels, method, spoil(getattr(TrialKernels, method)))
+    monkeypatch.setattr(ProblemKernels, method, spoil(getattr(ProblemKernels, method)))
     spoilt = failing(device, *words)
     assert all(any(word in name for name in spoilt) for word in words)
 
@@ -162,8 +162,8 @@ def test_a_check_that_cannot_run_fails_and_says_why(
         raise RuntimeError("does not compile\nat all")
 
     monkeypatch.setattr(checks, "VIEW_DEPENDENT", (Deferred(),))
-    monkeypatch.setattr(TrialKernels, "see", broken)
-    monkeypatch.setattr(TrialKernels, "train", broken)
+    monkeypatch.setattr(ProblemKernels, "see", broken)
+    monkeypatch.setattr(ProblemKernels, "train", broken)
     monkeypatch.setattr(checks, "_trained_twice", lambda threads: 0.0)
     results = verify(device, 1)
     failed = [result for result in results if not result.passed]

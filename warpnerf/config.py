@@ -16,7 +16,6 @@ from warpnerf.checks import (
 )
 from warpnerf.model.models import Deferred, Model, model_of, to_json
 
-ModelName = Literal["rgb", "sh", "deferred", "features"]
 Scaling = Literal["none", "quadratic", "clamped"]
 Jacobian = Literal["none", "density", "paper"]
 Contraction = Literal["none", "linf", "l2"]
@@ -116,13 +115,7 @@ class OptimConfig:
     """How far an update of one step moves raw densities, about, at the start; one of n steps moves
     them n^(1/4) times as far."""
     learning_rate_rgb: float = 0.2
-    """How far an update of one step moves raw colours, about, at the start; likewise."""
-    learning_rate_sh: float = 0.05
-    """The same of harmonics beyond the first one; likewise."""
-    learning_rate_features: float = 0.2
-    """The same of features that an MLP sees; likewise."""
-    learning_rate_mlp: float = 5e-3
-    """The same of the weights of an MLP; likewise."""
+    """The same of raw colours. Models with other features have rates of their own for them."""
     decay: float = 0.07
     """What is left of the learning rates at the end of training."""
     beta1: float = 0.9
@@ -136,7 +129,7 @@ class OptimConfig:
     """Weight of the total variation of raw densities, per pair of neighbouring nodes of the final
     grid; of coarser ones as much more as the face between two nodes is larger."""
     tv_rgb: float = 3e-10
-    """Weight of the total variation of raw colours, likewise."""
+    """The same of raw colours and of all other features."""
     tv_every: int = 8
     """Updates from one total-variation gradient to the next, which counts that many times."""
     accumulate_at: Literal["auto"] | tuple[float, ...] = "auto"
@@ -149,9 +142,6 @@ class OptimConfig:
         """Refuse what cannot be optimised with."""
         require_positive("optim.learning_rate_density", self.learning_rate_density)
         require_positive("optim.learning_rate_rgb", self.learning_rate_rgb)
-        require_positive("optim.learning_rate_sh", self.learning_rate_sh)
-        require_positive("optim.learning_rate_features", self.learning_rate_features)
-        require_positive("optim.learning_rate_mlp", self.learning_rate_mlp)
         require_positive("optim.decay", self.decay)
         require_positive("optim.epsilon", self.epsilon)
         require_at_least("optim.tv_density", self.tv_density, 0.0)

@@ -5,19 +5,18 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from functools import cache, partial
+from functools import cache
 from types import ModuleType
 from typing import Any, NamedTuple, get_args
 
 import numpy as np
 import torch
 import warp as wp
-from warpnerf_kernels.base import precision
 
 from warpnerf.checks import InputError, require_at_least, require_one_of, require_positive
 from warpnerf.config import MAX_VOXELS, Scaling
 from warpnerf.model.grid import box_struct, density_struct, free_struct, grid_struct
-from warpnerf.model.models import Load, Model, model_of
+from warpnerf.model.models import Load, Model, loader, model_of
 from warpnerf.rendering.adjoint import AdjointLaunch, gradient_struct, n_tiles
 from warpnerf.rendering.rays import rays_struct
 from warpnerf.rendering.render import Steps, scene_struct, scratch_struct, variant_of
@@ -184,9 +183,12 @@ def render_rays(
         raise InputError(f"density_shift must be finite, not {density_shift}.")
     if isinstance(model, str):
         model = model_of(model)
+    if not isinstance(model, Model):
+        raise InputError(f"model must be a name or a model, not {model!r}.")
     _require_grid(raw, model)
-    weights = _packed_head(head, model, raw)
-    raw = torch.nn.functional.pad(raw, (0, model.n_floats - raw.shape[3]))
+    weights = _flat_head(list(head), model, raw)
+    if raw.shape[3] < model.n_floats:
+        raw = torch.nn.functional.pad(raw, (0, model.n_floats - raw.shape[3]))
     corners = _corner("box_min", box_min), _corner("box_max", box_max)
     if not (corners[0] < corners[1]).all():
         raise InputError(
@@ -280,8 +282,9 @@ class _Render(torch.autograd.Function):
                 n,
                 _scene(raw, weights, call, workers),
                 _ray_arrays(raw, origins, directions, call),
-                scratch_struct(variant, 1, workers, assembly),
+                scratch_struct(variant, 0, workers, assembly),
                 seen,
+                rays=variant.batch,
             )
         ctx.call = call
         ctx.save_for_backward(
@@ -302,7 +305,9 @@ class _Render(torch.autograd.Function):
         launch = AdjointLaunch(
             assembly.render_backward_kernel(variant),
             variant,
-            call.steps.most(1.01 * diagonal),  # directions may be a little too short
+            call.model.most_steps(
+                call.steps, 1.01 * diagonal
+            ),  # directions may be a little too short
             len(origins),
             _workers(str(raw.device)),
         )
@@ -329,7 +334,7 @@ class _Render(torch.autograd.Function):
                 _array(adj_rgb, types.vec3),
                 _array(adj_opacity),
                 _array(adj_depth),
-                scratch_struct(variant, 1, workers, assembly),
+                scratch_struct(variant, 0, workers, assembly),
             )
         return adj_raw, adj_weights.sum(dim=0), None, None, None
 
@@ -341,7 +346,7 @@ def _workers(device: str) -> Workers:
 
 def _device_code(raw: torch.Tensor) -> Load:
     """Kernels in raw's precision."""
-    return partial(precision.load, _PRECISIONS[raw.dtype])
+    return loader(_PRECISIONS[raw.dtype])
 
 
 def _variant(raw: torch.Tensor, call: _Call, scaling: Scaling) -> Any:
@@ -415,7 +420,7 @@ def _ray_arrays(
     )
 
 
-def _packed_head(head: Sequence[torch.Tensor], model: Model, raw: torch.Tensor) -> torch.Tensor:
+def _flat_head(head: Sequence[torch.Tensor], model: Model, raw: torch.Tensor) -> torch.Tensor:
     """The layers in one tensor, as kernels take them; see ``warpnerf_kernels.heads.mlp``."""
     layout = model.layout(_device_code(raw))
     if layout is None:

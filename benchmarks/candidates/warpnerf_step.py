@@ -18,7 +18,7 @@ from warpnerf_kernels.base.types import gradient_type
 from workload import MODELS, Workload
 
 from warpnerf.rendering.render import TrainingPass, render_rays
-from warpnerf.runtime.parallel import Packed, Workers
+from warpnerf.runtime.parallel import LaunchCache, Workers
 
 
 @wp.func_native(
@@ -74,7 +74,7 @@ class WarpStep:
         self._free = work.free_cells(workers)
         self._steps = work.steps()
         self._batch = work.batch(workers)
-        self._packed = Packed()
+        self._launches = LaunchCache()
         scaling = "clamped" if work.scaled else "none"
         self._pass = TrainingPass(
             self._batch.count,
@@ -92,7 +92,7 @@ class WarpStep:
         gradients = self._pass.gradients
         span = 1 if self._workers.device.is_cuda else STRETCH
         n = -(-gradients.values.shape[0] // span)
-        self._workers.launch(self._clear, n, span, gradients.struct, packed=self._packed)
+        self._workers.launch(self._clear, n, span, gradients.struct, cache=self._launches)
         gradients.touched.zero_()
         gradients.weights.zero_()
         self._pass.run(self._free, self._batch)
@@ -133,17 +133,17 @@ class WarpStep:
         gradients = self._pass.gradients
         arrays = [*vars(self._pass).values(), gradients.touched, gradients.weights]
         used = sum(array.capacity for array in arrays if isinstance(array, wp.array))
-        deferred = self._pass.launch.deferred
-        if deferred is None:
+        sink = self._pass.launch.sink
+        if sink is None:
             return used, used
-        room = used + deferred.records.capacity + deferred.addressed.capacity
-        records = deferred.records.numpy()
+        room = used + sink.records.capacity + sink.addressed.capacity
+        records = sink.records.numpy()
         records = records.view(np.uint8).reshape(-1, records.dtype.itemsize)
         records.fill(255)
-        deferred.addressed.fill_(-1)
+        sink.addressed.fill_(-1)
         self.step()
         used += int((records != 255).any(axis=1).sum()) * records.shape[1]
-        used += 4 * int((deferred.addressed.numpy() != -1).sum())
+        used += 4 * int((sink.addressed.numpy() != -1).sum())
         return used, room
 
 

@@ -20,7 +20,7 @@ THIN = "test_kernel_packs.py::test_thin_media_keep_their_digits"
 OPAQUE = "test_kernel_render.py::test_nothing_flows_back_from_behind_an_opaque_wall[packed]"
 
 MUTANTS = [
-    # vectors.py
+    # simd.py
     Mutant("truncation rounds", "base/simd.py",
            "__builtin_convertvector(x, ivec)", "__builtin_convertvector(x + 0.5f, ivec)", ANY),
     Mutant("clamp one too low", "base/simd.py", "ivec(size - 1)", "ivec(size - 2)", ANY),
@@ -197,7 +197,7 @@ MUTANTS = [
     Mutant("pack's edge before growth begins", "sampling/steps.py",
            "step_edge(march, wp.max(step, march.n_linear))", "step_edge(march, step)", LINF),
     Mutant("early stop forgotten", "volume/walk_packs.py",
-           "packs[slot].passed < march.transmittance_min", "packs[slot].passed < real(0.0)", STOP),
+           "packs[slot].passed < scene.march.transmittance_min", "packs[slot].passed < real(0.0)", STOP),
     Mutant("packs overlap", "volume/walk_packs.py",
            "wp.min(step + LANES, ray.end)", "wp.min(step + LANES - 1, ray.end)", ANY),
     Mutant("packs leave a gap", "volume/walk_packs.py",
@@ -206,7 +206,7 @@ MUTANTS = [
            "                n_samples += packs", "                n_samples = packs", ANY, 1, 2),
     Mutant("light multiplied twice", "volume/walk_packs.py",
            "transmittance = packs[slot].passed", "transmittance *= packs[slot].passed",
-           ANY, 1, 2),
+           ANY, 1, 3),
     Mutant("green of the red", "volume/pack.py",
            "weight * load(pack.channel.data[c])", "weight * load(pack.channel.data[c == 1 ? 0 : c])", ANY),
     Mutant("colour of the last pack only", "volume/walk_packs.py",
@@ -222,13 +222,15 @@ MUTANTS = [
     Mutant("T_end term dropped, packed", "volume/walk_packs.py",
            "            + adj_transmittance * rows[row].transmittance\n", "", ANY),
     Mutant("what lies behind not carried on", "volume/walk_packs.py",
-           "                    behind = packs[slot].behind\n", "", ANY),
+           "                behind = packs[slot].behind\n", "", ANY),
     Mutant("made again one step early", "volume/walk_packs.py",
            "step = packs[slot].step + LANES", "step = packs[slot].step + LANES - 1", CAPACITY),
     Mutant("made again in full light", "volume/walk_packs.py",
-           "                    transmittance = packs[slot].passed\n", "", CAPACITY),
+           "transmittance = packs[slot].passed\n", "transmittance = 1.0\n", CAPACITY, 2, 3),
+    Mutant("made again after kept ones in full light", "volume/walk_packs.py",
+           "transmittance = packs[slot].passed\n", "transmittance = 1.0\n", CAPACITY, 3, 3),
     Mutant("all packs from the first slot", "volume/walk_packs.py",
-           "first = wp.min(begin + n, end - 1)", "first = begin", CAPACITY, 2, 2),
+           "first = wp.min(begin + n, end - n_packs)", "first = begin", CAPACITY, 2, 2),
     Mutant("one scale for a pack", "volume/walk_packs.py",
            "t[lane], content_distance", "t[0], content_distance", CLAMPED),
     Mutant("one determinant for a pack", "volume/walk_packs.py",

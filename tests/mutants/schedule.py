@@ -6,7 +6,7 @@ ROOM = "test_kernel_scatter.py::test_there_is_room_for_all_records"
 SHARED_OUT = "test_kernel_schedule.py::test_rays_are_shared_out_by_slab_and_work"
 WORK = "test_kernel_schedule.py::test_each_worker_has_as_much_work"
 NEAREST = "test_kernel_schedule.py::test_each_worker_has_the_rays_nearest_its_part_cell_by_cell"
-MEETING = "test_parallel.py::test_workers_meet"
+WAITING = "test_parallel.py::test_workers_wait_for_each_other"
 CELL = "test_kernel_schedule.py::test_cells_are_numbered_along_a_curve"
 
 MUTANTS = [
@@ -71,16 +71,16 @@ MUTANTS = [
     Mutant("pick_out: rays as they come", "cpu/schedule.py",
            "        chunk.rays[worker, place] = i", "        chunk.rays[worker, k] = i", SHARED_OUT),
     Mutant("take_share: picked out before all rays are measured", "cpu/schedule.py",
-           "            if not meet(chunk.barrier, n_workers):\n                return 0\n", "", NEAREST),
-    Mutant("meet: nobody waits", "cpu/barrier.py", "read(ARRIVED) < all", "false", MEETING),
-    Mutant("meet: one does not wait", "cpu/barrier.py",
-           "read(ARRIVED) < all", "read(ARRIVED) < all - 1", MEETING),
-    Mutant("meet: the last meeting's", "cpu/barrier.py",
-           "(before / n_workers + 1)", "(before / n_workers)", MEETING),
-    Mutant("meet: called off, and goes on", "cpu/barrier.py",
+           "            if not wait_for_all(chunk.barrier, n_workers):\n                return 0\n", "", NEAREST),
+    Mutant("barrier: nobody waits", "cpu/barrier.py", "read(ARRIVED) < all", "false", WAITING),
+    Mutant("barrier: one does not wait", "cpu/barrier.py",
+           "read(ARRIVED) < all", "read(ARRIVED) < all - 1", WAITING),
+    Mutant("barrier: the last wait's", "cpu/barrier.py",
+           "(before / n_workers + 1)", "(before / n_workers)", WAITING),
+    Mutant("barrier: called off, and goes on", "cpu/barrier.py",
            "    if (read(CALLED_OFF)) return false;\n", "    if (read(CALLED_OFF)) return true;\n",
            "test_parallel.py::test_nobody_waits_for_who_does_not_come"),
-    Mutant("meet: called off, and counted again", "cpu/barrier.py",
+    Mutant("barrier: called off, and counted again", "cpu/barrier.py",
            "if (read(CALLED_OFF)) return false;  // and is not counted again\n", "",
            "test_kernel_scatter.py::test_nothing_is_added_where_a_worker_is_missing"),
 ]  # fmt: skip

@@ -1,6 +1,7 @@
 """An encoding: density is trilinear in a dense grid, features are those of its first node."""
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, ClassVar
 
 import numpy as np
@@ -10,6 +11,7 @@ from warpnerf.config import OptimConfig
 from warpnerf.model.models import Load, Model
 
 
+@cache
 def encoding(load: Load) -> Any:
     dense, types = load("fields.dense"), load("base.types")
     real, vec3 = types.real, types.vec3

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, ClassVar
 
+import numpy as np
 import warp as wp
 
 from warpnerf.model.models import Load, Model
@@ -16,26 +17,28 @@ def params_type(real: Any) -> Any:
         edges: wp.array(dtype=real)  # [n + 1] in rising order, scene units
         near: real  # where the first step begins
         far: real  # where the last one ends
+        longest: real  # of the steps
         transmittance_min: real
 
     return Distances
 
 
+@cache
 def sampler(load: Load) -> Any:
     types = load("base.types")
-    real, vec2, Ray = types.real, types.vec2, types.Ray
+    real, vec2, vec3, Ray, Box = types.real, types.vec2, types.vec3, types.Ray, types.Box
     Distances = params_type(real)
 
     @wp.func
-    def interval(params: Distances, step: int) -> vec2:
+    def interval(params: Distances, ray: Ray, step: int) -> vec2:
         return vec2(params.edges[step], params.edges[step + 1] - params.edges[step])
 
     @wp.func
-    def edge(params: Distances, step: int) -> real:
+    def edge(params: Distances, ray: Ray, step: int) -> real:
         return params.edges[step]
 
     @wp.func
-    def steps_within(params: Distances, span: vec2) -> wp.vec2i:
+    def steps_within(params: Distances, ray: Ray, span: vec2) -> wp.vec2i:
         """Steps that reach into the interval."""
         n = params.edges.shape[0] - 1
         begin = int(0)
@@ -54,7 +57,11 @@ def sampler(load: Load) -> Any:
             k += 1
         return k
 
-    return load("base.parts").Sampler(Distances, interval, edge, steps_within, step_after)
+    @wp.func
+    def longest(params: Distances, box: Box, c: vec3, contraction: int) -> real:
+        return params.longest
+
+    return load("base.parts").Sampler(Distances, interval, edge, steps_within, step_after, longest)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,5 +88,9 @@ class AtDistances(Model):
         params = params_type(real)()
         params.edges = wp.array(self.edges, dtype=real, device=device)
         params.near, params.far = self.edges[0], self.edges[-1]
+        params.longest = float(np.diff(self.edges).max())
         params.transmittance_min = steps.transmittance_min
         return params
+
+    def most_steps(self, steps: Any, length: float) -> int:
+        return len(self.edges) - 1

@@ -1,6 +1,7 @@
 """A head: one channel, which is the colour."""
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, ClassVar
 
 import warp as wp
@@ -8,6 +9,7 @@ import warp as wp
 from warpnerf.model.models import Load, Model, register
 
 
+@cache
 def head(load: Load) -> Any:
     rgb, types = load("heads.rgb"), load("base.types")
     real, vec3, Channels = types.real, types.vec3, types.vector(1)
@@ -23,13 +25,8 @@ def head(load: Load) -> Any:
     ):
         return Channels(adj_rgb[0] + adj_rgb[1] + adj_rgb[2]), real(0.0)
 
-    return rgb.rgb()._replace(
-        n_channels=1,
-        decode=decode,
-        adj_decode=adj_decode,
-        shade=shade,
-        adj_shade=adj_shade,
-        decode_pack=None,  # no vector form
+    return rgb.rgb().but(
+        n_channels=1, decode=decode, adj_decode=adj_decode, shade=shade, adj_shade=adj_shade
     )
 
 

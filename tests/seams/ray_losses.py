@@ -1,6 +1,7 @@
 """Losses on a ray's weights, and on where its samples lie."""
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, ClassVar
 
 import warp as wp
@@ -8,6 +9,7 @@ import warp as wp
 from warpnerf.model.models import Load, Model
 
 
+@cache
 def around_two(load: Load, factor: float) -> Any:
     """factor sum_i w_i (t_i - 2)^2: matter is drawn to a distance of 2."""
     real = load("base.types").real
@@ -41,6 +43,7 @@ def around_two(load: Load, factor: float) -> Any:
     return load("base.parts").RayLoss(Total, add, value, value, adj_weight, bound)
 
 
+@cache
 def distortion(load: Load, factor: float) -> Any:
     """factor sum_ij w_i w_j |t_i - t_j| + factor / 3 sum_i w_i^2 dt_i: weights come together.
 

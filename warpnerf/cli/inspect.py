@@ -8,8 +8,8 @@ import tyro
 
 from warpnerf.checks import InputError, require_at_least
 from warpnerf.cli.machine import require_writable, write_json
-from warpnerf.config import ModelName
-from warpnerf.model.models import model_of
+from warpnerf.cli.model_options import chosen_model
+from warpnerf.config import PRESETS
 from warpnerf.runtime.memory import usable_cores
 
 
@@ -21,7 +21,8 @@ def inspect_command(
     downscale: int = 1,
     content_distance: float | None = None,
     near: float = 0.0,
-    model: ModelName | None = None,
+    model: str | None = None,
+    model_options: tuple[str, ...] = (),
     threads: int | None = None,
 ) -> int:
     """Say what was understood of a scene, what training will take, and what is odd.
@@ -34,7 +35,8 @@ def inspect_command(
         downscale: As training will be given.
         content_distance: As training will be given; by default the estimate.
         near: As training will be given.
-        model: That will be trained; by default that of the presets.
+        model: As training will be given: deferred, features, sh, or rgb.
+        model_options: As training will be given.
         threads: CPU threads that training would have; by default one per usable core.
     """
     from warpnerf.evaluation.inspection import inspect
@@ -52,7 +54,7 @@ def inspect_command(
         downscale=downscale,
         content_distance=content_distance,
         near=near,
-        model=None if model is None else model_of(model),
+        model=chosen_model(PRESETS["fast"].model, model, model_options),
         threads=threads or usable_cores(),
     )
     print(found)

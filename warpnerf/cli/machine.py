@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from warpnerf.checks import InputError
-from warpnerf.config import ModelName
+from warpnerf.cli.model_options import chosen_model
+from warpnerf.config import PRESETS
 
 if TYPE_CHECKING:
     from warpnerf.evaluation.verify import Result
@@ -55,14 +56,16 @@ def check_command(device: str = "cpu", threads: int | None = None, json: Path | 
     return FAILED if failed else 0
 
 
-def warmup_command(device: str = "cpu", model: ModelName | None = None) -> int:
+def warmup_command(
+    device: str = "cpu", model: str | None = None, model_options: tuple[str, ...] = ()
+) -> int:
     """Compile all kernels that training and evaluation with the presets need.
 
     Args:
         device: Where they are to run: cpu, cuda, cuda:1, ...
-        model: That will be trained; by default that of the presets.
+        model: As training will be given: deferred, features, sh, or rgb.
+        model_options: As training will be given.
     """
-    from warpnerf.model.models import model_of
     from warpnerf.training.warmup import warm_up
 
     def shown(kernel: Warmed) -> None:
@@ -70,7 +73,8 @@ def warmup_command(device: str = "cpu", model: ModelName | None = None) -> int:
         print(f"{kernel.name}: {how}", flush=True)
 
     start = time.perf_counter()
-    kernels = warm_up(device, shown, None if model is None else model_of(model))
+    chosen = chosen_model(PRESETS["fast"].model, model, model_options)
+    kernels = warm_up(device, shown, chosen)
     compiled = sum(kernel.compiled for kernel in kernels)
     seconds = time.perf_counter() - start
     print(

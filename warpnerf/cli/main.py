@@ -24,10 +24,10 @@ from warpnerf.cli.machine import (
     warmup_command,
     write_json,
 )
+from warpnerf.cli.model_options import chosen_model
 from warpnerf.cli.progress import ProgressBar
 from warpnerf.cli.render import render_command
-from warpnerf.config import PRESETS, ModelName, Scaling, TrainConfig
-from warpnerf.model.models import configured
+from warpnerf.config import PRESETS, Scaling, TrainConfig
 from warpnerf.runtime.signals import Stopped, StopRequest, raise_when_asked
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def train_command(
     output: Path | None = None,
     resume: Path | None = None,
     preset: Literal["fast", "quality"] | None = None,
-    model: ModelName | None = None,
+    model: str | None = None,
     model_options: tuple[str, ...] = (),
     steps: int | None = None,
     time_limit: float | None = None,
@@ -104,9 +104,7 @@ def train_command(
 
     def changed(config: TrainConfig) -> TrainConfig:
         config = dataclasses.replace(config, **given)
-        if model is not None or model_options:
-            chosen_model = configured(model or config.model.name, model_options)
-            config = dataclasses.replace(config, model=chosen_model)
+        config = dataclasses.replace(config, model=chosen_model(config.model, model, model_options))
         if voxels is not None:
             grid = dataclasses.replace(config.grid, voxels=voxels)
             config = dataclasses.replace(config, grid=grid)
@@ -148,7 +146,8 @@ def eval_command(
         folder: Output folder of a training run.
         scene: Other photographs in the same coordinates, reduced as those of the training were.
         split: Which views.
-        lpips: Weights of LPIPS, to measure it as well; see warpnerf/lpips.py for the file.
+        lpips: Weights of LPIPS, to measure it as well; warpnerf/evaluation/lpips.py describes the
+            file.
         json: Also write the figures to this file.
         device: cpu, cuda, cuda:1, ...
         threads: CPU threads; by default one per usable core.

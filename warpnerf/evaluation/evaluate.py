@@ -12,7 +12,7 @@ import numpy as np
 
 from warpnerf.checks import InputError
 from warpnerf.evaluation.metrics import SSIM_WINDOW, flip, has_flip, psnr, ssim
-from warpnerf.evaluation.near_field import Nearness, measure_nearness
+from warpnerf.evaluation.near_field import NearField, measure_near_field
 from warpnerf.runtime.terminal import table_text
 from warpnerf.scenes.scene import Scene, View, require_split
 
@@ -57,7 +57,7 @@ class Evaluation:
 
     images: tuple[ImageMetrics, ...]
     """In the scene's order."""
-    nearness: Nearness
+    near_field: NearField
     """Of floaters."""
 
     @property
@@ -77,7 +77,7 @@ class Evaluation:
             {key: value for key, value in vars(image).items() if value is not None}
             for image in self.images
         ]
-        content = {"mean": self.mean, "floaters": self.nearness.to_dict(), "images": images}
+        content = {"mean": self.mean, "floaters": self.near_field.to_dict(), "images": images}
         return json.dumps(content, indent=2) + "\n"
 
     def __str__(self) -> str:
@@ -91,7 +91,7 @@ class Evaluation:
         rows = [cells(image.name, partial(getattr, image)) for image in self.images]
         rows.append(cells("mean", mean.get))
         table = table_text(["image", *(HEADINGS[key][0] for key in mean)], rows)
-        return f"{table}\n{self.nearness}"
+        return f"{table}\n{self.near_field}"
 
 
 def evaluate(
@@ -109,7 +109,7 @@ def evaluate(
         split: train, val, test, or all.
         on_image: Called with each view, its truth [H, W, 3] in [0, 1] over the field's background,
             and its rendering.
-        lpips: A ``warpnerf.lpips.Lpips``, if LPIPS is wanted.
+        lpips: A ``warpnerf.evaluation.lpips.Lpips``, if LPIPS is wanted.
 
     Raises:
         InputError: The scene has no such split.
@@ -136,7 +136,7 @@ def evaluate(
         )
         if on_image is not None:
             on_image(view, target, rendering)
-    return Evaluation(images=tuple(images), nearness=measure_nearness(field, scene))
+    return Evaluation(images=tuple(images), near_field=measure_near_field(field, scene))
 
 
 def require_measurable(scene: Scene, split: str) -> None:

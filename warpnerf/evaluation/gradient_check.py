@@ -30,7 +30,7 @@ DENSITY_SHIFT = 0.3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Trial:
+class RayProblem:
     """Rays through a grid, and a loss: the product of what they see with the slopes below."""
 
     raw: np.ndarray
@@ -73,7 +73,7 @@ class Trial:
         """How many rays there are."""
         return len(self.origins)
 
-    def rounded(self) -> Trial:
+    def rounded(self) -> RayProblem:
         """The same in numbers that float32 holds, so that only arithmetic can differ."""
         exact = {f.name: getattr(self, f.name) for f in fields(self)}
         exact |= {
@@ -81,13 +81,13 @@ class Trial:
             for name, value in exact.items()
             if isinstance(value, np.ndarray) and value.dtype == np.float64
         }
-        return Trial(**exact)
+        return RayProblem(**exact)
 
 
 BOX_MIN, BOX_MAX = np.array([-1.0, -0.8, -1.1]), np.array([1.2, 0.9, 1.0])
 
 
-def make_trial(seed: int, n_rays: int = 24, size: tuple[int, int, int] = (7, 8, 6)) -> Trial:
+def make_problem(seed: int, n_rays: int = 24, size: tuple[int, int, int] = (7, 8, 6)) -> RayProblem:
     """Random rays, half of them from inside the box, through a random grid."""
     rng = np.random.default_rng(seed)
 
@@ -96,7 +96,7 @@ def make_trial(seed: int, n_rays: int = 24, size: tuple[int, int, int] = (7, 8, 
 
     origins = 2.0 * unit(rng.normal(size=(n_rays, 3)))
     origins[::2] *= 0.2
-    return Trial(
+    return RayProblem(
         raw=rng.normal(size=(*size, 4)),
         origins=origins,
         directions=unit(0.5 * rng.normal(size=(n_rays, 3)) - origins),
@@ -111,30 +111,30 @@ def make_trial(seed: int, n_rays: int = 24, size: tuple[int, int, int] = (7, 8, 
     )
 
 
-def stopping_early(trial: Trial) -> Trial:
+def stopping_early(problem: RayProblem) -> RayProblem:
     """The same through denser matter, with rays that end where little light is left."""
-    steps = replace(trial.steps, transmittance_min=0.2)
-    return replace(trial, density_scale=2.5, steps=steps)
+    steps = replace(problem.steps, transmittance_min=0.2)
+    return replace(problem, density_scale=2.5, steps=steps)
 
 
-def partly_free(trial: Trial) -> Trial:
+def partly_free(problem: RayProblem) -> RayProblem:
     """The same where half of 3 x 4 x 5 cells are free."""
     occupied = np.random.default_rng(7).uniform(size=(3, 4, 5)) < 0.5
-    return replace(trial, free=np.where(occupied, 0, 1).astype(np.uint8))
+    return replace(problem, free=np.where(occupied, 0, 1).astype(np.uint8))
 
 
-def folded(trial: Trial, contraction: Contraction = "linf") -> Trial:
+def folded(problem: RayProblem, contraction: Contraction = "linf") -> RayProblem:
     """The same in folded space, with steps that grow outside the box."""
-    steps = replace(trial.steps, far=40.0, n_linear=12, growth=0.09)
-    return replace(trial, contraction=contraction, border=0.2, steps=steps)
+    steps = replace(problem.steps, far=40.0, n_linear=12, growth=0.09)
+    return replace(problem, contraction=contraction, border=0.2, steps=steps)
 
 
-def of_model(trial: Trial, model: Model) -> Trial:
+def of_model(problem: RayProblem, model: Model) -> RayProblem:
     """The same rays through a random grid and MLP of another model."""
     rng = np.random.default_rng(11)
     return replace(
-        trial,
-        raw=rng.normal(size=(*trial.raw.shape[:3], model.n_floats)),
+        problem,
+        raw=rng.normal(size=(*problem.raw.shape[:3], model.n_floats)),
         model=model,
         weights=rng.normal(size=n_weights(model)) * 0.4,
     )
@@ -152,7 +152,7 @@ class Found:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Seen:
-    """What the rays of a trial see."""
+    """What the rays of a problem see."""
 
     rgb: np.ndarray
     """[n_rays, 3] in [0, 1], with background."""
@@ -163,16 +163,16 @@ class Seen:
     n_samples: np.ndarray
     """[n_rays] visited steps."""
 
-    def loss(self, trial: Trial) -> float:
-        """The trial's loss."""
+    def loss(self, problem: RayProblem) -> float:
+        """The problem's loss."""
         return float(
-            np.vdot(trial.rgb_slope, self.rgb)
-            + np.vdot(trial.opacity_slope, self.opacity)
-            + np.vdot(trial.depth_slope, self.depth)
+            np.vdot(problem.rgb_slope, self.rgb)
+            + np.vdot(problem.opacity_slope, self.opacity)
+            + np.vdot(problem.depth_slope, self.depth)
         )
 
 
-class TrialKernels:
+class ProblemKernels:
     """The kernels in one precision and form, on one device."""
 
     def __init__(self, name: str, workers: Workers, packed: bool = False) -> None:
@@ -191,9 +191,9 @@ class TrialKernels:
         self._types = self._load("base.types")
         self._assembly = self._load("launch.assembly")
 
-    def see(self, trial: Trial) -> Seen:
+    def see(self, problem: RayProblem) -> Seen:
         """The forward launch."""
-        seen = self._forward(trial)
+        seen = self._forward(problem)
         return Seen(
             rgb=seen.rgb.numpy(),
             opacity=1.0 - seen.transmittance.numpy(),
@@ -201,43 +201,45 @@ class TrialKernels:
             n_samples=seen.n_samples.numpy(),
         )
 
-    def gradient(self, trial: Trial, scaling: Scaling = "none") -> Found:
-        """The backward launch: the gradient of the trial's loss."""
-        variant = self._variant(trial, scaling)
-        launch = self._adjoint(trial, self._assembly.render_backward_kernel(variant), variant)
-        gradient = self._no_gradient(trial, launch.workers)
+    def gradient(self, problem: RayProblem, scaling: Scaling = "none") -> Found:
+        """The backward launch: the gradient of the problem's loss."""
+        variant = self._variant(problem, scaling)
+        launch = self._adjoint(problem, self._assembly.render_backward_kernel(variant), variant)
+        gradient = self._no_gradient(problem, launch.workers)
         launch.run(
-            trial.n_rays,
+            problem.n_rays,
             gradient,
-            self._scene(trial, launch.workers),
-            self._rays(trial),
-            self._forward(trial),
-            self._array(trial.rgb_slope, self._types.vec3),
-            self._array(trial.opacity_slope),
-            self._array(trial.depth_slope),
+            self._scene(problem, launch.workers),
+            self._rays(problem),
+            self._forward(problem),
+            self._array(problem.rgb_slope, self._types.vec3),
+            self._array(problem.opacity_slope),
+            self._array(problem.depth_slope),
             # nothing is kept between launches
-            scratch_struct(variant, 1, launch.workers, self._assembly),
+            scratch_struct(variant, 0, launch.workers, self._assembly),
         )
-        return _found(gradient, trial)
+        return _found(gradient, problem)
 
-    def train(self, trial: Trial, scaling: Scaling = "none") -> tuple[np.ndarray, Found]:
-        """The training launch: squared errors [n_rays], the gradient of their mean."""
-        error, n_samples = self._zeros(trial.n_rays), self._zeros(trial.n_rays, wp.int32)
-        variant = self._variant(trial, scaling)
-        launch = self._adjoint(trial, self._assembly.render_train_kernel(variant), variant)
-        gradient = self._no_gradient(trial, launch.workers)
+    def train(self, problem: RayProblem, scaling: Scaling = "none") -> tuple[np.ndarray, Found]:
+        """The training launch: losses of rays [n_rays], and the gradient of their mean."""
+        error, loss = self._zeros(problem.n_rays), self._zeros(problem.n_rays)
+        n_samples = self._zeros(problem.n_rays, wp.int32)
+        variant = self._variant(problem, scaling)
+        launch = self._adjoint(problem, self._assembly.render_train_kernel(variant), variant)
+        gradient = self._no_gradient(problem, launch.workers)
         launch.run(
-            trial.n_rays,
+            problem.n_rays,
             gradient,
-            self._scene(trial, launch.workers),
-            self._rays(trial),
-            self._array(trial.target, self._types.vec3),
-            1.0 / trial.n_rays,
+            self._scene(problem, launch.workers),
+            self._rays(problem),
+            self._array(problem.target, self._types.vec3),
+            1.0 / problem.n_rays,
             scratch_struct(variant, KEPT_PACKS, launch.workers, self._assembly),
             error,
+            loss,
             n_samples,
         )
-        return error.numpy(), _found(gradient, trial)
+        return error.numpy() + loss.numpy(), _found(gradient, problem)
 
     def gather(self, values: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Values [X, Y, Z, n] at points [m, 3] in folded coordinates: [m, n]."""
@@ -252,38 +254,38 @@ class TrialKernels:
         )
         return out.numpy().astype(np.float64)
 
-    def scatter(self, trial: Trial, points: np.ndarray, out: np.ndarray) -> np.ndarray:
-        """The transpose of ``gather``, which hands [m, n] to the trial's nodes: [X, Y, Z, n]."""
+    def scatter(self, problem: RayProblem, points: np.ndarray, out: np.ndarray) -> np.ndarray:
+        """The transpose of ``gather``, which hands [m, n] to the problem's nodes: [X, Y, Z, n]."""
         workers = self._workers if self._workers.device.is_cuda else Workers("cpu", 1)
-        gradient = self._no_gradient(trial, workers)
-        n_floats = trial.model.n_floats
+        gradient = self._no_gradient(problem, workers)
+        n_floats = problem.model.n_floats
         workers.launch(
             self._load("launch.probe").probe(n_floats).read_backward,
             len(points),
-            self._grid(trial.raw, 0.0),
+            self._grid(problem.raw, 0.0),
             self._array(points, self._types.vec3),
             self._array(out, self._types.vector(n_floats)),
             gradient,
         )
-        return _found(gradient, trial).values
+        return _found(gradient, problem).values
 
-    def _forward(self, trial: Trial) -> Any:
-        variant = self._variant(trial, "none")
-        seen = seen_struct(variant, trial.n_rays, self._workers, self._assembly)
+    def _forward(self, problem: RayProblem) -> Any:
+        variant = self._variant(problem, "none")
+        seen = seen_struct(variant, problem.n_rays, self._workers, self._assembly)
         self._workers.launch_owned(
             self._assembly.render_forward_kernel(variant),
-            -(-trial.n_rays // variant.batch),
-            trial.n_rays,
-            self._scene(trial, self._workers),
-            self._rays(trial),
-            scratch_struct(variant, 1, self._workers, self._assembly),
+            -(-problem.n_rays // variant.batch),
+            problem.n_rays,
+            self._scene(problem, self._workers),
+            self._rays(problem),
+            scratch_struct(variant, 0, self._workers, self._assembly),
             seen,
         )
         return seen
 
-    def _variant(self, trial: Trial, scaling: Scaling) -> Any:
+    def _variant(self, problem: RayProblem, scaling: Scaling) -> Any:
         return variant_of(
-            trial.model, self._name, trial.contraction, scaling, "none", packed=self._packed
+            problem.model, self._name, problem.contraction, scaling, "none", packed=self._packed
         )
 
     def _grid(self, values: np.ndarray, border: float) -> Any:
@@ -292,48 +294,50 @@ class TrialKernels:
         array = self._array(values.reshape(-1, n_floats), node)
         return grid_struct(self._load("fields.dense"), array, (x, y, z), border)
 
-    def _scene(self, trial: Trial, workers: Workers) -> Any:
-        x, y, z = trial.free.shape
-        distance = wp.array(trial.free.ravel(), dtype=wp.uint8, device=self._workers.device)
+    def _scene(self, problem: RayProblem, workers: Workers) -> Any:
+        x, y, z = problem.free.shape
+        distance = wp.array(problem.free.ravel(), dtype=wp.uint8, device=self._workers.device)
         return scene_struct(
-            trial.model,
+            problem.model,
             self._name,
-            box=box_struct(self._types, BOX_MIN, BOX_MAX, trial.border),
-            free=free_struct(self._types, distance, (x, y, z), trial.border),
-            steps=trial.steps,
-            grid=self._grid(trial.raw, trial.border),
-            density=density_struct(self._types, DENSITY_SHIFT, trial.density_scale),
-            weights=self._array(trial.weights),
+            box=box_struct(self._types, BOX_MIN, BOX_MAX, problem.border),
+            free=free_struct(self._types, distance, (x, y, z), problem.border),
+            steps=problem.steps,
+            grid=self._grid(problem.raw, problem.border),
+            density=density_struct(self._types, DENSITY_SHIFT, problem.density_scale),
+            weights=self._array(problem.weights),
             workers=workers,
         )
 
-    def _rays(self, trial: Trial) -> Any:
+    def _rays(self, problem: RayProblem) -> Any:
         return rays_struct(
             self._assembly,
-            self._array(trial.origins, self._types.vec3),
-            self._array(trial.directions, self._types.vec3),
-            self._array(trial.offsets),
-            self._array(trial.background, self._types.vec3),
-            self._array(trial.content_distance),
+            self._array(problem.origins, self._types.vec3),
+            self._array(problem.directions, self._types.vec3),
+            self._array(problem.offsets),
+            self._array(problem.background, self._types.vec3),
+            self._array(problem.content_distance),
         )
 
-    def _no_gradient(self, trial: Trial, workers: Workers) -> Any:
-        """A kernel's Gradient of a trial's model, zero."""
-        n_nodes = math.prod(trial.raw.shape[:3])
+    def _no_gradient(self, problem: RayProblem, workers: Workers) -> Any:
+        """A kernel's Gradient of a problem's model, zero."""
+        n_nodes = math.prod(problem.raw.shape[:3])
         return gradient_struct(
             self._types,
-            self._zeros(n_nodes, self._types.vector(trial.model.n_floats)),
+            self._zeros(n_nodes, self._types.vector(problem.model.n_floats)),
             self._zeros(n_tiles(n_nodes), wp.uint8),
-            self._zeros((workers.count, len(trial.weights))),
+            self._zeros((workers.count, len(problem.weights))),
         )
 
-    def _adjoint(self, trial: Trial, kernel: wp.Kernel, variant: Any) -> AdjointLaunch:
+    def _adjoint(self, problem: RayProblem, kernel: wp.Kernel, variant: Any) -> AdjointLaunch:
         length = float(np.linalg.norm(BOX_MAX - BOX_MIN))
         return AdjointLaunch(
             kernel,
             variant,
-            trial.steps.most(math.inf if trial.contraction != "none" else length),
-            trial.n_rays,
+            problem.model.most_steps(
+                problem.steps, math.inf if problem.contraction != "none" else length
+            ),
+            problem.n_rays,
             self._workers,
         )
 
@@ -346,7 +350,7 @@ class TrialKernels:
         return wp.zeros(shape, dtype=dtype or self._types.real, device=self._workers.device)
 
 
-def _found(gradient: Any, trial: Trial) -> Found:
+def _found(gradient: Any, problem: RayProblem) -> Found:
     """What was added.
 
     NaN in tiles that hold gradient and are not flagged: the optimiser would not see them.
@@ -357,4 +361,4 @@ def _found(gradient: Any, trial: Trial) -> Found:
     seen = flags[tile] | flags[tile - 1]
     found[found.any(axis=1) & ~seen] = np.nan
     weights = gradient.weights.numpy().astype(np.float64).sum(axis=0)
-    return Found(values=found.reshape(trial.raw.shape), weights=weights)
+    return Found(values=found.reshape(problem.raw.shape), weights=weights)

@@ -37,7 +37,7 @@ MIN_TRANSMITTANCE = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
-class Nearness:
+class NearField:
     """What a field holds close to the training cameras."""
 
     within: float
@@ -71,7 +71,7 @@ class Nearness:
         return said
 
 
-def measure_nearness(field: Field, scene: Scene) -> Nearness:
+def measure_near_field(field: Field, scene: Scene) -> NearField:
     """Look for what hangs in front of the training cameras.
 
     near_mass = mean over rays of the integral of sigma dt over t < within = mean of -log T(within)
@@ -96,7 +96,7 @@ def measure_nearness(field: Field, scene: Scene) -> Nearness:
         near += int(((seen.opacity >= 0.5) & (seen.depth < within * seen.opacity)).sum())
         n_rays += transmittance.size
     pulled = pulled_psnr(field, scene)
-    return Nearness(
+    return NearField(
         within=within,
         near_mass=mass / n_rays,
         near_rays=near / n_rays,

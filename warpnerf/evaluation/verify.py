@@ -20,10 +20,10 @@ from warpnerf.evaluation.gradient_check import (
     BOX_MAX,
     BOX_MIN,
     Found,
-    Trial,
-    TrialKernels,
+    ProblemKernels,
+    RayProblem,
     folded,
-    make_trial,
+    make_problem,
     of_model,
     partly_free,
     stopping_early,
@@ -38,12 +38,12 @@ from warpnerf.training.trainer import train
 SEEDS = range(3)
 SCALINGS: tuple[Scaling, ...] = ("quadratic", "clamped")
 
-PATHS: dict[str, Callable[[Trial], Trial]] = {
-    "plain": lambda trial: trial,
+PATHS: dict[str, Callable[[RayProblem], RayProblem]] = {
+    "plain": lambda problem: problem,
     "early stop": stopping_early,
     "free space": partly_free,
     "folded space": folded,
-    "all of these": lambda trial: stopping_early(partly_free(folded(trial))),
+    "all of these": lambda problem: stopping_early(partly_free(folded(problem))),
 }
 
 VIEW_DEPENDENT: tuple[Model, ...] = (
@@ -133,9 +133,9 @@ def report(results: list[Result], device: str, seconds: float) -> str:
 def _checks(workers: Workers) -> Iterator[tuple[str, float, Measure]]:
     """Name, tolerance and measurement of each check that the device can be asked for."""
     on_cpu = not workers.device.is_cuda
-    exact = TrialKernels("float64", workers)
-    plain = TrialKernels("float32", workers)
-    packed = TrialKernels("float32", workers, packed=True)
+    exact = ProblemKernels("float64", workers)
+    plain = ProblemKernels("float32", workers)
+    packed = ProblemKernels("float32", workers, packed=True)
     trained = packed if on_cpu else plain
 
     def same_sum(rounding: float) -> float:
@@ -199,7 +199,9 @@ def _checks(workers: Workers) -> Iterator[tuple[str, float, Measure]]:
     )
     if on_cpu:
         several = max(2, workers.count)
-        one, more = (TrialKernels("float32", Workers("cpu", n), packed=True) for n in (1, several))
+        one, more = (
+            ProblemKernels("float32", Workers("cpu", n), packed=True) for n in (1, several)
+        )
         measure = partial(_worst, _threads, every, one, more)
         yield f"float32, 1 thread = {several} threads within rounding", 1e-5, measure
         yield (
@@ -214,15 +216,17 @@ def _words(model: Model) -> str:
     return f"{model.name}, {'direct' if direct else 'all of these'}"
 
 
-def _with_model(model: Model, trial: Trial) -> Trial:
-    return of_model(PATHS["all of these"](trial), model)
+def _with_model(model: Model, problem: RayProblem) -> RayProblem:
+    return of_model(PATHS["all of these"](problem), model)
 
 
 def _worst(
-    measure: Callable[..., float], path: Callable[[Trial], Trial], *kernels: TrialKernels
+    measure: Callable[..., float],
+    path: Callable[[RayProblem], RayProblem],
+    *kernels: ProblemKernels,
 ) -> float:
-    """The largest error of measure(*kernels, trial) over the seeds; NaN if any is."""
-    return float(np.max([measure(*kernels, path(make_trial(seed))) for seed in SEEDS]))
+    """The largest error of measure(*kernels, problem) over the seeds; NaN if any is."""
+    return float(np.max([measure(*kernels, path(make_problem(seed))) for seed in SEEDS]))
 
 
 def relative_error(value: np.ndarray, expected: np.ndarray) -> float:
@@ -244,34 +248,34 @@ def gradient_error(value: Found, expected: Found) -> float:
     return float(np.max(errors))
 
 
-def _against_differences(kernels: TrialKernels, trial: Trial) -> float:
+def _against_differences(kernels: ProblemKernels, problem: RayProblem) -> float:
     """The gradient along random directions, against central differences of order h^4."""
-    gradient = kernels.gradient(trial)
-    visited = kernels.see(trial).n_samples
-    if trial.free.size > 1 or trial.steps.transmittance_min > 0.0:
-        whole = replace(trial, free=np.zeros((1, 1, 1), np.uint8))
-        whole = replace(whole, steps=replace(trial.steps, transmittance_min=0.0))
+    gradient = kernels.gradient(problem)
+    visited = kernels.see(problem).n_samples
+    if problem.free.size > 1 or problem.steps.transmittance_min > 0.0:
+        whole = replace(problem, free=np.zeros((1, 1, 1), np.uint8))
+        whole = replace(whole, steps=replace(problem.steps, transmittance_min=0.0))
         if visited.sum() >= kernels.see(whole).n_samples.sum():
             return math.nan  # nothing was left out
     rng = np.random.default_rng(1)
     # A ReLU or a threshold crossed within h leaves no derivative; with many, h has to be small.
-    h = 2e-6 if trial.weights.size else 2e-5
+    h = 2e-6 if problem.weights.size else 2e-5
     errors = []
-    for of_weights in (False, True) if trial.weights.size else (False,):
+    for of_weights in (False, True) if problem.weights.size else (False,):
         found, expected = [], []
         for _ in range(8):
-            direction = rng.normal(size=trial.weights.shape if of_weights else trial.raw.shape)
+            direction = rng.normal(size=problem.weights.shape if of_weights else problem.raw.shape)
             losses = {}
             smooth = True
             for k in (-2, -1, 1, 2):
                 if of_weights:
-                    moved = replace(trial, weights=trial.weights + k * h * direction)
+                    moved = replace(problem, weights=problem.weights + k * h * direction)
                 else:
-                    moved = replace(trial, raw=trial.raw + k * h * direction)
+                    moved = replace(problem, raw=problem.raw + k * h * direction)
                 seen = kernels.see(moved)
                 # Where a ray just reaches the end of its light, the loss jumps.
                 smooth &= np.array_equal(seen.n_samples, visited)
-                losses[k] = seen.loss(trial)
+                losses[k] = seen.loss(problem)
             near, far = losses[1] - losses[-1], losses[2] - losses[-2]
             smooth &= abs(2.0 * near - far) <= 1e-6 * abs(far)
             if smooth:
@@ -283,33 +287,33 @@ def _against_differences(kernels: TrialKernels, trial: Trial) -> float:
     return float(np.max(errors))
 
 
-def _transposed(kernels: TrialKernels) -> float:
+def _transposed(kernels: ProblemKernels) -> float:
     """The difference of the two products, over the sum of what is added up in them."""
     rng = np.random.default_rng(0)
     size = (5, 6, 7)
     values, out = rng.normal(size=(*size, 4)), rng.normal(size=(200, 4))
     points = rng.uniform(-1.0, 1.0, size=(200, 3))
     points[0], points[1] = -1.0, 1.0
-    trial = replace(make_trial(0), raw=values)
+    problem = replace(make_problem(0), raw=values)
     forward = np.vdot(kernels.gather(values, points), out)
-    backward = np.vdot(values, kernels.scatter(trial, points, out))
+    backward = np.vdot(values, kernels.scatter(problem, points, out))
     scale = np.abs(kernels.gather(np.abs(values), points) * out).sum()
     return abs(forward - backward) / scale if abs(forward) > 1e-4 * scale else math.nan
 
 
-def _one_sample(trial: Trial, t: float) -> Trial:
+def _one_sample(problem: RayProblem, t: float) -> RayProblem:
     """Rays from inside the box with a single sample each, around a distance t."""
     steps = Steps(near=t, far=t + 0.1, step=0.1)
-    return replace(trial, origins=0.1 * trial.origins, steps=steps)
+    return replace(problem, origins=0.1 * problem.origins, steps=steps)
 
 
-def _scaled_by_hand(kernels: TrialKernels, trial: Trial) -> float:
+def _scaled_by_hand(kernels: ProblemKernels, problem: RayProblem) -> float:
     """A ray with one sample: scaling its gradient is scaling what flows back along it."""
     errors = []
     for t in (0.05, 0.2, 0.4):
-        one = _one_sample(trial, t)
+        one = _one_sample(problem, t)
         # on both sides of the clamp
-        one = replace(one, content_distance=trial.content_distance * t / 1.5).rounded()
+        one = replace(one, content_distance=problem.content_distance * t / 1.5).rounded()
         if not (kernels.see(one).n_samples == 1).all():
             return math.nan
         for scaling in SCALINGS:
@@ -326,19 +330,19 @@ def _scaled_by_hand(kernels: TrialKernels, trial: Trial) -> float:
     return float(np.max(errors))
 
 
-def _scaled_along_a_ray(kernels: TrialKernels, trial: Trial) -> float:
+def _scaled_along_a_ray(kernels: ProblemKernels, problem: RayProblem) -> float:
     """Samples two voxels apart share no node, so each node has the scale of its one sample."""
     nodes = 24
     voxel = float(BOX_MAX[0] - BOX_MIN[0]) / (nodes - 1)
     start = np.array([BOX_MIN[0], 0.11, 0.07])
     steps = Steps(near=0.0, far=30.0, step=2.0 * voxel)
     along = replace(
-        make_trial(0, n_rays=1, size=(nodes, 3, 3)),
+        make_problem(0, n_rays=1, size=(nodes, 3, 3)),
         origins=start[None],
         directions=np.array([[1.0, 0.0, 0.0]]),
         offsets=np.array([0.2]),
-        rgb_slope=trial.rgb_slope[:1],
-        content_distance=trial.content_distance[:1],
+        rgb_slope=problem.rgb_slope[:1],
+        content_distance=problem.content_distance[:1],
         density_scale=0.3,
         steps=steps,
     )
@@ -352,71 +356,71 @@ def _scaled_along_a_ray(kernels: TrialKernels, trial: Trial) -> float:
     return float(np.max(errors))
 
 
-def _beyond(kernels: TrialKernels, trial: Trial) -> float:
+def _beyond(kernels: ProblemKernels, problem: RayProblem) -> float:
     """Where every sample is at the content distance or beyond, clamping leaves 1."""
-    beyond = replace(trial, steps=replace(trial.steps, near=0.5))
-    beyond = replace(beyond, content_distance=np.full(trial.n_rays, 0.5))
+    beyond = replace(problem, steps=replace(problem.steps, near=0.5))
+    beyond = replace(beyond, content_distance=np.full(problem.n_rays, 0.5))
     return gradient_error(kernels.gradient(beyond, "clamped"), kernels.gradient(beyond))
 
 
-def _at_camera(kernels: TrialKernels, trial: Trial) -> float:
+def _at_camera(kernels: ProblemKernels, problem: RayProblem) -> float:
     """The largest gradient of samples at the camera, where without scaling there is some."""
-    one = replace(_one_sample(trial, 0.0), offsets=np.zeros(trial.n_rays))
+    one = replace(_one_sample(problem, 0.0), offsets=np.zeros(problem.n_rays))
     if not np.abs(kernels.gradient(one).values).max() > 1e-3:
         return math.nan
     found = [np.abs(kernels.gradient(one, scaling).values).max() for scaling in SCALINGS]
     return float(np.max(found))
 
 
-def _fused(kernels: TrialKernels, trial: Trial) -> float:
+def _fused(kernels: ProblemKernels, problem: RayProblem) -> float:
     """Loss and gradient in one launch, against two launches and the loss by hand."""
     errors = []
     for scaling in ("none", "clamped"):
-        error, gradient = kernels.train(trial, scaling)
-        rgb = kernels.see(trial).rgb
+        error, gradient = kernels.train(problem, scaling)
+        rgb = kernels.see(problem).rgb
         two = replace(
-            trial,
-            rgb_slope=2.0 / trial.n_rays * (rgb - trial.target),
-            opacity_slope=np.zeros(trial.n_rays),
-            depth_slope=np.zeros(trial.n_rays),
+            problem,
+            rgb_slope=2.0 / problem.n_rays * (rgb - problem.target),
+            opacity_slope=np.zeros(problem.n_rays),
+            depth_slope=np.zeros(problem.n_rays),
         )
         errors.append(gradient_error(gradient, kernels.gradient(two, scaling)))
-        errors.append(relative_error(error, ((rgb - trial.target) ** 2).sum(axis=-1)))
+        errors.append(relative_error(error, ((rgb - problem.target) ** 2).sum(axis=-1)))
     return float(np.max(errors))
 
 
-def _forms(a: TrialKernels, b: TrialKernels, trial: Trial) -> float:
+def _forms(a: ProblemKernels, b: ProblemKernels, problem: RayProblem) -> float:
     """What rays see, and all gradients."""
-    trial = trial.rounded()
-    ours, theirs = a.see(trial), b.see(trial)
+    problem = problem.rounded()
+    ours, theirs = a.see(problem), b.see(problem)
     if not np.array_equal(ours.n_samples, theirs.n_samples):
         return math.nan
     errors = [
         relative_error(ours.rgb, theirs.rgb),
         relative_error(ours.opacity, theirs.opacity),
         relative_error(ours.depth, theirs.depth),
-        gradient_error(a.gradient(trial), b.gradient(trial)),
-        gradient_error(a.train(trial, "clamped")[1], b.train(trial, "clamped")[1]),
+        gradient_error(a.gradient(problem), b.gradient(problem)),
+        gradient_error(a.train(problem, "clamped")[1], b.train(problem, "clamped")[1]),
     ]
     return float(np.max(errors))
 
 
-def _same_image(kernels: TrialKernels, trial: Trial) -> float:
+def _same_image(kernels: ProblemKernels, problem: RayProblem) -> float:
     """How many rays' errors change with the scaling, which must change the gradient."""
-    error, gradient = kernels.train(trial)
+    error, gradient = kernels.train(problem)
     changed = 0
     for scaling in SCALINGS:
-        scaled = kernels.train(trial, scaling)
+        scaled = kernels.train(problem, scaling)
         if np.array_equal(scaled[1].values, gradient.values):
             return math.nan
         changed += int((scaled[0] != error).sum())
     return changed
 
 
-def _threads(one: TrialKernels, several: TrialKernels, trial: Trial) -> float:
+def _threads(one: ProblemKernels, several: ProblemKernels, problem: RayProblem) -> float:
     """The gradient of a training launch on one thread and on several."""
-    error, gradient = one.train(trial, "clamped")
-    again = several.train(trial, "clamped")
+    error, gradient = one.train(problem, "clamped")
+    again = several.train(problem, "clamped")
     if not np.array_equal(again[0], error):  # no sum over rays
         return math.nan
     return gradient_error(again[1], gradient)

@@ -1,4 +1,7 @@
-"""What distance scaling does, shown: builtin:room-sparse, trained without it and with it."""
+"""What distance scaling does, shown: builtin:room-sparse, trained without it and with it.
+
+The model is rgb: colour that depends on the direction of view can hide a floater from cameras.
+"""
 
 from __future__ import annotations
 
@@ -118,7 +121,9 @@ def demo(
     fields: dict[Scaling, Field] = {}
     figures: dict[Scaling, dict[str, float]] = {}
     for scaling in SCALINGS:
-        config = TrainConfig(steps=steps, scaling=scaling, device=device, threads=threads)
+        config = TrainConfig(
+            model="rgb", steps=steps, scaling=scaling, device=device, threads=threads
+        )
         field, seconds = _trained(scene, config, report)
         report(f"measuring the field {SCALINGS[scaling]}", 0.0, "")
         fields[scaling] = field

@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 from warpnerf_kernels.base import types
+from warpnerf_kernels.base.parts import Sampler
 from warpnerf_kernels.base.types import Box, Density, FreeSpace, real, vec3
-from warpnerf_kernels.fields import dense
+from warpnerf_kernels.fields import dense, dense_bound
 from warpnerf_kernels.sampling import occupancy
-from warpnerf_kernels.sampling.steps import March
+from warpnerf_kernels.sampling.steps import STEPS
 from warpnerf_kernels.space import contraction
 
 from warpnerf.checks import InputError
@@ -216,14 +217,21 @@ class FreeCells:
         )
 
     @staticmethod
-    def of(grid: VoxelGrid, workers: Workers, march: March, alpha_min: float) -> FreeCells:
+    def of(
+        grid: VoxelGrid,
+        workers: Workers,
+        march: Any,
+        alpha_min: float,
+        sampler: Sampler = STEPS,
+    ) -> FreeCells:
         """Look a grid over.
 
         Args:
             grid: The grid.
             workers: Where to work.
-            march: How rays are stepped: opacity is judged over the longest step there can be.
+            march: The sampler's parameters: opacity is judged over the longest step there can be.
             alpha_min: The least opacity that counts as visible.
+            sampler: Where steps lie.
         """
         device = workers.device
         size = tuple(max(1, (n - 1) // 2) for n in grid.size)
@@ -235,7 +243,7 @@ class FreeCells:
         shape = [*grid.size[:2], size[2]]
         highest = wp.empty(math.prod(shape), dtype=real, device=device)
         launch(
-            occupancy.find_highest_kernel(grid.n_floats),
+            dense_bound.find_highest_kernel(grid.n_floats),
             highest.size,
             grid.struct,
             size[2],
@@ -245,7 +253,7 @@ class FreeCells:
             shape[axis] = size[axis]
             joined = wp.empty(math.prod(shape), dtype=real, device=device)
             launch(
-                occupancy.join_highest,
+                dense_bound.join_highest,
                 joined.size,
                 grid.size[axis],
                 size[axis],
@@ -258,7 +266,7 @@ class FreeCells:
         distance = wp.empty(n, dtype=wp.uint8, device=device)
         spread = wp.empty_like(distance)
         launch(
-            occupancy.mark_occupied,
+            occupancy.mark_occupied_kernel(sampler),
             n,
             grid.box,
             grid.density,

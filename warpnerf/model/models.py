@@ -7,15 +7,21 @@ together, and says what of them is trained and how. A new one is a subclass of `
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
-from functools import cache, partial
+from functools import cache
 from types import ModuleType
 from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
 
-from warpnerf.checks import InputError, require_at_least, require_one_of, require_whole
+from warpnerf.checks import (
+    InputError,
+    require_at_least,
+    require_one_of,
+    require_positive,
+    require_whole,
+)
 
 Load = Callable[[str], ModuleType]
 """A module of the kernels, by its name in the package, in some precision."""
@@ -29,10 +35,6 @@ class Rates(Protocol):
     @property
     def learning_rate_rgb(self) -> float: ...  # noqa: D102
     @property
-    def learning_rate_sh(self) -> float: ...  # noqa: D102
-    @property
-    def learning_rate_features(self) -> float: ...  # noqa: D102
-    @property
     def tv_density(self) -> float: ...  # noqa: D102
     @property
     def tv_rgb(self) -> float: ...  # noqa: D102
@@ -42,13 +44,36 @@ class Model:
     """What a field stores, and how that becomes colour."""
 
     name: ClassVar[str]
-    """By which the command and files know it."""
-    relative_time: ClassVar[float] = 1.0
-    """How long a step of training takes as it is configured by default, about; rgb's is 1."""
+    """What the command and files call it."""
+    learning_rate_mlp: float = 0.0
+    """Of the weights of the head's MLP, where it has one."""
+
+    @property
+    def relative_time(self) -> float:
+        """How long a step of training takes, about; rgb's is 1.
+
+        That is what its nodes cost, by benchmarks/models.py; a model with an MLP adds it.
+        """
+        return 0.8 + 0.05 * self.n_floats
+
+    def keep_plain(self) -> None:
+        """Make each field of a frozen dataclass a plain int, float or bool, as its default is.
+
+        So what files hold of it is read back as the same. For ``__post_init__``.
+
+        Raises:
+            InputError: A field whose default is a bool is given something else.
+        """
+        for f in fields(self):  # type: ignore[arg-type]
+            value, kind = getattr(self, f.name), type(f.default)
+            if kind is bool and not isinstance(value, bool | np.bool_):
+                raise InputError(f"model.{f.name} must be True or False, not {value!r}.")
+            if kind in (bool, int, float):
+                object.__setattr__(self, f.name, kind(value))
 
     @property
     def n_features(self) -> int:
-        """Raw features of a node, besides its raw density."""
+        """How many raw features a node has, besides its raw density."""
         raise NotImplementedError
 
     @property
@@ -74,9 +99,18 @@ class Model:
         """
         return steps.struct(load("sampling.steps"))
 
+    def most_steps(self, steps: Any, length: float) -> int:
+        """How many steps a ray can take, at most: workers make room for as many.
+
+        Args:
+            steps: What is configured, ``warpnerf.rendering.render.Steps``.
+            length: Of the ray's way through the box, scene units; infinite where space is folded.
+        """
+        return int(steps.most(length))
+
     def first_weights(self, seed: int) -> np.ndarray:
         """The MLP's weights before the first step, [n_weights] float32; none without an MLP."""
-        layout = self.layout(partial(_device_code, "float32"))
+        layout = self.layout(loader("float32"))
         return np.zeros(0, np.float32) if layout is None else _uniform(layout, seed, 1.0)
 
     def learning_rates(self, optim: Rates) -> np.ndarray:
@@ -117,15 +151,19 @@ class SphericalHarmonics(Model):
     """Colour by spherical harmonics of the direction of view, without an MLP."""
 
     name: ClassVar[str] = "sh"
-    relative_time: ClassVar[float] = 2.5
     degree: int = 2
     """Of the harmonics, 0 to 3: 1, 4, 9 or 16 for each of red, green and blue."""
+    learning_rate_sh: float = 0.05
+    """How far an update of one step moves coefficients beyond the first one of a colour; see
+    ``OptimConfig.learning_rate_rgb``."""
 
     def __post_init__(self) -> None:
-        """Refuse what has no kernels."""
+        """Refuse a configuration for which there are no kernels."""
         require_whole("model.degree", self.degree, 0)
         if self.degree > 3:
             raise InputError(f"model.degree must be 0, 1, 2 or 3, not {self.degree}.")
+        require_positive("model.learning_rate_sh", self.learning_rate_sh)
+        self.keep_plain()
 
     @property
     def n_features(self) -> int:
@@ -143,7 +181,7 @@ class SphericalHarmonics(Model):
         """The first harmonic is a constant of 0.28: its rate moves colours as far as rgb's."""
         rates = super().learning_rates(optim)
         rates[1:4] = optim.learning_rate_rgb / 0.2820948
-        rates[4 : 1 + self.n_features] = optim.learning_rate_sh
+        rates[4 : 1 + self.n_features] = self.learning_rate_sh
         return rates
 
 
@@ -156,10 +194,15 @@ class _WithMlp(Model):
     width: int = 32
     """Units of each hidden layer, a multiple of 16 up to 128."""
     hidden_layers: int = 2
-    """Of the MLP, 1 to 3."""
+    """How many the MLP has, 1 to 3."""
+    learning_rate_features: float = 0.2
+    """How far an update of one step moves features that the MLP sees; see
+    ``OptimConfig.learning_rate_rgb``."""
+    learning_rate_mlp: float = 5e-3
+    """The same of the MLP's weights."""
 
     def __post_init__(self) -> None:
-        """Refuse what has no kernels."""
+        """Refuse a configuration for which there are no kernels."""
         require_whole("model.frequencies", self.frequencies, 0)
         if self.frequencies > 8:
             raise InputError(f"model.frequencies must be at most 8, not {self.frequencies}.")
@@ -172,6 +215,15 @@ class _WithMlp(Model):
         require_whole("model.hidden_layers", self.hidden_layers, 1)
         if self.hidden_layers > 3:
             raise InputError(f"model.hidden_layers must be 1, 2 or 3, not {self.hidden_layers}.")
+        require_positive("model.learning_rate_features", self.learning_rate_features)
+        require_positive("model.learning_rate_mlp", self.learning_rate_mlp)
+        self.keep_plain()
+
+    def multiplications(self) -> int:
+        """Of one row of the MLP, from its own inputs to its outputs."""
+        layout = self.layout(loader("float32"))
+        hidden = (self.hidden_layers - 1) * self.width**2
+        return int(layout.n_own * self.width + hidden + 4 * self.width)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,16 +231,20 @@ class Deferred(_WithMlp):
     """Features added up along the ray, and one small MLP a ray that sees the direction of view."""
 
     name: ClassVar[str] = "deferred"
-    relative_time: ClassVar[float] = 1.5
     specular: int = 4
     """Features of a node besides its diffuse colour, 1 to 28."""
 
     def __post_init__(self) -> None:
-        """Refuse what has no kernels."""
+        """Refuse a configuration for which there are no kernels."""
         super().__post_init__()
         require_whole("model.specular", self.specular, 1)
         if self.specular > 28:
             raise InputError(f"model.specular must be at most 28, not {self.specular}.")
+
+    @property
+    def relative_time(self) -> float:
+        """That of its nodes, and of an MLP once a ray."""
+        return super().relative_time + 1.5e-4 * self.multiplications()
 
     @property
     def n_features(self) -> int:
@@ -205,19 +261,19 @@ class Deferred(_WithMlp):
         )
 
     def layout(self, load: Load) -> Any:
-        """It sees all channels and the direction."""
+        """The MLP sees all channels and the direction of view."""
         return load("heads.deferred").layout_of(
             self.n_features, self.frequencies, self.width, self.hidden_layers
         )
 
     def first_weights(self, seed: int) -> np.ndarray:
-        """The output begins small, so that diffuse colour is learned first."""
-        return _uniform(self.layout(partial(_device_code, "float32")), seed, 0.1)
+        """Uniform; the output layer a tenth of that, so that diffuse colour is learned first."""
+        return _uniform(self.layout(loader("float32")), seed, 0.1)
 
     def learning_rates(self, optim: Rates) -> np.ndarray:
-        """Specular features have a rate of their own."""
+        """Those of density, of diffuse colour and of specular features."""
         rates = super().learning_rates(optim)
-        rates[4 : 1 + self.n_features] = optim.learning_rate_features
+        rates[4 : 1 + self.n_features] = self.learning_rate_features
         return rates
 
 
@@ -226,9 +282,8 @@ class Features(_WithMlp):
     """Features of each sample and the direction of view through an MLP, as in DVGO."""
 
     name: ClassVar[str] = "features"
-    relative_time: ClassVar[float] = 2.5
     features: int = 12
-    """Of a node, up to 31."""
+    """Of a node: 1 to 31, at least 4 with the residual."""
     frequencies: int = 4
     """Octaves of sines and cosines of the direction of view that the MLP sees, 0 to 8."""
     residual: bool = True
@@ -237,13 +292,13 @@ class Features(_WithMlp):
     """Samples of no more weight get no colour, [0, 1)."""
 
     def __post_init__(self) -> None:
-        """Refuse what has no kernels."""
+        """Refuse a configuration for which there are no kernels."""
         super().__post_init__()
         require_whole("model.features", self.features, 1)
         if self.residual and self.features < 4:
             raise InputError(
                 f"model.features must be at least 4 with the residual, not {self.features}: three "
-                "are colour, and the MLP sees the others; use more, or residual = False."
+                "are colour, and the MLP sees the others; use more, or residual=false."
             )
         if self.features > 31:
             raise InputError(f"model.features must be at most 31, not {self.features}.")
@@ -252,8 +307,13 @@ class Features(_WithMlp):
             raise InputError(f"model.threshold must be below 1, not {self.threshold}.")
 
     @property
+    def relative_time(self) -> float:
+        """That of its nodes, and of an MLP for each sample."""
+        return super().relative_time + 5.5e-4 * self.multiplications()
+
+    @property
     def n_features(self) -> int:
-        """As configured."""
+        """As many as are configured."""
         return self.features
 
     def parts(self, load: Load) -> Any:
@@ -271,21 +331,21 @@ class Features(_WithMlp):
         )
 
     def layout(self, load: Load) -> Any:
-        """It sees features, or those that are not colour, and the direction."""
+        """The MLP sees the features that are not colour, and the direction of view."""
         return load("heads.features").layout_of(
             self.features, self.frequencies, self.width, self.hidden_layers, self.residual
         )
 
     def first_weights(self, seed: int) -> np.ndarray:
-        """With the residual, the output begins small."""
-        layout = self.layout(partial(_device_code, "float32"))
+        """Uniform; with the residual, the output layer a tenth of that."""
+        layout = self.layout(loader("float32"))
         return _uniform(layout, seed, 0.1 if self.residual else 1.0)
 
     def learning_rates(self, optim: Rates) -> np.ndarray:
-        """Features that the MLP sees have a rate of their own."""
+        """Those of density, of colour, and of features that the MLP sees."""
         rates = super().learning_rates(optim)
         begin = 4 if self.residual else 1
-        rates[begin : 1 + self.n_features] = optim.learning_rate_features
+        rates[begin : 1 + self.n_features] = self.learning_rate_features
         return rates
 
 
@@ -298,8 +358,16 @@ AnyModel = TypeVar("AnyModel", bound=type[Model])
 
 
 def register(model: AnyModel) -> AnyModel:
-    """Make a model known by its name; a decorator."""
-    MODELS[model.name] = model
+    """Make a model known by its name, to files and to the command; a decorator.
+
+    Args:
+        model: The class. What it is configured by are numbers with defaults.
+
+    Raises:
+        ValueError: Another model has that name.
+    """
+    if MODELS.setdefault(model.name, model) is not model:
+        raise ValueError(f"{model.name!r} is the name of another model")
     return model
 
 
@@ -311,39 +379,6 @@ def model_of(name: str) -> Model:
     """
     require_one_of("model", name, tuple(MODELS))
     return MODELS[name]()
-
-
-def configured(name: str, options: Sequence[str]) -> Model:
-    """The model of a name, changed by options such as "width=64".
-
-    Args:
-        name: Of the model.
-        options: A field and its value each.
-
-    Raises:
-        InputError: There is no such model or field, or the value does not fit.
-    """
-    model = model_of(name)
-    known = {f.name: getattr(model, f.name) for f in fields(model)}  # type: ignore[arg-type]
-    given: dict[str, Any] = {}
-    for option in options:
-        field, equals, text = option.partition("=")
-        if not equals or field not in known:
-            listed = ", ".join(f"{key}={value}" for key, value in known.items()) or "none"
-            raise InputError(
-                f"--model-options: {option!r} is no option of the model {name}; it has {listed}."
-            )
-        given[field] = _parsed(field, text, type(known[field]))
-    return type(model)(**given)
-
-
-def _parsed(field: str, text: str, kind: type) -> Any:
-    words = {"true": True, "false": False}
-    try:
-        return words[text.lower()] if kind is bool else kind(text)
-    except (ValueError, KeyError):
-        wanted = {bool: "true or false", int: "a whole number", float: "a number"}[kind]
-        raise InputError(f"--model-options: {field} must be {wanted}, not {text!r}.") from None
 
 
 def to_json(model: Model) -> dict[str, Any]:
@@ -363,14 +398,16 @@ def from_json(tree: Any) -> Model:
     given = {name: value for name, value in tree.items() if name != "name"}
     types = {f.name: type(f.default) for f in fields(kind)}  # type: ignore[arg-type]
     for name, value in given.items():
-        if name not in types or type(value) is not types[name]:
+        if type(value) is int and types.get(name) is float:
+            given[name] = float(value)
+        elif name not in types or type(value) is not types[name]:
             raise ValueError(f"{name!r} of the model {kind.name} cannot be {value!r}")
     return kind(**given)
 
 
 def n_weights(model: Model) -> int:
     """Weights of a model's head; 0 without an MLP."""
-    layout = model.layout(partial(_device_code, "float32"))
+    layout = model.layout(loader("float32"))
     return 0 if layout is None else int(layout.n_weights)
 
 
@@ -384,13 +421,23 @@ def decode(kind: type, tree: Any) -> Any:
 @cache
 def parts_of(model: Model, precision: str) -> Any:
     """A model's parts in float32 or float64."""
-    return model.parts(partial(_device_code, precision))
+    return model.parts(loader(precision))
 
 
-def _device_code(precision: str, module: str) -> ModuleType:
-    from warpnerf_kernels.base.precision import load
+@cache
+def loader(precision: str) -> Load:
+    """The kernels' modules in float32 or float64; the same object each time, so a key for caches.
 
-    return load(precision, module)
+    Args:
+        precision: float32 or float64.
+    """
+
+    def load(module: str) -> ModuleType:
+        from warpnerf_kernels.base import precision as precisions
+
+        return precisions.load(precision, module)
+
+    return load
 
 
 def _uniform(layout: Any, seed: int, of_output: float) -> np.ndarray:

@@ -54,7 +54,7 @@ def parameters_of(
         name="weights",
         values=weights,
         kind="weights",
-        learning_rates=np.array([optim.learning_rate_mlp]),
+        learning_rates=np.array([model.learning_rate_mlp]),
         variation=np.zeros(1),
     )
     return nodes, of_head

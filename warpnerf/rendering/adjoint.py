@@ -16,7 +16,7 @@ from warpnerf_kernels.cpu import schedule
 from warpnerf_kernels.launch import assembly
 
 from warpnerf.model.models import Model, n_weights
-from warpnerf.runtime.parallel import Packed, Workers
+from warpnerf.runtime.parallel import LaunchCache, Workers
 
 SAMPLES = 1 << 21
 """Steps, in whole packs, whose gradients may be in records at a time where nodes hold four numbers,
@@ -38,7 +38,7 @@ class Gradients:
     """[n_tiles] uint8, 1 where a pair of nodes begins that got some; see base.tiles."""
     weights: wp.array
     """[n_workers, n_weights or more] of each worker's rays."""
-    packed: Packed = field(default_factory=Packed)
+    launches: LaunchCache = field(default_factory=LaunchCache)
     """The optimiser's launches that take it."""
 
     @staticmethod
@@ -105,8 +105,8 @@ class AdjointLaunch:
         """
         self._kernel = kernel
         self._workers = workers
-        self._packed = Packed()
-        self.deferred: Any = None
+        self._launches = LaunchCache()
+        self.sink: Any = None
         """What the workers leave for each other; None: kernels are scalar."""
         if variant.packed:
             encoding = variant.parts.encoding
@@ -117,12 +117,12 @@ class AdjointLaunch:
             if count < workers.count:
                 self._workers = Workers("cpu", count)
             room = samples // count if count > 1 else 0
-            self.deferred = _make_deferred(variant, room // LANES, count)
+            self.sink = _make_sink(variant, room // LANES, count)
             chunk = _make_chunk(n_rays, count)
             chunk.barrier = self._workers.barrier
             # One worker leaves no records. Of several, each may get a ray more than its share.
             chunk.most_work = count * (room - most_work) if count > 1 else ALONE
-            self.deferred.chunk = chunk
+            self.sink.chunk = chunk
         elif not workers.device.is_cuda:
             self._workers = Workers("cpu", 1)
 
@@ -139,15 +139,15 @@ class AdjointLaunch:
             gradient: A kernel's Gradient, in the kernel's precision.
             arguments: The kernel's, without the first two and the last.
         """
-        if self.deferred is None:
+        if self.sink is None:
             self._workers.launch_owned(self._kernel, n_rays, *arguments, gradient)
             return
-        self.deferred.gradient = gradient
-        chunk = self.deferred.chunk
+        self.sink.gradient = gradient
+        chunk = self.sink.chunk
         chunk.begin, chunk.end = 0, n_rays
         while chunk.begin < n_rays:
             self._workers.launch_owned(
-                self._kernel, self._workers.count, *arguments, self.deferred, packed=self._packed
+                self._kernel, self._workers.count, *arguments, self.sink, cache=self._launches
             )
             chunk.begin = int(chunk.next.numpy()[0])
 
@@ -166,11 +166,11 @@ def _make_chunk(n_rays: int, n_workers: int) -> schedule.Chunk:
     return chunk
 
 
-def _make_deferred(variant: assembly.Variant, n_packs: int, n_workers: int) -> Any:
+def _make_sink(variant: assembly.Variant, n_packs: int, n_workers: int) -> Any:
     """No records, with room for those of so many packs of each worker."""
     row = -(-n_workers // 16) * 16  # whole cache lines
     made = assembly.sink_type(variant)()
-    made.records = _room(n_workers, n_packs, dtype=variant.parts.encoding.Record)
+    made.records = _room(n_workers, n_packs, dtype=variant.parts.encoding.vectors.Record)
     made.n_records = _room(n_workers, row)
     made.addressed = _room(n_workers, n_workers, n_packs)
     made.n_addressed = _room(n_workers, row)

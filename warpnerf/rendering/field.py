@@ -103,7 +103,7 @@ class Field:
     @staticmethod
     def _rendering(rays: RenderedRays, shape: tuple[int, ...]) -> Rendering:
         return Rendering(
-            rgb=rays.rgb.numpy().reshape(*shape, 3),
+            rgb=rays.rgb.numpy().reshape(*shape, 3).clip(0.0, 1.0),  # an MLP may add too much
             depth=rays.depth.numpy().reshape(shape),
             opacity=1.0 - rays.transmittance.numpy().reshape(shape),
         )

@@ -15,7 +15,7 @@ from warpnerf_kernels.launch import assembly
 from warpnerf_kernels.space import camera as kernels
 
 from warpnerf.checks import InputError
-from warpnerf.runtime.parallel import Packed, Workers
+from warpnerf.runtime.parallel import LaunchCache, Workers
 from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.scene import View
 
@@ -152,7 +152,7 @@ class PixelSampler:
             len(views), content_distance, dtype=real, device=workers.device
         )
         self._batch = _room(n_rays, workers)
-        self._packed = Packed()
+        self._launches = LaunchCache()
 
     def draw(self, step: int, n_steps: int = 1) -> RayBatch:
         """The batches of some steps as one, each a function of its step and the seed.
@@ -185,7 +185,7 @@ class PixelSampler:
             batch.background,
             batch.content_distance,
             batch.target_rgb,
-            packed=self._packed,
+            cache=self._launches,
         )
         return batch
 

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import partial
 from types import ModuleType
 from typing import Any
 
 import warp as wp
-from warpnerf_kernels.base import precision as precisions
 from warpnerf_kernels.base.types import real
 from warpnerf_kernels.launch import assembly
 from warpnerf_kernels.sampling import steps as sampling
@@ -17,7 +15,7 @@ from warpnerf_kernels.volume import gradscale
 
 from warpnerf.config import Contraction, Jacobian, Scaling
 from warpnerf.model.grid import CONTRACTIONS, FreeCells, VoxelGrid
-from warpnerf.model.models import Model, parts_of
+from warpnerf.model.models import Model, loader, parts_of
 from warpnerf.rendering.adjoint import AdjointLaunch, Gradients
 from warpnerf.rendering.rays import RayBatch, rays_struct
 from warpnerf.runtime.parallel import Workers
@@ -33,10 +31,10 @@ JACOBIANS = {
     "paper": gradscale.JACOBIAN_PAPER,
 }
 
-KEPT_PACKS = 64
+KEPT_PACKS = 63
 """Packs of sixteen steps that a CPU worker keeps of a ray between the two passes; later ones are
 made again."""
-KEPT_PACKS_OF_BATCH = 256
+KEPT_PACKS_OF_BATCH = 255
 """The same of the rays of a batch together, where the head shades several at a time."""
 
 
@@ -89,7 +87,7 @@ class RenderedRays:
     """What rays see, on their device."""
 
     rgb: wp.array
-    """[n_rays] vec3 in [0, 1], with background."""
+    """[n_rays] vec3 with background; a deferred head may leave [0, 1]."""
     transmittance: wp.array
     """[n_rays] in [0, 1], light of the background."""
     depth: wp.array
@@ -117,7 +115,7 @@ def variant_of(
         packed: Sixteen samples at a time, where all parts of the model have such a form.
     """
     parts = parts_of(model, precision)
-    return precisions.load(precision, "launch.assembly").Variant(
+    return loader(precision)("launch.assembly").Variant(
         parts,
         CONTRACTIONS[contraction],
         SCALINGS[scaling],
@@ -151,10 +149,10 @@ def scene_struct(
         weights: [n_weights] of the head.
         workers: Those that will be launched.
     """
-    load = partial(precisions.load, precision)
+    load = loader(precision)
     scene = load("launch.assembly").scene_type(parts_of(model, precision))()
     scene.box, scene.free, scene.field, scene.density = box, free, grid, density
-    scene.march = model.march(load, steps, workers.device)
+    scene.march = march_struct(model, precision, steps, workers)
     layout = model.layout(load)
     if layout is not None:
         head = load("heads.mlp").Weights()
@@ -165,12 +163,25 @@ def scene_struct(
     return scene
 
 
+def march_struct(model: Model, precision: str, steps: Steps, workers: Workers) -> Any:
+    """The parameters of a model's sampler, as kernels take them.
+
+    Args:
+        model: Which one.
+        precision: float32 or float64.
+        steps: How to march.
+        workers: Those that will be launched.
+    """
+    return model.march(loader(precision), steps, workers.device)
+
+
 def scratch_struct(variant: Any, n_packs: int, workers: Workers, assembly: ModuleType) -> Any:
     """Where the workers of a launch keep rays between the passes.
 
     Args:
         variant: Of the kernel to launch.
-        n_packs: What each worker keeps, if in packs. Scalar kernels, which CUDA runs, keep nothing:
+        n_packs: What each worker keeps, if in packs, besides those that it does not keep. Scalar
+            kernels, which CUDA runs, keep nothing:
             with all rays under way at once, reading a sample again is the cheaper way.
         workers: Where to work.
         assembly: ``warpnerf_kernels.launch.assembly`` in the variant's precision.
@@ -179,8 +190,8 @@ def scratch_struct(variant: Any, n_packs: int, workers: Workers, assembly: Modul
     scratch = Scratch()
     if variant.packed:
         fields, n = Scratch.vars, workers.count
-        scratch.capacity = n_packs
-        scratch.packs = wp.empty(n * n_packs, dtype=fields["packs"].type.dtype, device="cpu")
+        scratch.capacity = capacity = n_packs + variant.parts.head.vectors.n_packs
+        scratch.packs = wp.empty(n * capacity, dtype=fields["packs"].type.dtype, device="cpu")
         scratch.rows = wp.empty(n * variant.batch, dtype=fields["rows"].type.dtype, device="cpu")
     return scratch
 
@@ -246,8 +257,9 @@ def render_rays(
         n,
         scene,
         rays_struct(assembly, origins, directions, offsets, background),
-        scratch_struct(variant, 1, workers, assembly),
+        scratch_struct(variant, 0, workers, assembly),
         seen,
+        rays=variant.batch,
     )
     return RenderedRays(
         rgb=seen.rgb, transmittance=seen.transmittance, depth=seen.depth, n_samples=seen.n_samples
@@ -282,7 +294,7 @@ class TrainingPass:
         self.launch = AdjointLaunch(
             assembly.render_train_kernel(variant),
             variant,
-            steps.most(math.inf if grid.contraction != "none" else grid.diagonal),
+            model.most_steps(steps, math.inf if grid.contraction != "none" else grid.diagonal),
             n_rays,
             workers,
         )
@@ -304,6 +316,8 @@ class TrainingPass:
         """Rays of the last run; before the first, those that there is room for."""
         self.error = wp.zeros(n_rays, dtype=real, device=device)
         """Squared error of each of these, then room."""
+        self.loss = wp.zeros(n_rays, dtype=real, device=device)
+        """The model's loss on each of these, 0 where it has none."""
         self.n_samples = wp.zeros(n_rays, dtype=wp.int32, device=device)
         """Visited steps of each of these, then room."""
         self.gradients = Gradients.zeros(model, math.prod(grid.size), workers)
@@ -328,5 +342,6 @@ class TrainingPass:
             n_batches / batch.count,
             self._scratch,
             self.error,
+            self.loss,
             self.n_samples,
         )

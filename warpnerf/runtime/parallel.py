@@ -27,12 +27,12 @@ RAYS = 1 << 13
 signals such as Ctrl-C wait for a launch to end."""
 
 
-class Packed:
+class LaunchCache:
     """What kernels were launched with, in the form that they take: kept for their next launch.
 
-    Packing arguments takes several times as long as a launch does, and the threads one after the
-    other. Packed anew is what is another object than last time, so what may change in place are
-    the contents of arrays and the fields of structs.
+    Converting arguments takes several times as long as a launch does, and threads do it one after
+    the other. An argument is converted anew where it is another object than last time; so what may
+    change in place are the contents of arrays and the fields of structs.
     """
 
     def __init__(self) -> None:
@@ -43,7 +43,7 @@ class Packed:
         self, worker: int, kernel: wp.Kernel, n: int, arguments: list[Any], device: wp.Device
     ) -> None:
         """Launch a kernel for one of the workers, on the CPU."""
-        # Taken out while it changes: what is interrupted then is packed anew.
+        # Taken out while it changes: what is interrupted then is converted anew.
         command, last = self._commands.pop((kernel, worker), (None, []))
         if command is None:
             command = wp.launch(kernel, n, inputs=arguments, device=device, record_cmd=True)
@@ -144,7 +144,7 @@ class Workers:
         n: int,
         *arguments: Any,
         chunk: int = NODES,
-        packed: Packed | None = None,
+        cache: LaunchCache | None = None,
     ) -> None:
         """Run kernel(first, *arguments) over items 0..n-1, shared out over the workers.
 
@@ -153,28 +153,32 @@ class Workers:
             n: Number of items.
             arguments: The rest of the kernel's arguments.
             chunk: Items per launch: NODES, RAYS, or as many fewer as an item has nodes.
-            packed: From launches before, and for those to come, on the CPU.
+            cache: What launches before have left, and those to come will find, on the CPU.
         """
-        self._launch(kernel, n, lambda worker: arguments, chunk, packed)
+        self._launch(kernel, n, lambda worker: arguments, chunk, cache)
 
     def launch_owned(
         self,
         kernel: wp.Kernel,
         n: int,
         *arguments: Any,
-        packed: Packed | None = None,
+        rays: int = 1,
+        cache: LaunchCache | None = None,
     ) -> None:
         """Run kernel(first, worker, *arguments) over items of much work each.
 
-        It writes to what a worker owns. A kernel whose workers meet has one item for each.
+        It writes to what a worker owns. A kernel whose workers wait for each other has an item for
+        each of them.
 
         Args:
             kernel: As for ``launch``; it is also told the worker's number.
             n: Number of items.
             arguments: The rest of the kernel's arguments.
-            packed: As for ``launch``.
+            rays: That an item works on.
+            cache: As for ``launch``.
         """
-        self._launch(kernel, n, lambda worker: (worker, *arguments), RAYS, packed)
+        chunk = max(1, RAYS // rays)
+        self._launch(kernel, n, lambda worker: (worker, *arguments), chunk, cache)
 
     def load(self, kernel: wp.Kernel) -> None:
         """Compile a kernel, or fetch it from the cache, once: else every thread would."""
@@ -188,7 +192,7 @@ class Workers:
         n: int,
         arguments: Callable[[int], tuple[Any, ...]],
         chunk: int,
-        packed: Packed | None,
+        cache: LaunchCache | None,
     ) -> None:
         if n == 0:
             return
@@ -204,16 +208,16 @@ class Workers:
                     if self._attendance[barrier.CALLED_OFF]:
                         return
                     size, inputs = min(chunk, end - first), [first, *arguments(worker)]
-                    if packed is not None:
-                        packed.launch(worker, kernel, size, inputs, self.device)
+                    if cache is not None:
+                        cache.launch(worker, kernel, size, inputs, self.device)
                     else:
                         wp.launch(kernel, size, inputs=inputs, device=self.device)
             except BaseException:
                 self._attendance[barrier.CALLED_OFF] = 1
                 raise
 
-        # Workers that meet must all be at the same launch, so there is one at a time, and it ends
-        # when none is left in it.
+        # Workers that wait for each other must all be in the same launch. So there is one at a
+        # time, and it ends when none is left in it.
         with self._launching:
             if self._in_launch:  # where an interrupt was interrupted
                 self._call_off()

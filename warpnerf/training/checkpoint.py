@@ -23,7 +23,7 @@ from warpnerf_kernels.base.types import vector
 from warpnerf.checks import InputError
 from warpnerf.config import Contraction, TrainConfig, config_from_json, config_to_json
 from warpnerf.model.grid import FreeCells, VoxelGrid
-from warpnerf.model.models import Model, Rgb, decode, n_weights, to_json
+from warpnerf.model.models import MODELS, Model, Rgb, decode, n_weights, to_json
 from warpnerf.model.parameters import parameters_of
 from warpnerf.rendering.field import Field
 from warpnerf.rendering.render import Steps
@@ -329,11 +329,17 @@ def _read(path: Path) -> tuple[_Header, dict[str, np.ndarray]]:
         _refuse(path, f"its header is not what was written ({error})")
     if kind not in (FIELD, TRAINING, *OLDER):
         raise InputError(
-            f"{path} has format {kind!r}, but this version reads {FIELD!r} and {TRAINING!r}; use "
-            "the version of warpnerf that wrote it, or train again."
+            f"{path} has format {kind!r}, but this version reads "
+            f"{', '.join(map(repr, (FIELD, TRAINING, *OLDER)))}; use the version of warpnerf that "
+            "wrote it, or train again."
         )
     if metadata.get("sha256") != _digest(metadata["header"], tensors):
         _refuse(path, "its content does not match its SHA-256")
+    if isinstance(model := tree.get("model"), dict) and model.get("name") not in MODELS:
+        raise InputError(
+            f"{path} holds a field of the model {model.get('name')!r}, but this version knows "
+            f"{', '.join(MODELS)}; register that model, or use the version that wrote it."
+        )
     try:
         if isinstance(training := tree.get("training"), dict) and "config" in training:
             tree["training"] = training | {"config": config_from_json(training["config"])}

@@ -70,7 +70,7 @@ class NodesRule:
             parameter.values,
             state["moments"],
             chunk=NODES // tiles.STRETCH,
-            packed=gradients.packed,
+            cache=gradients.launches,
         )
         gradients.touched.zero_()
 
@@ -112,7 +112,7 @@ class WeightsRule:
             parameter.values,
             state["mean"],
             state["square"],
-            packed=gradients.packed,
+            cache=gradients.launches,
         )
 
 
@@ -190,7 +190,7 @@ def add_total_variation(
             vector(n_floats)(*(factor * parameter.variation)),
             gradients.struct,
             chunk=NODES // tiles.STRETCH,
-            packed=gradients.packed,
+            cache=gradients.launches,
         )
 
 

@@ -14,11 +14,11 @@ from warpnerf_kernels.base.types import vector
 from warpnerf.checks import InputError
 from warpnerf.config import Contraction, TrainConfig
 from warpnerf.model.grid import FreeCells, VoxelGrid, grid_size, require_memory
-from warpnerf.model.models import Model
+from warpnerf.model.models import Model, parts_of
 from warpnerf.model.parameters import Parameter, first_weights, parameters_of
 from warpnerf.rendering.field import Field
 from warpnerf.rendering.rays import PixelSampler
-from warpnerf.rendering.render import Steps, TrainingPass
+from warpnerf.rendering.render import Steps, TrainingPass, march_struct
 from warpnerf.runtime.memory import give_back
 from warpnerf.runtime.parallel import Workers
 from warpnerf.scenes.scene import Scene
@@ -240,7 +240,8 @@ class Trainer:
         if self._progress is not None and self._progress.step == self.steps_done:
             return self._progress
         n_rays = self._pass.n_rays
-        loss = float(self._pass.error.numpy()[:n_rays].mean())
+        error = float(self._pass.error.numpy()[:n_rays].mean())
+        loss = error + float(self._pass.loss.numpy()[:n_rays].mean())
         if not math.isfinite(loss):
             raise self._not_finite("the loss is")
         self._progress = Progress(
@@ -248,7 +249,7 @@ class Trainer:
             fraction=self.fraction,
             seconds=self._seconds,
             loss=loss,
-            psnr=-10.0 * math.log10(max(loss / 3.0, 1e-12)),
+            psnr=-10.0 * math.log10(max(error / 3.0, 1e-12)),
             samples_per_ray=float(self._pass.n_samples.numpy()[:n_rays].mean()),
             size=self.grid.size,
             occupied=self._occupied,
@@ -428,9 +429,10 @@ class Trainer:
         """Find what need not be sampled; not in the first steps, when nothing has grown yet."""
         if self.steps_done < FIRST_LOOK:
             return
-        self.free = FreeCells.of(
-            self.grid, self.workers, self.march_steps().struct(), self.config.alpha_min
-        )
+        model = self.config.model
+        march = march_struct(model, "float32", self.march_steps(), self.workers)
+        sampler = parts_of(model, "float32").sampler
+        self.free = FreeCells.of(self.grid, self.workers, march, self.config.alpha_min, sampler)
         self._occupied = self.free.share()
 
 

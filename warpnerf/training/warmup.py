@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import get_args
 
 import warp as wp
-from warpnerf_kernels.fields import dense
+from warpnerf_kernels.fields import dense, dense_bound
 from warpnerf_kernels.launch import assembly
 from warpnerf_kernels.optim import adam, total_variation
 from warpnerf_kernels.sampling import occupancy
@@ -49,8 +49,10 @@ def training_kernels(
         adam.adam_kernel(n_floats),
         adam.adam_weights,
         adam.resample_moments_kernel(n_floats),
-        occupancy.find_highest_kernel(n_floats),
-        occupancy.mark_occupied,
+        dense_bound.find_highest_kernel(n_floats),
+        dense_bound.join_highest,
+        occupancy.mark_occupied_kernel(variant.parts.sampler),
+        occupancy.spread_distance,
         dense.resample_kernel(n_floats),
     ]
 

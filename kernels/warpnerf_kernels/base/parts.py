@@ -3,6 +3,8 @@
 Each part has a scalar form, which runs on CUDA, in float64 and wherever a vector form is missing,
 and may have a vector form for the CPU: sixteen samples, or the rows of a batch, at a time. Adjoints
 stand directly below. Parts are values that Python can hash, so that kernels made of them are kept.
+A part that differs from another in some functions is ``other.but(name=function)``: it has no vector
+form, unless it is given one too, since that of the other would not do the same.
 
 Names of arguments in the signatures below:
 
@@ -11,7 +13,8 @@ Names of arguments in the signatures below:
     raw         what a field holds at a sample, ``vector(n_floats)``: raw density first
     channels    what is added up along a ray, ``vector(n_channels)``
     gradient    ``base.types.gradient_type``: added to
-    packs, slot scratch of a CPU worker: sixteen steps, see volume.packs
+    packs, slot scratch of a CPU worker: sixteen steps, see volume.pack
+    rows, row   scratch of a CPU worker: what belongs to a ray, see volume.walk_packs
 """
 
 from typing import Any, NamedTuple
@@ -23,15 +26,39 @@ class Sampler(NamedTuple):
     Params: Any
     """Struct, with near, far and transmittance_min among its fields."""
     interval: Any
-    """(params, step) -> vec2: where a step begins, and its length."""
+    """(params, ray, step) -> vec2: where a step begins, and its length."""
     edge: Any
-    """(params, step) -> t at which a step begins; of the last one plus one, where steps end."""
+    """(params, ray, step) -> t at which a step begins; of the last one plus one, where they end."""
     steps_within: Any
-    """(params, interval of t) -> vec2i: the first step that can lie in it, one past the last."""
+    """(params, ray, interval of t) -> vec2i: the first step that can lie in it, one past the last.
+    The ray's own begin and end are not known yet."""
     step_after: Any
     """(params, ray, t, step) -> the first step after `step` whose sample may lie at t or beyond."""
+    longest: Any
+    """(params, box, c, contraction) -> the longest step whose sample can lie where no folded
+    coordinate is larger than c: cells that are free have to be so for it."""
     place_pack: Any = None
     """Vector form of interval: (params, ray, step, packs, slot) places sixteen steps."""
+
+    def but(self, **changes: Any) -> "Sampler":
+        """The same with other functions; see above."""
+        return self._replace(**{"place_pack": None, **changes})
+
+
+class EncodingVectors(NamedTuple):
+    """The vector form of an encoding."""
+
+    read_pack: Any
+    """Of read: (params, ray, packs, slot), from x, y, z of a pack to its raw."""
+    adj_read_pack: Any
+    """Of adj_read: (params, packs, slot, later, worker, sink) adds a pack's adj_raw where the
+    worker owns what it was read from, and leaves a record of the rest."""
+    add_records: Any
+    """(params, worker, sender, sink) adds what a sender has left for a worker."""
+    Record: Any
+    """Struct of what a pack leaves for other workers."""
+    pack_fields: tuple[tuple[str, Any], ...] = ()
+    """Fields of a pack that are its own: names and types."""
 
 
 class Encoding(NamedTuple):
@@ -48,17 +75,42 @@ class Encoding(NamedTuple):
     place: Any
     """(params, position) -> where it lies in the field, [0, 1]^3; workers own parts along the first
     axis, and take rays by it."""
-    read_pack: Any = None
-    """Vector form of read: (params, ray, packs, slot), from x, y, z of a pack to its raw."""
-    adj_read_pack: Any = None
-    """(params, packs, slot, later, worker, deferred) adds a pack's adj_raw where the worker owns
-    what it was read from, and leaves a record of the rest."""
-    add_records: Any = None
-    """(params, worker, sender, deferred) adds what a sender has left for a worker."""
+    vectors: EncodingVectors | None = None
+    """The vector form, if it has one."""
+
+    def but(self, **changes: Any) -> "Encoding":
+        """The same with other functions; see above."""
+        return self._replace(**{"vectors": None, **changes})
+
+
+class HeadVectors(NamedTuple):
+    """The vector form of a head."""
+
+    begin_rows: Any
+    """(params, worker) before the first row of a launch."""
+    prepare_row: Any
+    """Of prepare: (params, rows, row) for a ray, from its direction."""
+    adj_prepare_row: Any
+    """Of adj_prepare: (params, rows, row, worker, gradient)."""
+    decode_pack: Any
+    """Of decode: (params, rows, row, packs, slot, n) for n packs of a ray, from raw and weight to
+    channel."""
+    adj_decode_pack: Any
+    """Of adj_decode: (params, rows, row, packs, slot, n, worker, gradient) from weight, scale and
+    the row's adj_channels to adj_raw, but for the density's."""
+    shade_rows: Any
+    """Of shade: (params, rows, row, n) for n rays, from channels and transmittance to rgb."""
+    adj_shade_rows: Any
+    """Of adj_shade: (params, rows, row, n, worker, gradient) from adj_rgb to adj_channels and
+    adj_opacity."""
     pack_fields: tuple[tuple[str, Any], ...] = ()
     """Fields of a pack that are its own: names and types."""
-    Record: Any = None
-    """Struct of what a pack leaves for other workers."""
+    row_fields: tuple[tuple[str, Any], ...] = ()
+    """Fields of a row that are its own."""
+    n_packs: int = 1
+    """Packs of a ray that are decoded together, at most."""
+    batch: int = 1
+    """Rays whose rows are shaded together."""
 
 
 class Head(NamedTuple):
@@ -90,36 +142,19 @@ class Head(NamedTuple):
     """(params, direction, channels, opacity, adj_rgb, gradient) -> adj_channels, adj_opacity."""
     weight_min: float = -1.0
     """Samples of no more weight are not decoded: their channels are 0."""
-    begin_rows: Any = None
-    """(params, worker) before the first row of a launch. Vector forms: rows and row name what
-    belongs to a ray, see volume.walk_packs."""
-    prepare_row: Any = None
-    """(params, rows, row) for a ray, from its direction."""
-    adj_prepare_row: Any = None
-    """(params, rows, row, worker, gradient)"""
-    decode_pack: Any = None
-    """(params, rows, row, packs, slot, n) for n packs of a ray, from raw and weight to channel."""
-    adj_decode_pack: Any = None
-    """(params, rows, row, packs, slot, n, worker, gradient) from weight, scale and the row's
-    adj_channels to adj_raw, but for the density's."""
-    n_packs: int = 1
-    """Packs of a ray that are decoded together, at most."""
-    shade_rows: Any = None
-    """(params, rows, row, n) for n rays: from channels and transmittance to rgb."""
-    adj_shade_rows: Any = None
-    """(params, rows, row, n, worker, gradient) from adj_rgb to adj_channels and adj_opacity."""
-    pack_fields: tuple[tuple[str, Any], ...] = ()
-    """Fields of a pack that are its own."""
-    row_fields: tuple[tuple[str, Any], ...] = ()
-    """Fields of a ray's row that are its own."""
-    batch: int = 1
-    """Rays whose rows are shaded together."""
+    vectors: HeadVectors | None = None
+    """The vector form, if it has one."""
+
+    def but(self, **changes: Any) -> "Head":
+        """The same with other functions; see above."""
+        return self._replace(**{"vectors": None, **changes})
 
 
 class RayLoss(NamedTuple):
     """A loss over a ray's samples: any function of their weights and of where they lie.
 
-    Its derivative needs of the rest of the ray what ``State`` holds after all samples.
+    Its derivative needs of the rest of the ray what ``State`` holds after all samples. Sums build
+    on each other, so the vector walk calls the same functions, one sample after the other.
     """
 
     State: Any

@@ -10,7 +10,7 @@ from types import ModuleType
 
 @cache
 def load(precision: str, module: str) -> ModuleType:
-    """A module of the package, such as "launch.render", in "float32" or "float64".
+    """A module of the package, such as "launch.assembly", in "float32" or "float64".
 
     float64 is for checking gradients and for torch users: types.py reads the package's name, and
     all imports inside the package are relative, so a second package of the same files under another

@@ -9,7 +9,7 @@ from typing import Any
 import warp as wp
 
 TILE = 4
-"""Nodes in a tile: in float32, a cache line."""
+"""Nodes in a tile: in float32, a cache line for every four numbers of a node."""
 
 STRETCH = 256
 """Nodes that a thread on the CPU works on."""

@@ -72,6 +72,7 @@ def gradient_type(n_floats: int) -> type:
 class Ray:
     """A ray prepared for one box: q(t) = q_origin + t q_direction."""
 
+    index: int  # in its launch
     q_origin: vec3
     q_direction: vec3
     direction: vec3  # unit, in the scene

@@ -2,7 +2,7 @@
 
 They are threads that all run at the same time, and wait awake: to end a launch and begin another
 takes 100 to 150 us, most of it to wake a thread, and a step of a training may last 4 ms. A worker
-that gave up before it came to a meeting calls the meeting off, so that nobody waits for ever.
+that gives up calls the barrier off, so that nobody waits for ever.
 """
 
 import warp as wp
@@ -10,9 +10,9 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 ARRIVED = 0
-"""Where a meeting counts how often somebody has come, beginning with 0 in each launch."""
+"""Where the barrier counts how often a worker has come, from 0 on in each launch."""
 CALLED_OFF = 16
-"""Where it says that somebody will not come; on another cache line."""
+"""Where it is not 0 if some worker will not come; on another cache line."""
 SIZE = 32
 
 
@@ -26,9 +26,9 @@ constexpr int AWAKE = 10000;  // looks, some 0.1 to 0.4 ms, before others may ha
 #if defined(__linux__)
 int sched_yield(void) __asm__("sched_yield") __attribute__((weak));  // where it is to be had
 #endif
-auto read = [&](int at) -> int { return __atomic_load_n(meeting.data + at, __ATOMIC_ACQUIRE); };
+auto read = [&](int at) -> int { return __atomic_load_n(barrier.data + at, __ATOMIC_ACQUIRE); };
 if (read(CALLED_OFF)) return false;  // and is not counted again
-const int before = __atomic_fetch_add(meeting.data + ARRIVED, 1, __ATOMIC_ACQ_REL);
+const int before = __atomic_fetch_add(barrier.data + ARRIVED, 1, __ATOMIC_ACQ_REL);
 const int all = (before / n_workers + 1) * n_workers;
 int looks = 0;
 while (read(ARRIVED) < all) {
@@ -47,6 +47,6 @@ return true;
 #endif
 """
 )
-def meet(meeting: wp.array(dtype=wp.int32), n_workers: int) -> bool:
-    """Wait until all workers have come as often as this one; false: somebody never will."""
+def wait_for_all(barrier: wp.array(dtype=wp.int32), n_workers: int) -> bool:
+    """Wait until all workers have come as often as this one; false if one of them gave up."""
     ...

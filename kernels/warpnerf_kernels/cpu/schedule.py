@@ -14,7 +14,7 @@ import warp as wp
 from ..base.parts import Encoding, Sampler
 from ..base.simd import LANES
 from ..base.types import Box, real, vec3
-from ..cpu.barrier import meet
+from ..cpu.barrier import wait_for_all
 from ..sampling.traversal import traversal
 from ..space.contraction import contract
 
@@ -55,7 +55,7 @@ class Chunk:
 def cell_at(x: vec3) -> int:
     """The cell that holds a position, [0, 1]^3: its place on a Z-order curve (Morton 1966).
 
-    Bits of its three indices in chunk, those of x first; so numbers close by are cells close by.
+    Bits of its three indices in turn, those of x first; so numbers close by are cells close by.
     """
     cell = int(0)
     for axis in range(3):
@@ -154,8 +154,8 @@ def ray_schedule(sampler: Sampler, encoding: Encoding) -> SimpleNamespace:
         chunk: Chunk,  # its work and cells are written
     ):
         """How much work a ray is, and where its middle step lies."""
-        ray = prepare_ray(box, march, origins[i], directions[i], real(0.0), contraction)
-        t = wp.min(edge(march, (ray.begin + ray.end) // 2), march.far)
+        ray = prepare_ray(box, march, i, origins[i], directions[i], real(0.0), contraction)
+        t = wp.min(edge(march, ray, (ray.begin + ray.end) // 2), march.far)
         c = contract(ray.q_origin + t * ray.q_direction, box.border, contraction)
         # A pack more where the last one is full: a step more or less is a matter of rounding.
         n_packs = (ray.end - ray.begin) // wp.static(LANES) + 1
@@ -183,7 +183,7 @@ def ray_schedule(sampler: Sampler, encoding: Encoding) -> SimpleNamespace:
             until = int(n * wp.int64(worker + 1) // wp.int64(n_workers))
             for i in range(int(n * wp.int64(worker) // wp.int64(n_workers)), until):
                 measure_ray(i, box, march, field, origins, directions, contraction, chunk)
-            if not meet(chunk.barrier, n_workers):
+            if not wait_for_all(chunk.barrier, n_workers):
                 return 0
         return pick_out(worker, chunk)
 

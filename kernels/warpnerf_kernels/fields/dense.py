@@ -8,7 +8,7 @@ from typing import Any
 
 import warp as wp
 
-from ..base.parts import Encoding
+from ..base.parts import Encoding, EncodingVectors
 from ..base.simd import LANES, VECTORS, lanes, lanes_int
 from ..base.types import Ray, real, vec3, vector
 from .interp import adj_gather, flat_index, gather, lowest_node, place_in
@@ -70,11 +70,8 @@ def place(grid: Any, position: vec3) -> vec3:
 
 PACK_FIELDS = (
     ("base", lanes_int),  # flat index of the lowest of the eight nodes around
-    (
-        "shares",
-        wp.types.matrix((4, LANES), wp.float32),
-    ),  # of the four columns of nodes around, by x
-    # and y; together 1
+    # Of the four columns of nodes around, by x and y; together 1:
+    ("shares", wp.types.matrix((4, LANES), wp.float32)),
     ("fraction_x", lanes),  # position between the nodes, [0, 1]
     ("fraction_y", lanes),
     ("fraction_z", lanes),
@@ -174,15 +171,15 @@ def read_pack(grid: Any, ray: Ray, packs: wp.array(dtype=Any), slot: int):
 
 
 ADD_OWN = (
-    NODES.replace("VALUES", "deferred.gradient.values.data")
+    NODES.replace("VALUES", "sink.gradient.values.data")
     + r"""
 const auto& size = grid.size;
-const int n_workers = deferred.records.shape[0], n_packs = deferred.records.shape[1];
-const int row = deferred.n_addressed.shape[1];  // numbers in a sender's row
+const int n_workers = sink.records.shape[0], n_packs = sink.records.shape[1];
+const int row = sink.n_addressed.shape[1];  // numbers in a sender's row
 const int n_planes = (size.c[0] + n_workers - 1) / n_workers;  // of nodes, for each worker
 const int stride_y = size.c[2], stride_x = stride_y * size.c[1];
-auto* values = deferred.gradient.values.data;
-auto* flags = deferred.gradient.touched.data;
+auto* values = sink.gradient.values.data;
+auto* flags = sink.gradient.touched.data;
 // No more than there are, which int holds.
 auto first_node = [&](int owner) -> int { return least(owner * n_planes, size.c[0]) * stride_x; };
 auto owned = [&](int owner, ivec node) -> unsigned {
@@ -252,8 +249,8 @@ const auto& pack = packs.data[slot];
 fetch_own(packs.data[later]);
 const unsigned visited = bits(load_int(pack.visited));
 if (add_own(pack, visited, pack.shares.data)) return;
-const int sent = deferred.n_records.data[worker * row]++;
-auto& record = deferred.records.data[(size_t)worker * n_packs + sent];
+const int sent = sink.n_records.data[worker * row]++;
+auto& record = sink.records.data[(size_t)worker * n_packs + sent];
 const ivec base = load_int(pack.base);
 record.visited = visited;
 store_int(record.base, base);
@@ -264,8 +261,8 @@ for (int f = 0; f < FLOATS; ++f) store(record.adj_raw.data[f], load(pack.adj_raw
 for (int receiver = 0; receiver < n_workers; ++receiver) {
     const unsigned theirs = owned(receiver, base) | owned(receiver, base + stride_x);
     if (receiver == worker || !(theirs & visited)) continue;
-    int& n = deferred.n_addressed.data[worker * row + receiver];
-    deferred.addressed.data[((size_t)worker * n_workers + receiver) * n_packs + n++] = sent;
+    int& n = sink.n_addressed.data[worker * row + receiver];
+    sink.addressed.data[((size_t)worker * n_workers + receiver) * n_packs + n++] = sent;
 }
 """
 )
@@ -275,7 +272,7 @@ def adj_read_pack(
     slot: int,
     later: int,  # slot of a pack that comes soon
     worker: int,
-    deferred: Any,  # added to, and what is in it
+    sink: Any,  # added to, and what is in it
 ):
     """adj_read for a pack's samples, where the worker owns the nodes; a record of the rest."""
     ...
@@ -288,9 +285,9 @@ constexpr int SOON = 4;  // records from the one that is added to the one that i
 auto fetch_whole = [&](const auto& x) {
     for (size_t at = 0; at < sizeof(x); at += 64) __builtin_prefetch((const char*)&x + at);
 };
-const auto* records = deferred.records.data + (size_t)sender * n_packs;
-const int* which = deferred.addressed.data + ((size_t)sender * n_workers + worker) * n_packs;
-const int n = deferred.n_addressed.data[sender * row + worker];
+const auto* records = sink.records.data + (size_t)sender * n_packs;
+const int* which = sink.addressed.data + ((size_t)sender * n_workers + worker) * n_packs;
+const int n = sink.n_addressed.data[sender * row + worker];
 for (int k = 0; k < n; ++k) {
     if (k + SOON < n) fetch_whole(records[which[k + SOON]]);
     if (k + 1 < n) fetch_own(records[which[k + 1]]);
@@ -301,7 +298,7 @@ for (int k = 0; k < n; ++k) {
 }
 """
 )
-def add_records(grid: Any, worker: int, sender: int, deferred: Any):
+def add_records(grid: Any, worker: int, sender: int, sink: Any):
     """Add what a sender has left for a worker."""
     ...
 
@@ -331,11 +328,13 @@ def dense(n_floats: int) -> Encoding:
         read=read,
         adj_read=adj_read,
         place=place,
-        read_pack=read_pack,
-        adj_read_pack=adj_read_pack,
-        add_records=add_records,
-        pack_fields=PACK_FIELDS,
-        Record=record_type(n_floats),
+        vectors=EncodingVectors(
+            read_pack=read_pack,
+            adj_read_pack=adj_read_pack,
+            add_records=add_records,
+            Record=record_type(n_floats),
+            pack_fields=PACK_FIELDS,
+        ),
     )
 
 

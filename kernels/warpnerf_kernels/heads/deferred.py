@@ -154,22 +154,25 @@ def deferred(n_channels: int, n_frequencies: int, width: int, n_hidden: int) -> 
 
     decode, adj_decode = plain.decode_of(n_channels)
     padded = wp.types.vector(layout.n_padded, wp.float32)
-    return plain.rgb()._replace(
+    head = plain.rgb()
+    return head.but(
         n_channels=n_channels,
         Params=Weights,
         decode=decode,
         adj_decode=adj_decode,
         shade=shade,
         adj_shade=adj_shade,
-        begin_rows=network.begin_rows,
-        prepare_row=prepare_row,
-        shade_rows=shade_rows,
-        adj_shade_rows=adj_shade_rows,
-        row_fields=(
-            ("inputs", padded),
-            ("adj_inputs", padded),
-            ("hidden", wp.types.vector(layout.units, wp.float32)),
-            ("specular", wp.types.vector(4, wp.float32)),  # and, on the way back, its adjoint
+        vectors=head.vectors._replace(
+            begin_rows=network.begin_rows,
+            prepare_row=prepare_row,
+            shade_rows=shade_rows,
+            adj_shade_rows=adj_shade_rows,
+            row_fields=(
+                ("inputs", padded),
+                ("adj_inputs", padded),
+                ("hidden", wp.types.vector(layout.units, wp.float32)),
+                ("specular", wp.types.vector(4, wp.float32)),  # and, on the way back, its adjoint
+            ),
+            batch=BATCH,
         ),
-        batch=BATCH,
     )

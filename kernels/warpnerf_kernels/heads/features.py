@@ -259,7 +259,8 @@ def features(
     ): ...
 
     units = wp.types.vector(width, wp.float32)
-    return plain.rgb()._replace(
+    head = plain.rgb()
+    return head.but(
         Params=Weights,
         View=Units,
         prepare=prepare,
@@ -267,19 +268,21 @@ def features(
         decode=decode,
         adj_decode=adj_decode,
         weight_min=weight_min,
-        begin_rows=network.begin_rows,
-        prepare_row=prepare_row,
-        adj_prepare_row=adj_prepare_row,
-        decode_pack=decode_pack,
-        adj_decode_pack=adj_decode_pack,
-        pack_fields=(
-            ("inputs", wp.types.matrix((LANES, layout.n_padded), wp.float32)),
-            ("hidden", wp.types.matrix((LANES, layout.units), wp.float32)),
-        ),
-        n_packs=N_PACKS,
-        row_fields=(
-            ("view", units),
-            ("adj_view", units),
-            ("encoded", wp.types.vector(layout.n_shared, wp.float32)),
+        vectors=head.vectors._replace(
+            begin_rows=network.begin_rows,
+            prepare_row=prepare_row,
+            adj_prepare_row=adj_prepare_row,
+            decode_pack=decode_pack,
+            adj_decode_pack=adj_decode_pack,
+            pack_fields=(
+                ("inputs", wp.types.matrix((LANES, layout.n_padded), wp.float32)),
+                ("hidden", wp.types.matrix((LANES, layout.units), wp.float32)),
+            ),
+            row_fields=(
+                ("view", units),
+                ("adj_view", units),
+                ("encoded", wp.types.vector(layout.n_shared, wp.float32)),
+            ),
+            n_packs=N_PACKS,
         ),
     )

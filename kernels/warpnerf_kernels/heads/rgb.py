@@ -6,7 +6,7 @@ from typing import Any
 import warp as wp
 
 from ..base.activation import adj_sigmoid, sigmoid
-from ..base.parts import Head
+from ..base.parts import Head, HeadVectors
 from ..base.simd import VECTORS
 from ..base.types import Nothing, real, vec3, vector
 
@@ -15,7 +15,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def no_view(params: Any, direction: vec3):
-    """What does not depend on the direction of view."""
+    """One zero: colour does not depend on the direction of view."""
     return vector_1(real(0.0))
 
 
@@ -47,7 +47,7 @@ def decode_of(n_channels: int) -> tuple[wp.Function, wp.Function]:
         adj_raw = raw * real(0.0)
         for c in range(n_channels):
             adj_raw[1 + c] = adj[c]
-        return adj_raw, view
+        return adj_raw, view - view
 
     return decode, adj_decode
 
@@ -133,7 +133,7 @@ def adj_shade_rows(
 
 @wp.func
 def begin_rows(params: Any, worker: int):
-    """Nothing to make ready."""
+    """The head has no parameters to prepare."""
 
 
 @wp.func
@@ -160,11 +160,13 @@ def rgb() -> Head:
         adj_decode=adj_decode,
         shade=shade,
         adj_shade=adj_shade,
-        begin_rows=begin_rows,
-        prepare_row=prepare_row,
-        adj_prepare_row=adj_prepare_row,
-        decode_pack=decode_pack,
-        adj_decode_pack=adj_decode_pack,
-        shade_rows=shade_rows,
-        adj_shade_rows=adj_shade_rows,
+        vectors=HeadVectors(
+            begin_rows=begin_rows,
+            prepare_row=prepare_row,
+            adj_prepare_row=adj_prepare_row,
+            decode_pack=decode_pack,
+            adj_decode_pack=adj_decode_pack,
+            shade_rows=shade_rows,
+            adj_shade_rows=adj_shade_rows,
+        ),
     )

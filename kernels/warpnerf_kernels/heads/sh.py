@@ -86,7 +86,7 @@ def adj_decode(params: Any, view: Any, raw: Any, channels: vec3, adj_channels: v
     for k in range(len(view)):
         for c in range(3):
             adj_raw[1 + 3 * k + c] = view[k] * adj[c]
-    return adj_raw, view
+    return adj_raw, view - view
 
 
 @wp.func_native(
@@ -151,13 +151,16 @@ def sh(degree: int) -> Head:
     def prepare_row(params: Any, rows: wp.array(dtype=Any), row: int):
         rows[row].view = harmonics(params, rows[row].ray.direction)
 
-    return plain.rgb()._replace(
+    head = plain.rgb()
+    return head.but(
         View=View,
         prepare=harmonics,
         decode=decode,
         adj_decode=adj_decode,
-        prepare_row=prepare_row,
-        decode_pack=decode_pack,
-        adj_decode_pack=adj_decode_pack,
-        row_fields=(("view", View),),
+        vectors=head.vectors._replace(
+            prepare_row=prepare_row,
+            decode_pack=decode_pack,
+            adj_decode_pack=adj_decode_pack,
+            row_fields=(("view", View),),
+        ),
     )

@@ -11,13 +11,14 @@ from typing import NamedTuple
 import warp as wp
 
 from ..base.parts import Encoding, Head, RayLoss, Sampler
-from ..base.types import Box, Density, FreeSpace, gradient_type, real, vec3, vector
+from ..base.types import gradient_type, real, vec3, vector
 from ..cpu.scatter import delivery, leave_none
 from ..cpu.schedule import ray_schedule
 from ..sampling.steps import STEPS
-from ..sampling.traversal import traversal
+from ..volume import scene as scenes
 from ..volume.loss import adj_squared_error, squared_error
 from ..volume.ray_loss import NONE
+from ..volume.scene import Rays, ray_getter, ray_value
 from ..volume.walk import walk
 from ..volume.walk_packs import walk_packs
 
@@ -35,9 +36,8 @@ class Parts(NamedTuple):
         """Whether all parts have a vector form; else the CPU runs the scalar one, on a thread."""
         return (
             self.sampler.place_pack is not None
-            and self.encoding.read_pack is not None
-            and self.head.decode_pack is not None
-            and self.loss is NONE
+            and self.encoding.vectors is not None
+            and self.head.vectors is not None
         )
 
 
@@ -53,34 +53,16 @@ class Variant(NamedTuple):
     @property
     def batch(self) -> int:
         """Rays that a worker has in hand together."""
-        return self.parts.head.batch if self.packed else 1
+        return self.parts.head.vectors.batch if self.packed else 1
 
 
-@cache
 def scene_type(parts: Parts) -> type:
     """What rays are marched through."""
-
-    @wp.struct
-    class Scene:
-        box: Box
-        free: FreeSpace
-        march: parts.sampler.Params
-        field: parts.encoding.Params
-        density: Density
-        head: parts.head.Params
-
-    return Scene
+    return scenes.scene_type(parts.sampler, parts.encoding, parts.head)
 
 
-@wp.struct
-class Rays:
-    """Rays of a launch."""
-
-    origins: wp.array(dtype=vec3)  # [n_rays] scene units
-    directions: wp.array(dtype=vec3)  # [n_rays] unit vectors
-    offsets: wp.array(dtype=real)  # [n_rays] or [1], in [0, 1)
-    background: wp.array(dtype=vec3)  # [n_rays] or [1], rgb in [0, 1]
-    content_distance: wp.array(dtype=real)  # [n_rays] or [1], scene units; for gradients
+def _ray_of(parts: Parts) -> wp.Function:
+    return ray_getter(parts.sampler, parts.encoding, parts.head)
 
 
 @cache
@@ -110,11 +92,12 @@ def scratch_type(variant: Variant) -> type:
     """What workers keep between the two passes."""
     if not variant.packed:
         return Nowhere
-    walked = walk_packs(variant.parts.sampler, variant.parts.encoding, variant.parts.head)
+    parts = variant.parts
+    walked = walk_packs(parts.sampler, parts.encoding, parts.head, parts.loss)
 
     @wp.struct
     class Scratch:
-        capacity: int  # packs of each worker
+        capacity: int  # packs of each worker, n_packs of the head at least
         packs: wp.array(dtype=walked.Pack)  # [n_workers * capacity]
         rows: wp.array(dtype=walked.Row)  # [n_workers * batch]
 
@@ -123,22 +106,10 @@ def scratch_type(variant: Variant) -> type:
 
 def sink_type(variant: Variant) -> type:
     """What kernels add to: the gradient, or that and records on their way to it."""
-    encoding = variant.parts.encoding
+    parts = variant.parts
     if not variant.packed:
-        return gradient_type(encoding.n_floats)
-    return walk_packs(variant.parts.sampler, encoding, variant.parts.head).Deferred
-
-
-@wp.func
-def ray_value(values: wp.array(dtype=vec3), ray: int) -> vec3:
-    """One value for all rays, or one per ray."""
-    return values[wp.min(ray, values.shape[0] - 1)]
-
-
-@wp.func
-def ray_value(values: wp.array(dtype=real), ray: int) -> real:  # noqa: F811 (an overload)
-    """One value for all rays, or one per ray."""
-    return values[wp.min(ray, values.shape[0] - 1)]
+        return gradient_type(parts.encoding.n_floats)
+    return walk_packs(parts.sampler, parts.encoding, parts.head, parts.loss).Sink
 
 
 def render_forward_kernel(variant: Variant) -> wp.Kernel:
@@ -162,8 +133,8 @@ def render_backward_kernel(variant: Variant) -> wp.Kernel:
 def render_train_kernel(variant: Variant) -> wp.Kernel:
     """Forward, loss and adjoint of a batch in one launch.
 
-    (first, worker, scene, rays, target_rgb, loss_weight, scratch, out_error, out_n_samples,
-    out_gradient)
+    (first, worker, scene, rays, target_rgb, loss_weight, scratch, out_error, out_loss,
+    out_n_samples, out_gradient)
     """
     return _train_packs(variant) if variant.packed else _train(variant)
 
@@ -175,7 +146,7 @@ def render_train_kernel(variant: Variant) -> wp.Kernel:
 def _forward(variant: Variant) -> wp.Kernel:
     parts, contraction = variant.parts, variant.contraction
     Scene, Seen = scene_type(parts), seen_type(parts.head.n_channels)
-    prepare_ray = traversal(parts.sampler).prepare_ray
+    ray_of = _ray_of(parts)
     integrate = walk(parts.sampler, parts.encoding, parts.head, parts.loss).integrate
     shade = parts.head.shade
 
@@ -190,21 +161,9 @@ def _forward(variant: Variant) -> wp.Kernel:
         out_seen: Seen,
     ):
         i = first + wp.tid()
-        ray = prepare_ray(
-            scene.box,
-            scene.march,
-            rays.origins[i],
-            rays.directions[i],
-            ray_value(rays.offsets, i),
-            contraction,
-        )
+        ray = ray_of(scene, rays, i, contraction)
         total = integrate(
-            scene.box,
-            scene.free,
-            scene.march,
-            scene.field,
-            scene.density,
-            scene.head,
+            scene,
             ray,
             contraction,
         )
@@ -224,7 +183,7 @@ def _backward(variant: Variant) -> wp.Kernel:
     scaling, jacobian = variant.scaling, variant.jacobian
     Scene, Seen = scene_type(parts), seen_type(parts.head.n_channels)
     Gradient = gradient_type(parts.encoding.n_floats)
-    prepare_ray = traversal(parts.sampler).prepare_ray
+    ray_of = _ray_of(parts)
     walked = walk(parts.sampler, parts.encoding, parts.head, parts.loss)
     adj_integrate, Integral = walked.adj_integrate, walked.Integral
     adj_shade = parts.head.adj_shade
@@ -243,14 +202,7 @@ def _backward(variant: Variant) -> wp.Kernel:
         out_gradient: Gradient,  # added to
     ):
         i = first + wp.tid()
-        ray = prepare_ray(
-            scene.box,
-            scene.march,
-            rays.origins[i],
-            rays.directions[i],
-            ray_value(rays.offsets, i),
-            contraction,
-        )
+        ray = ray_of(scene, rays, i, contraction)
         total = Integral()
         total.channels = seen.channels[i]
         total.transmittance = seen.transmittance[i]
@@ -266,12 +218,7 @@ def _backward(variant: Variant) -> wp.Kernel:
         )
         adj_transmittance = wp.dot(adj_rgb[i], ray_value(rays.background, i)) - adj_opacity[i]
         adj_integrate(
-            scene.box,
-            scene.free,
-            scene.march,
-            scene.field,
-            scene.density,
-            scene.head,
+            scene,
             ray,
             total,
             adj_channels,
@@ -294,11 +241,11 @@ def _train(variant: Variant) -> wp.Kernel:
     scaling, jacobian = variant.scaling, variant.jacobian
     Scene = scene_type(parts)
     Gradient = gradient_type(parts.encoding.n_floats)
-    prepare_ray = traversal(parts.sampler).prepare_ray
+    ray_of = _ray_of(parts)
     walked = walk(parts.sampler, parts.encoding, parts.head, parts.loss)
     integrate, adj_integrate = walked.integrate, walked.adj_integrate
     shade, adj_shade = parts.head.shade, parts.head.adj_shade
-    loss_value = parts.loss.value
+    has_loss, loss_value = parts.loss is not NONE, parts.loss.value
 
     @wp.kernel(module="unique", enable_backward=False)
     def render_train(
@@ -309,26 +256,15 @@ def _train(variant: Variant) -> wp.Kernel:
         target_rgb: wp.array(dtype=vec3),  # [n_rays] in [0, 1]
         loss_weight: real,  # of one ray
         scratch: Nowhere,
-        out_error: wp.array(dtype=real),  # [n_rays] squared error, and the ray's loss
+        out_error: wp.array(dtype=real),  # [n_rays] squared error
+        out_loss: wp.array(dtype=real),  # [n_rays] of the samples; not written where there is none
         out_n_samples: wp.array(dtype=wp.int32),  # [n_rays]
         out_gradient: Gradient,  # added to
     ):
         i = first + wp.tid()
-        ray = prepare_ray(
-            scene.box,
-            scene.march,
-            rays.origins[i],
-            rays.directions[i],
-            ray_value(rays.offsets, i),
-            contraction,
-        )
+        ray = ray_of(scene, rays, i, contraction)
         total = integrate(
-            scene.box,
-            scene.free,
-            scene.march,
-            scene.field,
-            scene.density,
-            scene.head,
+            scene,
             ray,
             contraction,
         )
@@ -336,19 +272,16 @@ def _train(variant: Variant) -> wp.Kernel:
         opacity = real(1.0) - total.transmittance
         rgb = shade(scene.head, ray.direction, total.channels, opacity)
         rgb += total.transmittance * behind_all
-        out_error[i] = squared_error(rgb, target_rgb[i]) + loss_value(total.loss)
+        out_error[i] = squared_error(rgb, target_rgb[i])
+        if wp.static(has_loss):
+            out_loss[i] = loss_value(total.loss)
         out_n_samples[i] = total.n_samples
         adj_rgb = adj_squared_error(rgb, target_rgb[i], loss_weight)
         adj_channels, adj_opacity = adj_shade(
             scene.head, ray.direction, total.channels, opacity, adj_rgb, out_gradient
         )
         adj_integrate(
-            scene.box,
-            scene.free,
-            scene.march,
-            scene.field,
-            scene.density,
-            scene.head,
+            scene,
             ray,
             total,
             adj_channels,
@@ -377,9 +310,9 @@ def _forward_packs(variant: Variant) -> wp.Kernel:
         seen_type(parts.head.n_channels),
         scratch_type(variant),
     )
-    prepare_ray = traversal(parts.sampler).prepare_ray
-    integrate = walk_packs(parts.sampler, parts.encoding, parts.head).integrate
-    shade_rows = parts.head.shade_rows
+    ray_of = _ray_of(parts)
+    integrate = walk_packs(parts.sampler, parts.encoding, parts.head, parts.loss).integrate
+    shade_rows, n_packs = parts.head.vectors.shade_rows, parts.head.vectors.n_packs
 
     @wp.kernel(module="unique", enable_backward=False)
     def render_forward(
@@ -394,30 +327,18 @@ def _forward_packs(variant: Variant) -> wp.Kernel:
         begin = (first + wp.tid()) * batch
         n = wp.min(batch, n_rays - begin)
         row = worker * batch
-        slot = worker * scratch.capacity
+        end = (worker + 1) * scratch.capacity
         for r in range(n):
             i = begin + r
-            scratch.rows[row + r].ray = prepare_ray(
-                scene.box,
-                scene.march,
-                rays.origins[i],
-                rays.directions[i],
-                ray_value(rays.offsets, i),
-                contraction,
-            )
+            scratch.rows[row + r].ray = ray_of(scene, rays, i, contraction)
             integrate(
-                scene.box,
-                scene.free,
-                scene.march,
-                scene.field,
-                scene.density,
-                scene.head,
+                scene,
                 scratch.rows,
                 row + r,
                 contraction,
                 scratch.packs,
-                slot,
-                slot + 1,
+                end - n_packs,  # none is kept
+                end,
             )
         shade_rows(scene.head, scratch.rows, row, n)
         for r in range(n):
@@ -443,13 +364,15 @@ def _backward_packs(variant: Variant) -> wp.Kernel:
         seen_type(parts.head.n_channels),
         scratch_type(variant),
     )
-    Deferred = sink_type(variant)
-    prepare_ray = traversal(parts.sampler).prepare_ray
+    Sink = sink_type(variant)
+    ray_of = _ray_of(parts)
     take_share = ray_schedule(parts.sampler, parts.encoding).take_share
     deliver = delivery(parts.encoding)
-    adj_integrate = walk_packs(parts.sampler, parts.encoding, parts.head).adj_integrate
-    begin_rows, prepare_row = parts.head.begin_rows, parts.head.prepare_row
-    shade_rows, adj_shade_rows = parts.head.shade_rows, parts.head.adj_shade_rows
+    adj_integrate = walk_packs(parts.sampler, parts.encoding, parts.head, parts.loss).adj_integrate
+    has_loss, State = parts.loss is not NONE, parts.loss.State
+    begin_rows, prepare_row = parts.head.vectors.begin_rows, parts.head.vectors.prepare_row
+    n_packs = parts.head.vectors.n_packs
+    shade_rows, adj_shade_rows = parts.head.vectors.shade_rows, parts.head.vectors.adj_shade_rows
 
     @wp.kernel(module="unique", enable_backward=False)
     def render_backward(
@@ -462,7 +385,7 @@ def _backward_packs(variant: Variant) -> wp.Kernel:
         adj_opacity: wp.array(dtype=real),  # [n_rays]
         adj_depth: wp.array(dtype=real),  # [n_rays]
         scratch: Scratch,
-        out_gradient: Deferred,  # added to
+        out_gradient: Sink,  # added to
     ):
         chunk = out_gradient.chunk
         leave_none(worker, out_gradient)
@@ -478,26 +401,21 @@ def _backward_packs(variant: Variant) -> wp.Kernel:
             contraction,
         )
         row = worker * batch
-        slot = worker * scratch.capacity
+        end = (worker + 1) * scratch.capacity
         for begin in range(0, n_mine, batch):
             n = wp.min(batch, n_mine - begin)
             for r in range(n):
                 i = chunk.rays[worker, begin + r]
-                scratch.rows[row + r].ray = prepare_ray(
-                    scene.box,
-                    scene.march,
-                    rays.origins[i],
-                    rays.directions[i],
-                    ray_value(rays.offsets, i),
-                    contraction,
-                )
+                scratch.rows[row + r].ray = ray_of(scene, rays, i, contraction)
                 prepare_row(scene.head, scratch.rows, row + r)
-                scratch.rows[row + r].slot = slot
+                scratch.rows[row + r].slot = end - n_packs  # none was kept
                 scratch.rows[row + r].channels = seen.channels[i]
                 scratch.rows[row + r].depth = seen.depth[i]
                 scratch.rows[row + r].transmittance = seen.transmittance[i]
                 scratch.rows[row + r].n_samples = seen.n_samples[i]
                 scratch.rows[row + r].adj_rgb = adj_rgb[i]
+                if wp.static(has_loss):  # whose part in the gradient is none here
+                    scratch.rows[row + r].loss = State()
             shade_rows(scene.head, scratch.rows, row, n)
             adj_shade_rows(scene.head, scratch.rows, row, n, worker, out_gradient.gradient)
             for r in range(n):
@@ -506,22 +424,18 @@ def _backward_packs(variant: Variant) -> wp.Kernel:
                     wp.dot(adj_rgb[i], ray_value(rays.background, i)) - adj_opacity[i]
                 )
                 adj_integrate(
-                    scene.box,
-                    scene.free,
-                    scene.march,
-                    scene.field,
-                    scene.density,
-                    scene.head,
+                    scene,
                     scratch.rows,
                     row + r,
                     adj_transmittance - scratch.rows[row + r].adj_opacity,
                     adj_depth[i],
+                    real(0.0),
                     ray_value(rays.content_distance, i),
                     contraction,
                     scaling,
                     jacobian,
                     scratch.packs,
-                    slot + 1,
+                    end,
                     worker,
                     out_gradient,
                 )
@@ -535,14 +449,15 @@ def _train_packs(variant: Variant) -> wp.Kernel:
     parts, contraction, batch = variant.parts, variant.contraction, variant.batch
     scaling, jacobian = variant.scaling, variant.jacobian
     Scene, Scratch = scene_type(parts), scratch_type(variant)
-    Deferred = sink_type(variant)
-    prepare_ray = traversal(parts.sampler).prepare_ray
+    Sink = sink_type(variant)
+    ray_of = _ray_of(parts)
     take_share = ray_schedule(parts.sampler, parts.encoding).take_share
     deliver = delivery(parts.encoding)
-    walked = walk_packs(parts.sampler, parts.encoding, parts.head)
+    walked = walk_packs(parts.sampler, parts.encoding, parts.head, parts.loss)
     integrate, adj_integrate = walked.integrate, walked.adj_integrate
-    begin_rows = parts.head.begin_rows
-    shade_rows, adj_shade_rows = parts.head.shade_rows, parts.head.adj_shade_rows
+    begin_rows = parts.head.vectors.begin_rows
+    has_loss, loss_value = parts.loss is not NONE, parts.loss.value
+    shade_rows, adj_shade_rows = parts.head.vectors.shade_rows, parts.head.vectors.adj_shade_rows
 
     @wp.kernel(module="unique", enable_backward=False)
     def render_train(
@@ -554,8 +469,9 @@ def _train_packs(variant: Variant) -> wp.Kernel:
         loss_weight: real,  # of one ray
         scratch: Scratch,
         out_error: wp.array(dtype=real),  # [n_rays] squared error
+        out_loss: wp.array(dtype=real),  # [n_rays] of the samples; not written where there is none
         out_n_samples: wp.array(dtype=wp.int32),  # [n_rays]
-        out_gradient: Deferred,  # added to
+        out_gradient: Sink,  # added to
     ):
         chunk = out_gradient.chunk
         leave_none(worker, out_gradient)
@@ -577,21 +493,9 @@ def _train_packs(variant: Variant) -> wp.Kernel:
             slot = worker * scratch.capacity
             for r in range(n):
                 i = chunk.rays[worker, begin + r]
-                scratch.rows[row + r].ray = prepare_ray(
-                    scene.box,
-                    scene.march,
-                    rays.origins[i],
-                    rays.directions[i],
-                    ray_value(rays.offsets, i),
-                    contraction,
-                )
+                scratch.rows[row + r].ray = ray_of(scene, rays, i, contraction)
                 slot = integrate(
-                    scene.box,
-                    scene.free,
-                    scene.march,
-                    scene.field,
-                    scene.density,
-                    scene.head,
+                    scene,
                     scratch.rows,
                     row + r,
                     contraction,
@@ -606,6 +510,8 @@ def _train_packs(variant: Variant) -> wp.Kernel:
                     rays.background, i
                 )
                 out_error[i] = squared_error(rgb, target_rgb[i])
+                if wp.static(has_loss):
+                    out_loss[i] = loss_value(scratch.rows[row + r].loss)
                 out_n_samples[i] = scratch.rows[row + r].n_samples
                 scratch.rows[row + r].adj_rgb = adj_squared_error(rgb, target_rgb[i], loss_weight)
             adj_shade_rows(scene.head, scratch.rows, row, n, worker, out_gradient.gradient)
@@ -615,16 +521,12 @@ def _train_packs(variant: Variant) -> wp.Kernel:
                     scratch.rows[row + r].adj_rgb, ray_value(rays.background, i)
                 )
                 adj_integrate(
-                    scene.box,
-                    scene.free,
-                    scene.march,
-                    scene.field,
-                    scene.density,
-                    scene.head,
+                    scene,
                     scratch.rows,
                     row + r,
                     adj_transmittance - scratch.rows[row + r].adj_opacity,
                     real(0.0),
+                    loss_weight,
                     ray_value(rays.content_distance, i),
                     contraction,
                     scaling,

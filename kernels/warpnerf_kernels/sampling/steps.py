@@ -13,7 +13,8 @@ import warp as wp
 
 from ..base.parts import Sampler
 from ..base.simd import VECTORS
-from ..base.types import Ray, real, vec2
+from ..base.types import Box, Ray, real, vec2, vec3
+from ..space.contraction import norm_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -48,7 +49,13 @@ def step_length(march: March, k: int) -> real:
 
 
 @wp.func
-def interval(march: March, k: int) -> vec2:
+def edge(march: March, ray: Ray, k: int) -> real:
+    """step_edge: steps are the same for all rays."""
+    return step_edge(march, k)
+
+
+@wp.func
+def interval(march: March, ray: Ray, k: int) -> vec2:
     """Where step k begins, and its length."""
     return vec2(step_edge(march, k), step_length(march, k))
 
@@ -64,7 +71,7 @@ def steps_before(march: March, t: real) -> real:
 
 
 @wp.func
-def steps_within(march: March, interval: vec2) -> wp.vec2i:
+def steps_within(march: March, ray: Ray, interval: vec2) -> wp.vec2i:
     """The first step that can lie in an interval of t, and one past the last.
 
     One step of slack at both ends absorbs rounding.
@@ -124,12 +131,30 @@ def place_steps(march: March, ray: Ray, step: int, packs: wp.array(dtype=Any), s
     place_steps_at(march, ray, step, step_edge(march, wp.max(step, march.n_linear)), packs, slot)
 
 
+@wp.func
+def longest_step(march: March, box: Box, c: vec3, contraction: int) -> real:
+    """How long steps can be where contracted coordinates are no larger than c, on each axis.
+
+    A point n boxes out is at most n times as far from a camera as equal steps reach: these go to
+    the farthest corner of the box.
+    """
+    norm = norm_of(c, contraction)
+    if norm <= real(1.0) or march.growth == real(0.0):
+        return march.step
+    t = march.far
+    if norm < real(1.0) + box.border:
+        n = box.border / (real(1.0) + box.border - norm)
+        t = wp.min(t, n * step_edge(march, march.n_linear))
+    return wp.max(march.step, march.growth * t)
+
+
 STEPS = Sampler(
     Params=March,
     interval=interval,
-    edge=step_edge,
+    edge=edge,
     steps_within=steps_within,
     step_after=step_after,
+    longest=longest_step,
     place_pack=place_steps,
 )
 """The sampler."""

@@ -6,6 +6,7 @@ from typing import Any
 
 import warp as wp
 
+from ..base.parts import Sampler
 from ..base.simd import VECTORS
 from ..base.types import Box, FreeSpace, Ray, Sample, real, vec2, vec3
 from ..space.contraction import L2, NONE, contract, det_jacobian_of
@@ -127,14 +128,14 @@ def locate_pack(
 
 
 @cache
-def traversal(sampler: Any) -> SimpleNamespace:
+def traversal(sampler: Sampler) -> SimpleNamespace:
     """The functions that ask the sampler where a step lies.
 
     Args:
-        sampler: ``launch.parts.Sampler``.
+        sampler: Where steps lie.
 
     Returns:
-        prepare_ray(box, march, origin, direction, offset, contraction) -> Ray,
+        prepare_ray(box, march, index, origin, direction, offset, contraction) -> Ray,
         next_sample(box, free, march, ray, first, contraction) -> Sample.
     """
     Steps = sampler.Params
@@ -148,6 +149,7 @@ def traversal(sampler: Any) -> SimpleNamespace:
     def prepare_ray(
         box: Box,
         march: Steps,
+        index: int,
         origin: vec3,
         direction: vec3,  # unit
         offset: real,
@@ -158,6 +160,7 @@ def traversal(sampler: Any) -> SimpleNamespace:
         A ray that is not finite or has no direction, of a lens that folds over, meets nothing.
         """
         ray = Ray()
+        ray.index = index
         ray.offset = offset
         ray.direction = direction
         ray.q_origin = wp.cw_div(origin - box.centre, box.half)
@@ -171,7 +174,7 @@ def traversal(sampler: Any) -> SimpleNamespace:
         ray.end = int(0)
         finite = wp.isfinite(ray.q_origin) and wp.isfinite(ray.q_direction)
         if interval[0] <= interval[1] and finite and wp.length_sq(ray.q_direction) > real(0.0):
-            steps = steps_within(march, interval)
+            steps = steps_within(march, ray, interval)
             ray.begin = steps[0]
             ray.end = steps[1]
         return ray
@@ -193,7 +196,7 @@ def traversal(sampler: Any) -> SimpleNamespace:
         sample.step = ray.end
         step = int(first)
         while step < ray.end:
-            edge_and_length = interval_of(march, step)
+            edge_and_length = interval_of(march, ray, step)
             dt = edge_and_length[1]
             t = edge_and_length[0] + ray.offset * dt
             if t >= march.far:

@@ -15,9 +15,10 @@ from typing import Any
 
 import warp as wp
 
-from ..base.parts import Encoding, Head
+from ..base.parts import Encoding, Head, RayLoss
 from ..base.simd import LANES, VECTORS, lanes, lanes_int
 from ..base.types import Density, Ray
+from .ray_loss import NONE
 
 wp.set_module_options({"enable_backward": False})
 
@@ -27,7 +28,7 @@ def _struct(name: str, fields: dict[str, Any]) -> type:
 
 
 @cache
-def pack_type(encoding: Encoding, head: Head) -> type:
+def pack_type(encoding: Encoding, head: Head, loss: RayLoss) -> type:
     """Sixteen consecutive steps of a ray, which of them are samples, and what those hold."""
     return _struct(
         "Pack",
@@ -52,14 +53,15 @@ def pack_type(encoding: Encoding, head: Head) -> type:
             "adj_raw": wp.types.matrix((encoding.n_floats, LANES), wp.float32),
             "channel": wp.types.matrix((head.n_channels, LANES), wp.float32),
             "sums": wp.types.vector(head.n_channels, wp.float32),  # of weight times channel
-            **dict(encoding.pack_fields),
-            **dict(head.pack_fields),
+            **dict(encoding.vectors.pack_fields),
+            **dict(head.vectors.pack_fields),
+            **({"adj_weight": lanes} if loss is not NONE else {}),  # from the loss on the ray
         },
     )
 
 
 @cache
-def row_type(head: Head) -> type:
+def row_type(head: Head, loss: RayLoss) -> type:
     """A ray between the two passes."""
     channels = wp.types.vector(head.n_channels, wp.float32)
     vec3 = wp.types.vector(3, wp.float32)
@@ -76,7 +78,8 @@ def row_type(head: Head) -> type:
             "adj_rgb": vec3,
             "adj_channels": channels,
             "adj_opacity": wp.float32,
-            **dict(head.row_fields),
+            **dict(head.vectors.row_fields),
+            **({"loss": loss.State} if loss is not NONE else {}),  # sums over its samples
         },
     )
 
@@ -119,9 +122,7 @@ def weigh(
     ...
 
 
-@wp.func_native(
-    VECTORS
-    + r"""
+COMPOSITE = r"""
 auto& pack = packs.data[slot];
 constexpr int CHANNELS = sizeof(pack.channel) / sizeof(vec);
 const vec weight = load(pack.weight);
@@ -131,15 +132,8 @@ for (int c = 0; c < CHANNELS; ++c) {
 }
 pack.depth = sum(weight * load(pack.t));
 """
-)
-def composite(packs: wp.array(dtype=Any), slot: int):
-    """What walk.integrate adds up, for the samples of a pack."""
-    ...
 
-
-@wp.func_native(
-    VECTORS
-    + r"""
+ADJ_COMPOSITE = r"""
 auto& pack = packs.data[slot];
 const auto& adj = rows.data[row].adj_channels;
 constexpr int CHANNELS = sizeof(pack.channel) / sizeof(vec);
@@ -150,6 +144,7 @@ vec adj_weight = fma(all(adj_depth), load(pack.t),
 for (int c = CHANNELS - 2; c >= 0; --c) {
     adj_weight = fma(all(adj.c[c]), load(pack.channel.data[c]), adj_weight);
 }
+OF_LOSS
 vec light = load(pack.transmittance);
 vec left = behind - running_sum(weight * adj_weight);
 left = least(most(left, -limit * light), limit * light);
@@ -158,15 +153,31 @@ const vec adj_sigma = load(pack.scale) * (load(pack.dt) * adj_tau);
 store(pack.adj_raw.data[0], load(pack.sigma_slope) * adj_sigma);
 pack.behind = left[LANES - 1];
 """
-)
-def adj_composite(
-    adj_depth: wp.float32,
-    behind: wp.float32,  # what lies behind the pack before this one
-    limit: wp.float32,  # of what lies behind, for each unit of light
-    rows: wp.array(dtype=Any),
-    row: int,  # whose adj_channels flow back
-    packs: wp.array(dtype=Any),
-    slot: int,
-):
-    """What walk.adj_integrate does with a density, for the samples of a pack."""
-    ...
+
+
+@cache
+def compositing(loss: RayLoss) -> tuple[wp.Function, wp.Function]:
+    """composite, what walk.integrate adds up for the samples of a pack, and adj_composite.
+
+    The latter does what walk.adj_integrate does with densities. Where there is a loss on the ray,
+    the pack holds what it adds to the slope of each weight.
+    """
+    of_loss = "" if loss is NONE else "adj_weight += load(pack.adj_weight);"
+    forward = VECTORS + COMPOSITE
+    backward = VECTORS + ADJ_COMPOSITE.replace("OF_LOSS", of_loss)
+
+    @wp.func_native(forward)
+    def composite(packs: wp.array(dtype=Any), slot: int): ...
+
+    @wp.func_native(backward)
+    def adj_composite(
+        adj_depth: wp.float32,
+        behind: wp.float32,  # what lies behind the pack before this one
+        limit: wp.float32,  # of what lies behind, for each unit of light
+        rows: wp.array(dtype=Any),
+        row: int,  # whose adj_channels flow back
+        packs: wp.array(dtype=Any),
+        slot: int,
+    ): ...
+
+    return composite, adj_composite

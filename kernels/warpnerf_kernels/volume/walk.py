@@ -15,10 +15,11 @@ import warp as wp
 
 from ..base.activation import adj_softplus, opacity_of
 from ..base.parts import Encoding, Head, RayLoss, Sampler
-from ..base.types import Box, Density, FreeSpace, Ray, gradient_type, real, vector
+from ..base.types import Ray, gradient_type, real, vector
 from ..sampling.traversal import traversal
 from .compositing import matter_of, shed
 from .gradscale import distance_scale
+from .scene import scene_type
 
 wp.set_module_options({"enable_backward": False})
 
@@ -46,7 +47,7 @@ def walk(sampler: Sampler, encoding: Encoding, head: Head, loss: RayLoss) -> Sim
     Returns:
         integrate, adj_integrate, and Integral, the type between them.
     """
-    Steps, Field, Params = sampler.Params, encoding.Params, head.Params
+    Scene = scene_type(sampler, encoding, head)
     Raw, Channels, View = vector(encoding.n_floats), vector(head.n_channels), head.View
     Gradient = gradient_type(encoding.n_floats)
     State = loss.State
@@ -61,46 +62,36 @@ def walk(sampler: Sampler, encoding: Encoding, head: Head, loss: RayLoss) -> Sim
 
     @wp.func
     def integrate(
-        box: Box,
-        free: FreeSpace,
-        march: Steps,
-        field: Field,
-        density: Density,
-        params: Params,
+        scene: Scene,
         ray: Ray,
         contraction: int,
     ) -> Integral:
         """Composite a ray's samples front to back: sum_i T_i alpha_i c_i."""
-        view = prepare(params, ray.direction)
+        view = prepare(scene.head, ray.direction)
         total = Integral()
         total.transmittance = real(1.0)
         step = int(ray.begin)
         while step < ray.end:
-            sample = next_sample(box, free, march, ray, step, contraction)
+            sample = next_sample(scene.box, scene.free, scene.march, ray, step, contraction)
             step = sample.step + 1
             if sample.step < ray.end:
-                raw = read(field, sample.position)
-                matter = matter_of(density, raw[0], sample.dt)
+                raw = read(scene.field, sample.position)
+                matter = matter_of(scene.density, raw[0], sample.dt)
                 opacity = opacity_of(matter.sigma * sample.dt, matter.attenuation)
                 weight = total.transmittance * opacity
                 if weight > real(weight_min):
-                    total.channels += weight * decode(params, view, raw)
+                    total.channels += weight * decode(scene.head, view, raw)
                 total.loss = add_loss(total.loss, weight, sample.t, sample.dt)
                 total.depth += weight * sample.t
                 total.transmittance *= matter.attenuation
                 total.n_samples += 1
-                if total.transmittance < march.transmittance_min:
+                if total.transmittance < scene.march.transmittance_min:
                     step = ray.end
         return total
 
     @wp.func
     def adj_integrate(
-        box: Box,
-        free: FreeSpace,
-        march: Steps,
-        field: Field,
-        density: Density,
-        params: Params,
+        scene: Scene,
         ray: Ray,
         total: Integral,
         adj_channels: Channels,
@@ -120,7 +111,7 @@ def walk(sampler: Sampler, encoding: Encoding, head: Head, loss: RayLoss) -> Sim
 
         both multiplied by the distance scaling. The two sums are what lies behind sample i.
         """
-        view = prepare(params, ray.direction)
+        view = prepare(scene.head, ray.direction)
         adj_view = View()
         behind = (
             wp.dot(adj_channels, total.channels)
@@ -131,17 +122,17 @@ def walk(sampler: Sampler, encoding: Encoding, head: Head, loss: RayLoss) -> Sim
         limit = behind_limit(
             adj_transmittance,
             adj_channels,
-            adj_depth * edge(march, ray.end),
-            adj_loss_value * loss_bound(total.loss, edge(march, ray.end)),
+            adj_depth * edge(scene.march, ray, ray.end),
+            adj_loss_value * loss_bound(total.loss, edge(scene.march, ray, ray.end)),
         )
         before = State()
         transmittance = real(1.0)
         step = int(ray.begin)
         for _n in range(total.n_samples):
-            sample = next_sample(box, free, march, ray, step, contraction)
+            sample = next_sample(scene.box, scene.free, scene.march, ray, step, contraction)
             step = sample.step + 1
-            raw = read(field, sample.position)
-            matter = matter_of(density, raw[0], sample.dt)
+            raw = read(scene.field, sample.position)
+            matter = matter_of(scene.density, raw[0], sample.dt)
             weight = transmittance * opacity_of(matter.sigma * sample.dt, matter.attenuation)
             transmittance *= matter.attenuation
             scale = distance_scale(
@@ -153,18 +144,18 @@ def walk(sampler: Sampler, encoding: Encoding, head: Head, loss: RayLoss) -> Sim
             before = add_loss(before, weight, sample.t, sample.dt)
             adj_raw = Raw()
             if weight > real(weight_min):
-                channels = decode(params, view, raw)
+                channels = decode(scene.head, view, raw)
                 adj_weight += wp.dot(adj_channels, channels)
                 adj_sample_channels = scale * (weight * adj_channels)
                 adj_raw, adj_sample_view = adj_decode(
-                    params, view, raw, channels, adj_sample_channels, gradient
+                    scene.head, view, raw, channels, adj_sample_channels, gradient
                 )
                 adj_view += adj_sample_view
             behind = shed(behind, weight, adj_weight, limit, transmittance)
             adj_sigma = scale * (sample.dt * (transmittance * adj_weight - behind))
             adj_raw[0] = adj_softplus(matter.sigma_slope, adj_sigma)
-            adj_read(field, sample.position, adj_raw, gradient)
-        adj_prepare(params, ray.direction, adj_view, gradient)
+            adj_read(scene.field, sample.position, adj_raw, gradient)
+        adj_prepare(scene.head, ray.direction, adj_view, gradient)
 
     return SimpleNamespace(integrate=integrate, adj_integrate=adj_integrate, Integral=Integral)
 

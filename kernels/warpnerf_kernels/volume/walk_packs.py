@@ -1,7 +1,8 @@
 """walk.py for the CPU: the same walk, a pack of sixteen steps at a time.
 
 A worker has some rays in hand, one or a batch whose rows the head shades together. Of each it keeps
-packs between the two passes, as many as there is room for; the others are made again.
+packs between the two passes, as many as there is room for: the last slots, as many as are decoded
+together, are for packs that are not kept, and are made again.
 """
 
 from functools import cache
@@ -9,43 +10,45 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from ..base.parts import Encoding, Head, Sampler
+from ..base.parts import Encoding, Head, RayLoss, Sampler
 from ..base.simd import LANES, lanes
-from ..base.types import Box, Density, FreeSpace, Ray
-from ..cpu.scatter import deferred_type
+from ..base.types import Ray
+from ..cpu.scatter import sink_type
 from ..sampling.traversal import locate_pack, traversal
 from .gradscale import distance_scale
-from .pack import adj_composite, composite, pack_type, row_type, weigh
+from .pack import compositing, pack_type, row_type, weigh
+from .ray_loss import NONE
+from .scene import scene_type
 from .walk import behind_limit
 
 wp.set_module_options({"enable_backward": False})
 
 
 @cache
-def walk_packs(sampler: Sampler, encoding: Encoding, head: Head) -> SimpleNamespace:
+def walk_packs(sampler: Sampler, encoding: Encoding, head: Head, loss: RayLoss) -> SimpleNamespace:
     """The two passes for a model's parts.
 
     Returns:
-        integrate, adj_integrate, and what they keep: Pack, Row; and Deferred, what they add to.
+        integrate, adj_integrate, and what they keep: Pack, Row; and Sink, what they add to.
     """
-    Steps, Field, Params = sampler.Params, encoding.Params, head.Params
-    Pack, Row = pack_type(encoding, head), row_type(head)
-    Deferred = deferred_type(encoding)
+    Scene = scene_type(sampler, encoding, head)
+    own, of_head = encoding.vectors, head.vectors
+    Pack, Row = pack_type(encoding, head, loss), row_type(head, loss)
+    Sink = sink_type(encoding)
     Channels = wp.types.vector(head.n_channels, wp.float32)
     next_sample = traversal(sampler).next_sample
     edge, place_pack = sampler.edge, sampler.place_pack
-    read_pack, adj_read_pack = encoding.read_pack, encoding.adj_read_pack
-    decode_pack, adj_decode_pack = head.decode_pack, head.adj_decode_pack
-    n_packs = head.n_packs
-    prepare_row, adj_prepare_row = head.prepare_row, head.adj_prepare_row
+    read_pack, adj_read_pack = own.read_pack, own.adj_read_pack
+    decode_pack, adj_decode_pack = of_head.decode_pack, of_head.adj_decode_pack
+    n_packs = of_head.n_packs
+    prepare_row, adj_prepare_row = of_head.prepare_row, of_head.adj_prepare_row
+    composite, adj_composite = compositing(loss)
+    has_loss, State = loss is not NONE, loss.State
+    add_loss, weighted, adj_loss, loss_bound = loss.add, loss.weighted, loss.adj_weight, loss.bound
 
     @wp.func
     def next_pack(
-        box: Box,
-        free: FreeSpace,
-        march: Steps,
-        field: Field,
-        density: Density,
+        scene: Scene,
         ray: Ray,
         first: int,  # step to begin looking at
         dense: bool,  # the step before it is a sample, so that this one is likely to be
@@ -61,34 +64,59 @@ def walk_packs(sampler: Sampler, encoding: Encoding, head: Head) -> SimpleNamesp
         """
         step = first
         if not dense:
-            step = next_sample(box, free, march, ray, first, contraction).step
-        place_pack(march, ray, step, packs, slot)
-        locate_pack(box, free, ray, contraction, packs, slot)
-        read_pack(field, ray, packs, slot)
-        weigh(density, transmittance, march.transmittance_min, packs, slot)
-        if packs[slot].passed < march.transmittance_min:
+            step = next_sample(scene.box, scene.free, scene.march, ray, first, contraction).step
+        place_pack(scene.march, ray, step, packs, slot)
+        locate_pack(scene.box, scene.free, ray, contraction, packs, slot)
+        read_pack(scene.field, ray, packs, slot)
+        weigh(scene.density, transmittance, scene.march.transmittance_min, packs, slot)
+        if packs[slot].passed < scene.march.transmittance_min:
             return ray.end
         return wp.min(step + LANES, ray.end)
 
     @wp.func
+    def add_pack(before: State, packs: wp.array(dtype=Pack), slot: int) -> State:
+        """The loss's sums with the samples of a pack. One after the other: they build on it."""
+        state = before
+        for lane in range(LANES):
+            if packs[slot].visited[lane] != 0:
+                weight = packs[slot].weight[lane]
+                state = add_loss(state, weight, packs[slot].t[lane], packs[slot].dt[lane])
+        return state
+
+    @wp.func
+    def adj_add_pack(
+        total: State,
+        before: State,
+        adj_loss_value: float,
+        packs: wp.array(dtype=Pack),  # whose adj_weight is written
+        slot: int,
+    ) -> State:
+        """What the loss adds to the slope of each weight of a pack; the sums with its samples."""
+        state = before
+        adj = lanes()
+        for lane in range(LANES):
+            if packs[slot].visited[lane] != 0:
+                weight, t, dt = packs[slot].weight[lane], packs[slot].t[lane], packs[slot].dt[lane]
+                adj[lane] = adj_loss_value * adj_loss(total, state, weight, t, dt)
+                state = add_loss(state, weight, t, dt)
+        packs[slot].adj_weight = adj
+        return state
+
+    @wp.func
     def integrate(
-        box: Box,
-        free: FreeSpace,
-        march: Steps,
-        field: Field,
-        density: Density,
-        params: Params,
+        scene: Scene,
         rows: wp.array(dtype=Row),
         row: int,  # whose ray is given, and what it gathers written
         contraction: int,
         packs: wp.array(dtype=Pack),  # written
         begin: int,  # first slot that is free
-        end: int,  # one past the last; all packs that do not fit share that one
+        end: int,  # one past the last
     ) -> int:
         """walk.integrate, a pack at a time. Returns the first slot that is still free."""
-        prepare_row(params, rows, row)
+        prepare_row(scene.head, rows, row)
         ray = rows[row].ray
         channels = Channels()
+        state = State()
         depth = float(0.0)
         transmittance = float(1.0)
         n_samples = int(0)
@@ -96,16 +124,11 @@ def walk_packs(sampler: Sampler, encoding: Encoding, head: Head) -> SimpleNamesp
         n = int(0)  # packs so far
         dense = bool(False)
         while step < ray.end:
-            first = wp.min(begin + n, end - 1)
-            last = wp.min(first + n_packs, end)
+            first = wp.min(begin + n, end - n_packs)
             slot = int(first)
-            while slot < last and step < ray.end:
+            while slot < first + n_packs and step < ray.end:
                 step = next_pack(
-                    box,
-                    free,
-                    march,
-                    field,
-                    density,
+                    scene,
                     ray,
                     step,
                     dense,
@@ -118,31 +141,31 @@ def walk_packs(sampler: Sampler, encoding: Encoding, head: Head) -> SimpleNamesp
                 transmittance = packs[slot].passed
                 n_samples += packs[slot].n_samples
                 slot += 1
-            decode_pack(params, rows, row, packs, first, slot - first)
+            decode_pack(scene.head, rows, row, packs, first, slot - first)
             for k in range(first, slot):
                 composite(packs, k)
                 channels += packs[k].sums
                 depth += packs[k].depth
+                if wp.static(has_loss):
+                    state = add_pack(state, packs, k)
             n += slot - first
         rows[row].channels = channels
         rows[row].depth = depth
         rows[row].transmittance = transmittance
         rows[row].n_samples = n_samples
         rows[row].slot = begin
-        return wp.min(begin + n, end - 1)
+        if wp.static(has_loss):
+            rows[row].loss = state
+        return wp.min(begin + n, end - n_packs)
 
     @wp.func
     def adj_integrate(
-        box: Box,
-        free: FreeSpace,
-        march: Steps,
-        field: Field,
-        density: Density,
-        params: Params,
+        scene: Scene,
         rows: wp.array(dtype=Row),
         row: int,  # as integrate left it, with what flows back to its channels
         adj_transmittance: float,  # of what passes all samples
         adj_depth: float,
+        adj_loss_value: float,  # of the loss on the ray
         content_distance: float,
         contraction: int,
         scaling: int,
@@ -150,9 +173,9 @@ def walk_packs(sampler: Sampler, encoding: Encoding, head: Head) -> SimpleNamesp
         packs: wp.array(dtype=Pack),  # as integrate left it
         end: int,  # one past the last slot
         worker: int,
-        deferred: Deferred,  # added to, and what is in it
+        sink: Sink,  # added to, and what is in it
     ):
-        """walk.adj_integrate, a pack at a time; those that shared the last slot are made again.
+        """walk.adj_integrate, a pack at a time; those that were not kept are made again.
 
         What it has for other workers' parts of the field it leaves in records.
         """
@@ -164,64 +187,63 @@ def walk_packs(sampler: Sampler, encoding: Encoding, head: Head) -> SimpleNamesp
             + adj_depth * rows[row].depth
             + adj_transmittance * rows[row].transmittance
         )
+        of_loss = float(0.0)
+        if wp.static(has_loss):
+            behind += adj_loss_value * weighted(rows[row].loss)
+            of_loss = adj_loss_value * loss_bound(rows[row].loss, edge(scene.march, ray, ray.end))
         limit = behind_limit(
-            adj_transmittance, adj_channels, adj_depth * edge(march, ray.end), float(0.0)
+            adj_transmittance, adj_channels, adj_depth * edge(scene.march, ray, ray.end), of_loss
         )
+        before = State()
         transmittance = float(1.0)
         step = int(ray.begin)
         n = int(0)
         dense = bool(False)
         n_samples = int(0)
         while n_samples < rows[row].n_samples and step < ray.end:
-            first = wp.min(begin + n, end - 1)
-            last = wp.min(first + n_packs, end)
+            first = wp.min(begin + n, end - n_packs)
+            kept = first < end - n_packs
+            last = wp.min(first + n_packs, end - n_packs)
             slot = int(first)
-            while slot < last and n_samples < rows[row].n_samples and step < ray.end:
-                if slot == end - 1:
-                    if slot > first:
-                        last = slot  # it is made again, for itself
-                    else:
-                        step = next_pack(
-                            box,
-                            free,
-                            march,
-                            field,
-                            density,
-                            ray,
-                            step,
-                            dense,
-                            transmittance,
-                            contraction,
-                            packs,
-                            slot,
-                        )
-                        decode_pack(params, rows, row, packs, slot, 1)
-                else:
-                    step = packs[slot].step + LANES
-                if slot < last:
+            if not kept:
+                while slot < end and step < ray.end:
+                    step = next_pack(
+                        scene, ray, step, dense, transmittance, contraction, packs, slot
+                    )
                     dense = packs[slot].visited[LANES - 1] != 0
-                    n_samples += packs[slot].n_samples
                     transmittance = packs[slot].passed
-                    t = packs[slot].t
-                    det_jacobian = packs[slot].det_jacobian
-                    scale = lanes()
-                    for lane in range(LANES):
-                        scale[lane] = distance_scale(
-                            t[lane], content_distance, det_jacobian[lane], scaling, jacobian
-                        )
-                    packs[slot].scale = scale
-                    adj_composite(adj_depth, behind, limit, rows, row, packs, slot)
-                    behind = packs[slot].behind
                     slot += 1
+                decode_pack(scene.head, rows, row, packs, first, slot - first)
+                last = slot
+                slot = first
+            while slot < last and n_samples < rows[row].n_samples:
+                if kept:
+                    step = packs[slot].step + LANES
+                    dense = packs[slot].visited[LANES - 1] != 0
+                    transmittance = packs[slot].passed
+                n_samples += packs[slot].n_samples
+                t = packs[slot].t
+                det_jacobian = packs[slot].det_jacobian
+                scale = lanes()
+                for lane in range(LANES):
+                    scale[lane] = distance_scale(
+                        t[lane], content_distance, det_jacobian[lane], scaling, jacobian
+                    )
+                packs[slot].scale = scale
+                if wp.static(has_loss):
+                    before = adj_add_pack(rows[row].loss, before, adj_loss_value, packs, slot)
+                adj_composite(adj_depth, behind, limit, rows, row, packs, slot)
+                behind = packs[slot].behind
+                slot += 1
             adj_decode_pack(
-                params, rows, row, packs, first, slot - first, worker, deferred.gradient
+                scene.head, rows, row, packs, first, slot - first, worker, sink.gradient
             )
             for k in range(first, slot):
                 later = wp.min(k + 2, end - 1)
-                adj_read_pack(field, packs, k, later, worker, deferred)
+                adj_read_pack(scene.field, packs, k, later, worker, sink)
             n += slot - first
-        adj_prepare_row(params, rows, row, worker, deferred.gradient)
+        adj_prepare_row(scene.head, rows, row, worker, sink.gradient)
 
     return SimpleNamespace(
-        integrate=integrate, adj_integrate=adj_integrate, Pack=Pack, Row=Row, Deferred=Deferred
+        integrate=integrate, adj_integrate=adj_integrate, Pack=Pack, Row=Row, Sink=Sink
     )

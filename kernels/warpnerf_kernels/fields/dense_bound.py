@@ -1,0 +1,78 @@
+"""How dense a grid can be in each cell of free space, whose cells are not the grid's own."""
+
+from functools import cache
+
+import warp as wp
+
+from ..base.types import real
+from .dense import grid_type
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def first_node(cell: int, n_cells: int, n_nodes: int) -> int:
+    """Lowest node, on one axis, that a cell's samples or their neighbours' can touch."""
+    return wp.max(0, (cell * (n_nodes - 1)) // n_cells - 1)
+
+
+@wp.func
+def last_node(cell: int, n_cells: int, n_nodes: int) -> int:
+    """Highest such node."""
+    return wp.min(n_nodes - 1, ((cell + 1) * (n_nodes - 1) + n_cells - 1) // n_cells + 1)
+
+
+@cache
+def find_highest_kernel(n_floats: int) -> wp.Kernel:
+    """The highest raw density in and next to a cell, in one of its columns of nodes along z."""
+    Grid = grid_type(n_floats)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def find_highest(
+        first: int,
+        span: int,  # cells per thread, in one row along z
+        grid: Grid,
+        n_cells: int,  # MZ, along z
+        out_highest: wp.array(dtype=real),  # [X * Y * MZ]
+    ):
+        """The highest raw density in and next to a cell, in one of its columns of nodes along z.
+
+        What is not a number counts as dense: it must be seen to be noticed.
+        """
+        start = (first + wp.tid()) * span
+        column = (start // n_cells) * grid.size[2]
+        cell = start % n_cells
+        for n in range(start, start + span):
+            highest = real(-1.0e30)
+            for k in range(
+                first_node(cell, n_cells, grid.size[2]), last_node(cell, n_cells, grid.size[2]) + 1
+            ):
+                raw = grid.values[column + k][0]  # compared with itself, as isnan is a slow call
+                highest = wp.max(highest, wp.where(raw == raw, raw, real(1.0e30)))
+            out_highest[n] = highest
+            cell += 1
+
+    return find_highest
+
+
+@wp.kernel
+def join_highest(
+    first: int,
+    span: int,  # cells per thread, in one row along z
+    n_nodes: int,  # along the axis
+    n_cells: int,  # along the axis
+    stride: int,  # along the axis, a multiple of span
+    highest: wp.array(dtype=real),  # [... * n_nodes * stride]
+    out_highest: wp.array(dtype=real),  # [... * n_cells * stride]
+):
+    """Of what was found for nodes along one axis, the highest in and next to a cell."""
+    start = (first + wp.tid()) * span
+    cell = (start // stride) % n_cells
+    low = first_node(cell, n_cells, n_nodes)
+    high = last_node(cell, n_cells, n_nodes)
+    begin = start // (n_cells * stride) * n_nodes * stride + start % stride
+    for n in range(span):
+        raw = real(-1.0e30)
+        for node in range(low, high + 1):
+            raw = wp.max(raw, highest[begin + node * stride + n])
+        out_highest[start + n] = raw
