@@ -252,6 +252,31 @@ def test_every_adjoint_stands_below_its_forward() -> None:
     assert len(seen) >= 10 and {"adj_gather", "adj_composite", "render_backward_kernel"} <= {*seen}
 
 
+def bodies(source: str) -> list[tuple[str, bool]]:
+    """Constants named ADJ_X, the C++ of an adjoint, and whether each stands directly below X."""
+    names = [
+        node.targets[0].id
+        for node in ast.parse(source).body
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name)
+    ]
+    return [
+        (name, at > 0 and names[at - 1] == name.removeprefix("ADJ_"))
+        for at, name in enumerate(names)
+        if name.startswith("ADJ_")
+    ]
+
+
+def test_the_code_of_every_adjoint_stands_below_that_of_its_forward() -> None:
+    assert bodies("X = 1\nADJ_X = 2") == [("ADJ_X", True)]
+    assert bodies("X = 1\nY = 1\nADJ_X = 2") == bodies("ADJ_X = 2\nX = 1") == [("ADJ_X", False)]
+    found = []
+    for path in KERNELS:
+        for name, in_place in bodies(path.read_text()):
+            assert in_place, f"{path.name}: {name} does not stand directly below what it belongs to"
+            found.append(name)
+    assert {"ADJ_SHADE_ROWS", "ADJ_COMPOSITE", "ADJ_DECODE_PACK"} <= {*found}
+
+
 DOCUMENTS = [ROOT / "kernels/README.md", ROOT / "benchmarks/README.md"]
 DOCUMENTS += sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import inspect
 import subprocess
 import sys
+from typing import Any
 
 import pytest
 
 import warpnerf
+from warpnerf.torch import render_rays, scale_gradient
 
 HEAVY = "{'warp', 'torch', 'imageio', 'PIL', 'safetensors', 'tyro', 'rich', 'numpy'}"
 
@@ -56,3 +59,31 @@ def test_they_stay_functions_when_their_modules_come_first(name: str, home: str)
 def test_an_unknown_name_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="no_such_name"):
         warpnerf.no_such_name  # noqa: B018
+
+
+def public_functions() -> dict[str, Any]:
+    """Functions, and methods where they are first defined, of public names."""
+    homes = {name: getattr(warpnerf, name) for name in warpnerf.__all__}
+    homes |= {f"torch.{f.__name__}": f for f in (scale_gradient, render_rays)}
+    found = {}
+    for name, value in homes.items():
+        if inspect.isfunction(value):
+            found[name] = value
+        elif inspect.isclass(value) and value.__module__.startswith("warpnerf"):
+            for method, function in vars(value).items():
+                plain = getattr(function, "__func__", function)
+                inherited = any(hasattr(base, method) for base in value.__mro__[1:])
+                if not method.startswith("_") and inspect.isfunction(plain) and not inherited:
+                    found[f"{name}.{method}"] = plain
+    return found
+
+
+@pytest.mark.parametrize("name", public_functions())
+def test_public_functions_say_what_they_take_and_return(name: str) -> None:
+    function = public_functions()[name]
+    says = function.__doc__ or ""
+    parameters = [p for p in inspect.signature(function).parameters if p not in ("self", "cls")]
+    for parameter in parameters:
+        assert f"    {parameter}: " in says.partition("Args:")[2], parameter
+    if inspect.signature(function).return_annotation not in (None, "None"):
+        assert "Returns:" in says or not parameters

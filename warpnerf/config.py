@@ -165,7 +165,14 @@ class OptimConfig:
                 raise InputError(f"optim.{name} must lie in [0, 1), not {getattr(self, name)}.")
 
     def accumulation(self, kind: SceneKind) -> tuple[float, ...]:
-        """``accumulate_at``, decided for a kind of scene."""
+        """``accumulate_at``, decided for a kind of scene.
+
+        Args:
+            kind: object, bounded or unbounded.
+
+        Returns:
+            Shares of the training.
+        """
         if not isinstance(self.accumulate_at, str):
             return self.accumulate_at
         return ACCUMULATE_AT[kind]

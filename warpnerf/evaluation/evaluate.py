@@ -111,6 +111,9 @@ def evaluate(
             and its rendering.
         lpips: A ``warpnerf.evaluation.lpips.Lpips``, if LPIPS is wanted.
 
+    Returns:
+        Figures of each image and their means, and what hangs in front of the training cameras.
+
     Raises:
         InputError: The scene has no such split.
     """

@@ -14,7 +14,7 @@ import numpy as np
 
 from warpnerf.checks import InputError, require_at_least, require_positive
 from warpnerf.config import PRESETS, TRAINING_BYTES, SceneKind, TrainConfig
-from warpnerf.model.models import Model
+from warpnerf.model.models import Model, to_json
 from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.load import load_scene
 from warpnerf.scenes.scene import Scene, find_focus, share_aimed_at, up_direction
@@ -69,6 +69,8 @@ class Inspection:
     """What may be a mistake, a sentence each."""
     costs: dict[str, Cost]
     """By preset."""
+    model: Model
+    """The one that costs are of."""
 
     def facts(self) -> dict[str, Any]:
         """All of it in plain numbers and texts, for JSON."""
@@ -98,6 +100,7 @@ class Inspection:
             "unbounded": scene.unbounded,
             "content_distance": self.content_distance,
             "how": list(scene.notes),
+            "model": to_json(self.model),
             "costs": {preset: asdict(cost) for preset, cost in self.costs.items()},
             "odd": list(self.oddities),
         }
@@ -138,8 +141,8 @@ class Inspection:
             rows.append(
                 (
                     f"training, {preset}",
-                    f"at least {cost.memory / 2**30:.2g} GiB of memory; very roughly "
-                    f"{_duration(cost.seconds)} on {cost.threads} CPU threads",
+                    f"model {self.model.name}: at least {cost.memory / 2**30:.2g} GiB of memory; "
+                    f"very roughly {_duration(cost.seconds)} on {cost.threads} CPU threads",
                 )
             )
         rows += [("odd", oddity) for oddity in self.oddities] or [("odd", "nothing")]
@@ -165,6 +168,9 @@ def inspect(
         model: That will be trained; None: that of the presets.
         threads: CPU threads that training would have.
 
+    Returns:
+        What was found; its text is what ``warpnerf inspect`` prints.
+
     Raises:
         InputError: The scene cannot be loaded; where frames are to blame, it says how many are.
     """
@@ -181,6 +187,7 @@ def inspect(
         named = ", ".join(others[:5]) + (", ..." if len(others) > 5 else "")
         raise InputError(f"{error} Poses refused likewise: {len(others)} more ({named}).") from None
     distance = scene.content_distance if content_distance is None else content_distance
+    model = model or PRESETS["fast"].model
     return Inspection(
         scene=scene,
         format=found.format,
@@ -189,9 +196,10 @@ def inspect(
         focus=_focus(scene.training_cameras),
         oddities=(*scene.warnings, *_oddities(scene, found, distance, near)),
         costs={
-            name: _cost(scene, replace(preset, model=model or preset.model), threads)
+            name: _cost(scene, replace(preset, model=model), threads)
             for name, preset in PRESETS.items()
         },
+        model=model,
     )
 
 

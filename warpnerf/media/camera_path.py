@@ -63,6 +63,9 @@ def camera_path(
         size: Width and height, pixels; None: those of the first training camera.
         distance: How far "back" backs away, scene units; None: ``BACK_SHARE`` content distances.
 
+    Returns:
+        n_frames cameras, in the order of the film.
+
     Raises:
         InputError: An unknown path, a size or distance that is not above zero, or too few cameras.
     """

@@ -20,6 +20,7 @@ from warpnerf.evaluation.floater_metrics import near_density
 from warpnerf.media.camera_path import backing_away
 from warpnerf.media.pictures import FAINT, INK, depth_legend, depth_picture, font, write_png
 from warpnerf.media.video import video_file, write_video
+from warpnerf.model.models import Rgb
 from warpnerf.rendering.field import Field, Rendering
 from warpnerf.scenes.builtin.room import first_hit, photograph
 from warpnerf.scenes.camera import Camera
@@ -104,6 +105,9 @@ def demo(
         threads: CPU threads; None: one per usable core.
         report: Told how far it is.
 
+    Returns:
+        Figures and fields by scaling, and where the files are.
+
     Raises:
         InputError: The folder cannot be written to, or the device is missing.
     """
@@ -122,7 +126,7 @@ def demo(
     figures: dict[Scaling, dict[str, float]] = {}
     for scaling in SCALINGS:
         config = TrainConfig(
-            model="rgb", steps=steps, scaling=scaling, device=device, threads=threads
+            model=Rgb(), steps=steps, scaling=scaling, device=device, threads=threads
         )
         field, seconds = _trained(scene, config, report)
         report(f"measuring the field {SCALINGS[scaling]}", 0.0, "")

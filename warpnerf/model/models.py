@@ -82,11 +82,25 @@ class Model:
         return max(4, 1 << self.n_features.bit_length())
 
     def parts(self, load: Load) -> Any:
-        """The ``warpnerf_kernels.launch.assembly.Parts``."""
+        """What the model is made of.
+
+        Args:
+            load: The kernels' modules, in the precision that is wanted.
+
+        Returns:
+            ``warpnerf_kernels.launch.assembly.Parts``.
+        """
         raise NotImplementedError
 
     def layout(self, load: Load) -> Any:
-        """The ``warpnerf_kernels.heads.mlp.Layout`` of the head's MLP; None: it has none."""
+        """The shape of the head's MLP.
+
+        Args:
+            load: The kernels' modules.
+
+        Returns:
+            ``warpnerf_kernels.heads.mlp.Layout``; None: the head has no MLP.
+        """
         return None
 
     def march(self, load: Load, steps: Any, device: Any) -> Any:
@@ -96,6 +110,9 @@ class Model:
             load: The kernels' modules.
             steps: What is configured.
             device: The ``warp.Device`` where arrays among the parameters have to lie.
+
+        Returns:
+            The struct ``Params`` of the model's sampler.
         """
         return steps.struct(load("sampling.steps"))
 
@@ -105,23 +122,47 @@ class Model:
         Args:
             steps: What is configured, ``warpnerf.rendering.render.Steps``.
             length: Of the ray's way through the box, scene units; infinite where space is folded.
+
+        Returns:
+            That, or more.
         """
         return int(steps.most(length))
 
     def first_weights(self, seed: int) -> np.ndarray:
-        """The MLP's weights before the first step, [n_weights] float32; none without an MLP."""
+        """The MLP's weights before the first step.
+
+        Args:
+            seed: Of what is random.
+
+        Returns:
+            [n_weights] float32, as ``layout`` orders them; none without an MLP.
+        """
         layout = self.layout(loader("float32"))
         return np.zeros(0, np.float32) if layout is None else _uniform(layout, seed, 1.0)
 
     def learning_rates(self, optim: Rates) -> np.ndarray:
-        """Of each number of a node, [n_floats]; 0 for padding."""
+        """How far an update moves each number of a node, about, at the start.
+
+        Args:
+            optim: What is configured for all models.
+
+        Returns:
+            [n_floats]; 0 for padding.
+        """
         rates = np.zeros(self.n_floats)
         rates[0] = optim.learning_rate_density
         rates[1 : 1 + self.n_features] = optim.learning_rate_rgb
         return rates
 
     def variation(self, optim: Rates) -> np.ndarray:
-        """Weights of total variation of each number of a node, [n_floats]; 0 for padding."""
+        """How much each number of a node is smoothed by total variation.
+
+        Args:
+            optim: What is configured for all models.
+
+        Returns:
+            [n_floats] weights; 0 for padding.
+        """
         weights = np.zeros(self.n_floats)
         weights[0] = optim.tv_density
         weights[1 : 1 + self.n_features] = optim.tv_rgb
@@ -374,6 +415,12 @@ def register(model: AnyModel) -> AnyModel:
 def model_of(name: str) -> Model:
     """The model of a name, as it is configured by default.
 
+    Args:
+        name: A key of ``MODELS``.
+
+    Returns:
+        The model.
+
     Raises:
         InputError: There is none.
     """
@@ -452,9 +499,9 @@ def _uniform(layout: Any, seed: int, of_output: float) -> np.ndarray:
         limit = 1.0 / np.sqrt(n_inputs)
         weights[begin:end] = rng.uniform(-limit, limit, end - begin)
 
-    fill(0, layout.hidden, layout.n_inputs)
-    fill(layout.hidden, layout.output, layout.width)
-    last = weights[layout.output :].reshape(-1, 4)
+    fill(0, layout.at_hidden, layout.n_inputs)
+    fill(layout.at_hidden, layout.at_output, layout.width)
+    last = weights[layout.at_output :].reshape(-1, 4)
     limit = of_output / np.sqrt(layout.width)
     last[:-1, :3] = rng.uniform(-limit, limit, (layout.width, 3))
     return weights

@@ -117,6 +117,12 @@ class Camera:
 
         Pixels at the right and bottom that fill no block are cropped. Distortion acts on (X/Z, Y/Z)
         and stays as it is.
+
+        Args:
+            factor: Edge of a block, pixels.
+
+        Returns:
+            A camera with the same pose and 1 / factor of the pixels along each side.
         """
         return replace(
             self,

@@ -89,6 +89,9 @@ def load_field(path: str | Path, device: str = "cpu", threads: int | None = None
         device: Where the field shall live.
         threads: CPU threads; None: one per usable core.
 
+    Returns:
+        The field, on that device.
+
     Raises:
         InputError: The file is missing, damaged, or of another kind; or the device is missing.
     """
@@ -102,6 +105,9 @@ def load_checkpoint(path: str | Path) -> TrainingState:
 
     Args:
         path: Of the file.
+
+    Returns:
+        The state, to go on from by ``train(scene, resume=state)``.
 
     Raises:
         InputError: The file is missing, damaged, or of another kind.

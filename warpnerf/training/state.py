@@ -69,6 +69,10 @@ class TrainingState:
     def require_same(self, scene: Scene, config: TrainConfig) -> None:
         """Raise InputError unless a training of this scene and configuration would go on as begun.
 
+        Args:
+            scene: Photographs and cameras.
+            config: How to go on.
+
         Raises:
             InputError: A field that decides the result differs, or the photographs do.
         """
@@ -81,6 +85,9 @@ class TrainingState:
 
     def require_same_config(self, config: TrainConfig) -> None:
         """Raise InputError unless a configuration would go on as begun; see MAY_CHANGE.
+
+        Args:
+            config: How to go on.
 
         Raises:
             InputError: A field that decides the result differs.

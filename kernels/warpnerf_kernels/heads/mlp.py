@@ -60,24 +60,24 @@ class Layout(NamedTuple):
         return self.width * self.width + self.width
 
     @property
-    def biases(self) -> int:
+    def at_biases(self) -> int:
         """Where the first layer's biases lie."""
         return self.n_inputs * self.width
 
     @property
-    def hidden(self) -> int:
+    def at_hidden(self) -> int:
         """Where the second layer lies."""
-        return self.biases + self.width
+        return self.at_biases + self.width
 
     @property
-    def output(self) -> int:
+    def at_output(self) -> int:
         """Where the output's weights lie."""
-        return self.hidden + (self.n_hidden - 1) * self.layer_size
+        return self.at_hidden + (self.n_hidden - 1) * self.layer_size
 
     @property
     def n_weights(self) -> int:
         """In all."""
-        return self.output + OUTPUTS * (self.width + 1)
+        return self.at_output + OUTPUTS * (self.width + 1)
 
     @property
     def n_transposed(self) -> int:
@@ -126,7 +126,7 @@ def mlp(layout: Layout) -> Mlp:
         layout: Its shape; width is a multiple of 16.
     """
     width, n_hidden, units = layout.width, layout.n_hidden, layout.units
-    biases, hidden, output = layout.biases, layout.hidden, layout.output
+    biases, hidden, output = layout.at_biases, layout.at_hidden, layout.at_output
     layer_size = layout.layer_size
     Units = vector(width)
     Activations = vector(units)
@@ -246,9 +246,9 @@ def _words(layout: Layout) -> str:
         "INPUTS": layout.n_own,
         "WIDTH": layout.width,
         "HIDDEN": layout.n_hidden,
-        "AT_BIASES": layout.biases,
-        "AT_HIDDEN": layout.hidden,
-        "AT_OUTPUT": layout.output,
+        "AT_BIASES": layout.at_biases,
+        "AT_HIDDEN": layout.at_hidden,
+        "AT_OUTPUT": layout.at_output,
         "OUTPUTS": OUTPUTS,
     }
     listed = ", ".join(f"{name} = {value}" for name, value in constants.items())
