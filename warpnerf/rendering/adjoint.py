@@ -48,7 +48,10 @@ class Gradients:
         if device.is_cuda:
             values = wp.zeros(n_nodes, dtype=node, device=device)
         else:  # pages that take no memory until a gradient is added to them
-            zeros = np.zeros((n_nodes, model.n_floats), np.float32)
+            n = n_nodes * model.n_floats
+            room = np.zeros(n + LANES, np.float32)
+            begin = -room.ctypes.data // 4 % LANES  # of a cache line: nodes lie in as few as can be
+            zeros = room[begin : begin + n].reshape(n_nodes, model.n_floats)
             values = wp.array(zeros, dtype=node, device=device, copy=False)
         row = -(-n_weights(model) // LANES) * LANES  # whole cache lines
         return Gradients(

@@ -53,6 +53,9 @@ class EncodingVectors(NamedTuple):
     adj_read_pack: Any
     """Of adj_read: (params, packs, slot, later, worker, sink) adds a pack's adj_raw where the
     worker owns what it was read from, and leaves a record of the rest."""
+    fetch_pack: Any
+    """(params, packs, slot, worker, sink) asks for the memory that adj_read_pack will change, of a
+    ray's first packs; adj_read_pack asks for that of later ones."""
     add_records: Any
     """(params, worker, sender, sink) adds what a sender has left for a worker."""
     Record: Any

@@ -87,15 +87,16 @@ typedef float node_at __attribute__((ext_vector_type(FLOATS), aligned(4), may_al
 typedef float pair_at __attribute__((ext_vector_type(2 * FLOATS), aligned(4), may_alias));
 typedef float quad_at __attribute__((ext_vector_type(4), aligned(4), may_alias));
 // Bring the four columns of nodes around a sample into the cache, ahead of their use.
-auto fetch_node = [&](const auto* node) {
-    for (size_t at = 0; at < sizeof(*node); at += 64) __builtin_prefetch((const char*)node + at);
+auto fetch_column = [&](const auto* node) {
+    const char* column = (const char*)node;
+    for (size_t at = 0; at < 2 * sizeof(*node); at += 64) __builtin_prefetch(column + at);
 };
 auto fetch = [&](const auto* node, const auto& size) {
     const size_t stride_y = size.c[2], stride_x = stride_y * size.c[1];
-    fetch_node(node);
-    fetch_node(node + stride_y);
-    fetch_node(node + stride_x);
-    fetch_node(node + stride_x + stride_y);
+    fetch_column(node);
+    fetch_column(node + stride_y);
+    fetch_column(node + stride_x);
+    fetch_column(node + stride_x + stride_y);
 };
 """
 )
@@ -133,7 +134,10 @@ i = clamp(truncate(ux), grid.size.c[0] - 1);
 j = clamp(truncate(uy), grid.size.c[1] - 1);
 l = clamp(truncate(uz), grid.size.c[2] - 1);
 const ivec node_ahead = index(i, j, l);
-for (int n = 0; n < LANES; ++n) fetch(grid.values.data + node_ahead[n], grid.size);
+// Wide nodes are many cache lines, so only where the next pack begins right behind this one.
+if (FLOATS == 4 || bits(visited) >> (LANES - 1)) {
+    for (int n = 0; n < LANES; ++n) fetch(grid.values.data + node_ahead[n], grid.size);
+}
 
 const float* values = (const float*)grid.values.data;
 const size_t stride_y = FLOATS * (size_t)grid.size.c[2], stride_x = stride_y * grid.size.c[1];
@@ -185,8 +189,8 @@ auto first_node = [&](int owner) -> int { return least(owner * n_planes, size.c[
 auto owned = [&](int owner, ivec node) -> unsigned {
     return bits((first_node(owner) <= node) & (node < first_node(owner + 1)));
 };
-auto fetch_own = [&](const auto& samples) {
-    each(owned(worker, load_int(samples.base)), [&](int n) {
+auto fetch_own = [&](const auto& samples, unsigned visited) {
+    each(owned(worker, load_int(samples.base)) & visited, [&](int n) {
         fetch(values + samples.base.c[n], size);
     });
 };
@@ -246,7 +250,7 @@ auto add_own = [&](const auto& samples, unsigned visited, const auto& shares) ->
     ADD_OWN
     + r"""
 const auto& pack = packs.data[slot];
-fetch_own(packs.data[later]);
+fetch_own(packs.data[later], bits(load_int(packs.data[later].visited)));
 const unsigned visited = bits(load_int(pack.visited));
 if (add_own(pack, visited, pack.shares.data)) return;
 const int sent = sink.n_records.data[worker * row]++;
@@ -278,6 +282,12 @@ def adj_read_pack(
     ...
 
 
+@wp.func_native(ADD_OWN + "fetch_own(packs.data[slot], bits(load_int(packs.data[slot].visited)));")
+def fetch_pack(grid: Any, packs: wp.array(dtype=Any), slot: int, worker: int, sink: Any):
+    """Ask for the nodes that adj_read_pack will add to, where the worker owns them."""
+    ...
+
+
 @wp.func_native(
     ADD_OWN
     + r"""
@@ -290,7 +300,7 @@ const int* which = sink.addressed.data + ((size_t)sender * n_workers + worker) *
 const int n = sink.n_addressed.data[sender * row + worker];
 for (int k = 0; k < n; ++k) {
     if (k + SOON < n) fetch_whole(records[which[k + SOON]]);
-    if (k + 1 < n) fetch_own(records[which[k + 1]]);
+    if (k + 1 < n) fetch_own(records[which[k + 1]], records[which[k + 1]].visited);
     const auto& record = records[which[k]];
     float shares[4][LANES];
     split(load(record.fraction_x), load(record.fraction_y), shares);
@@ -331,6 +341,7 @@ def dense(n_floats: int) -> Encoding:
         vectors=EncodingVectors(
             read_pack=read_pack,
             adj_read_pack=adj_read_pack,
+            fetch_pack=fetch_pack,
             add_records=add_records,
             Record=record_type(n_floats),
             pack_fields=PACK_FIELDS,

@@ -263,6 +263,15 @@ constexpr int LAYER = WIDTH * WIDTH + WIDTH;
 constexpr int VECS = WIDTH % (2 * LANES) ? 1 : 2;  // vectors of units worked on together
 auto at = [&](const float* x) -> vec { return *(const vec_at*)x; };
 auto put = [&](float* x, vec v) { *(vec_at*)x = v; };
+// Of the output layer a vector holds the weights of four units. To go with it, units four times
+// each, and outputs four times in a row.
+auto units_four_times = [&](const float* h) -> vec {
+    const quad q = *(const quad_at*)h;
+    return __builtin_shufflevector(q, q, 0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3);
+};
+auto outputs_four_times = [&](quad q) -> vec {
+    return __builtin_shufflevector(q, q, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3);
+};
 
 // The weights with rows and columns exchanged, for the way back.
 auto transpose = [&](const float* w, float* t) {
@@ -361,15 +370,21 @@ auto forward = [&](int n, const float* w, auto x_of, auto first_of, auto h_of, a
             }
             multiply(from, WIDTH, WIDTH, Several(), below, biases, h, relu);
         }
-        quad y[ROWS_AT_ONCE];
+        vec sums[ROWS_AT_ONCE];
         const float* last = w + AT_OUTPUT;
-        for (int b = 0; b < ROWS_AT_ONCE; ++b) y[b] = *(const quad_at*)(last + OUTPUTS * WIDTH);
-        for (int i = 0; i < WIDTH; ++i) {
-            const quad row = *(const quad_at*)(last + OUTPUTS * i);
+        for (int b = 0; b < ROWS_AT_ONCE; ++b) sums[b] = all(0.0f);
+        for (int i = 0; i < WIDTH; i += 4) {
+            const vec four = at(last + OUTPUTS * i);
             #pragma clang loop unroll(full)
-            for (int b = 0; b < ROWS_AT_ONCE; ++b) y[b] = fma(quad(h[b][i]), row, y[b]);
+            for (int b = 0; b < ROWS_AT_ONCE; ++b) {
+                sums[b] = fma(units_four_times(h[b] + i), four, sums[b]);
+            }
         }
-        for (int b = 0; b < ROWS_AT_ONCE && begin + b < n; ++b) *(quad_at*)y_of(begin + b) = y[b];
+        const quad biases = *(const quad_at*)(last + OUTPUTS * WIDTH);
+        for (int b = 0; b < ROWS_AT_ONCE && begin + b < n; ++b) {
+            const octet two = sums[b].lo + sums[b].hi;
+            *(quad_at*)y_of(begin + b) = biases + (two.lo + two.hi);
+        }
     }
 };
 // The way back: adj_y_of(r) four numbers, the last one 0; adj_x_of(r) room for PADDED inputs;
@@ -393,11 +408,13 @@ auto backward = [&](int n, const float* transposed, float* g, auto x_of, auto h_
         float* g_last = g + AT_OUTPUT;
         const float* t = transposed + PADDED * WIDTH + (HIDDEN - 1) * WIDTH * WIDTH;
         *(quad_at*)(g_last + OUTPUTS * WIDTH) += (adj_y[0] + adj_y[1]) + (adj_y[2] + adj_y[3]);
-        for (int i = 0; i < WIDTH; ++i) {
-            quad sum = *(const quad_at*)(g_last + OUTPUTS * i);
+        for (int i = 0; i < WIDTH; i += 4) {
+            vec sum = at(g_last + OUTPUTS * i);
             #pragma clang loop unroll(full)
-            for (int b = 0; b < ROWS_AT_ONCE; ++b) sum = fma(quad(h[b][i]), adj_y[b], sum);
-            *(quad_at*)(g_last + OUTPUTS * i) = sum;
+            for (int b = 0; b < ROWS_AT_ONCE; ++b) {
+                sum = fma(units_four_times(h[b] + i), outputs_four_times(adj_y[b]), sum);
+            }
+            put(g_last + OUTPUTS * i, sum);
         }
         auto behind_relu = [&](vec adj_h, int b, int u) -> vec {
             return at(h[b] + u) > 0.0f ? adj_h : all(0.0f);

@@ -38,7 +38,7 @@ def walk_packs(sampler: Sampler, encoding: Encoding, head: Head, loss: RayLoss) 
     Channels = wp.types.vector(head.n_channels, wp.float32)
     next_sample = traversal(sampler).next_sample
     edge, place_pack = sampler.edge, sampler.place_pack
-    read_pack, adj_read_pack = own.read_pack, own.adj_read_pack
+    read_pack, adj_read_pack, fetch_pack = own.read_pack, own.adj_read_pack, own.fetch_pack
     decode_pack, adj_decode_pack = of_head.decode_pack, of_head.adj_decode_pack
     n_packs = of_head.n_packs
     prepare_row, adj_prepare_row = of_head.prepare_row, of_head.adj_prepare_row
@@ -230,6 +230,10 @@ def walk_packs(sampler: Sampler, encoding: Encoding, head: Head, loss: RayLoss) 
                         t[lane], content_distance, det_jacobian[lane], scaling, jacobian
                     )
                 packs[slot].scale = scale
+                if n + slot - first < wp.static(
+                    max(n_packs, 2)
+                ):  # adj_read_pack cares for later ones
+                    fetch_pack(scene.field, packs, slot, worker, sink)
                 if wp.static(has_loss):
                     before = adj_add_pack(rows[row].loss, before, adj_loss_value, packs, slot)
                 adj_composite(adj_depth, behind, limit, rows, row, packs, slot)
