@@ -357,10 +357,15 @@ class Features(_WithMlp):
         """As many as are configured."""
         return self.features
 
+    @property
+    def n_floats(self) -> int:
+        """At least 8: the first four of a node are read lane by lane, the others by sample."""
+        return max(8, super().n_floats)
+
     def parts(self, load: Load) -> Any:
         """A dense grid, and a head of samples."""
         return load("launch.assembly").Parts(
-            encoding=load("fields.dense").dense(self.n_floats),
+            encoding=load("fields.dense").dense(self.n_floats, by_sample=True),
             head=load("heads.features").features(
                 self.features,
                 self.frequencies,

@@ -60,6 +60,10 @@ class EncodingVectors(NamedTuple):
     """(params, worker, sender, sink) adds what a sender has left for a worker."""
     Record: Any
     """Struct of what a pack leaves for other workers."""
+    n_by_lane: int
+    """How many numbers of raw lie lane by lane in a pack's raw and adj_raw: all, or the first four.
+    Then all of raw lies sample by sample in ``by_sample``, and the head leaves the adjoint of those
+    after the first four in ``adj_by_sample``, zeros where there is none."""
     pack_fields: tuple[tuple[str, Any], ...] = ()
     """Fields of a pack that are its own: names and types."""
 

@@ -6,6 +6,7 @@ which the box is [-1, 1]^3; ``c`` are these after folding, within [-(1 + border)
 """
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
@@ -20,6 +21,17 @@ mat33 = wp.types.matrix((3, 3), real)
 def vector(n: int) -> type:
     """n numbers: what a node stores, features, channels, units of a layer."""
     return wp.types.vector(n, real)
+
+
+def struct(name: str, fields: dict[str, Any], module: str) -> type:
+    """A Warp struct whose fields depend on what it is made for.
+
+    Args:
+        name: Of the struct.
+        fields: Names and types.
+        module: Name of the Python module that makes it.
+    """
+    return wp.struct(type(name, (), {"__annotations__": fields, "__module__": module}))
 
 
 @wp.struct

@@ -10,7 +10,7 @@ import warp as wp
 
 from ..base.parts import Encoding, EncodingVectors
 from ..base.simd import LANES, VECTORS, lanes, lanes_int
-from ..base.types import Ray, real, vec3, vector
+from ..base.types import Ray, real, struct, vec3, vector
 from .interp import adj_gather, flat_index, gather, lowest_node, place_in
 
 wp.set_module_options({"enable_backward": False})
@@ -157,7 +157,16 @@ for (int n = 0; n < LANES; ++n) {
     both = fma(pair_vec(shares[3][n]), column(node + stride_x + stride_y), both);
     raw[n] = fma(node_vec(pack.fraction_z.c[n]), both.hi - both.lo, both.lo);
 }
-for (int f = 0; f < FLOATS; f += 4) {
+constexpr int BY_LANE = sizeof(pack.raw) / sizeof(vec);
+[&](auto& pack) {
+    if constexpr (BY_LANE < FLOATS) {
+        #pragma clang loop unroll(full)
+        for (int n = 0; n < LANES; ++n) {
+            if (wanted >> n & 1) *(node_at*)&pack.by_sample.data[n] = raw[n];
+        }
+    }
+}(pack);
+for (int f = 0; f < BY_LANE; f += 4) {
     quad four[LANES];
     for (int n = 0; n < LANES; ++n) four[n] = *(const quad_at*)((const float*)&raw[n] + f);
     vec a, b, c, d;
@@ -202,9 +211,10 @@ auto add_column = [&](int node, float share, pair_vec both) {
 };
 // Add what samples have for the worker's own planes. Returns whether that is all of it.
 auto add_own = [&](const auto& samples, unsigned visited, const auto& shares) -> bool {
-    quad four[FLOATS / 4][LANES];
+    constexpr int BY_LANE = sizeof(samples.adj_raw) / sizeof(vec);
+    quad four[BY_LANE / 4][LANES];
     #pragma clang loop unroll(full)
-    for (int f = 0; f < FLOATS; f += 4) {
+    for (int f = 0; f < BY_LANE; f += 4) {
         to_quads(load(samples.adj_raw.data[f]), load(samples.adj_raw.data[f + 1]),
                  load(samples.adj_raw.data[f + 2]), load(samples.adj_raw.data[f + 3]), four[f / 4]);
     }
@@ -212,8 +222,9 @@ auto add_own = [&](const auto& samples, unsigned visited, const auto& shares) ->
     #pragma clang loop unroll(full)
     for (int n = 0; n < LANES; ++n) {
         node_vec whole;  // put together in registers: what is stored in parts is slow to load
+        if constexpr (BY_LANE < FLOATS) whole = *(const node_at*)&samples.adj_by_sample.data[n];
         #pragma clang loop unroll(full)
-        for (int f = 0; f < FLOATS; f += 4) *(quad_at*)((float*)&whole + f) = four[f / 4][n];
+        for (int f = 0; f < BY_LANE; f += 4) *(quad_at*)((float*)&whole + f) = four[f / 4][n];
         adj[n] = whole;
     }
     auto add_plane = [&](int n, int node, const auto* share) {
@@ -261,7 +272,11 @@ store_int(record.base, base);
 store(record.fraction_x, load(pack.fraction_x));
 store(record.fraction_y, load(pack.fraction_y));
 store(record.fraction_z, load(pack.fraction_z));
-for (int f = 0; f < FLOATS; ++f) store(record.adj_raw.data[f], load(pack.adj_raw.data[f]));
+constexpr int BY_LANE = sizeof(pack.adj_raw) / sizeof(vec);
+for (int f = 0; f < BY_LANE; ++f) store(record.adj_raw.data[f], load(pack.adj_raw.data[f]));
+[&](auto& record, const auto& pack) {
+    if constexpr (BY_LANE < FLOATS) record.adj_by_sample = pack.adj_by_sample;
+}(record, pack);
 for (int receiver = 0; receiver < n_workers; ++receiver) {
     const unsigned theirs = owned(receiver, base) | owned(receiver, base + stride_x);
     if (receiver == worker || !(theirs & visited)) continue;
@@ -314,24 +329,35 @@ def add_records(grid: Any, worker: int, sender: int, sink: Any):
 
 
 @cache
-def record_type(n_floats: int) -> type:
+def record_type(n_floats: int, n_by_lane: int) -> type:
     """What a pack of samples has for the nodes around them, not all of which are the sender's."""
-
-    @wp.struct
-    class Record:
-        visited: wp.uint32  # bit n: lane n is a sample
-        base: lanes_int  # flat index of the lowest of the eight nodes around
-        fraction_x: lanes  # position between the nodes, [0, 1]
-        fraction_y: lanes
-        fraction_z: lanes
-        adj_raw: wp.types.matrix((n_floats, LANES), wp.float32)  # of the raw values at the samples
-
-    return Record
+    fields = {
+        "visited": wp.uint32,  # bit n: lane n is a sample
+        "base": lanes_int,  # flat index of the lowest of the eight nodes around
+        "fraction_x": lanes,  # position between the nodes, [0, 1]
+        "fraction_y": lanes,
+        "fraction_z": lanes,
+        "adj_raw": wp.types.matrix((n_by_lane, LANES), wp.float32),  # of the raw values at samples
+    }
+    if n_by_lane < n_floats:
+        fields["adj_by_sample"] = wp.types.matrix((LANES, n_floats), wp.float32)
+    return struct("Record", fields, __name__)
 
 
 @cache
-def dense(n_floats: int) -> Encoding:
-    """The encoding whose nodes hold so many values: 4, 8, 16, 32 or 64."""
+def dense(n_floats: int, by_sample: bool = False) -> Encoding:
+    """The encoding whose nodes hold so many values: 4, 8, 16, 32 or 64.
+
+    Args:
+        n_floats: Of a node.
+        by_sample: Whether packs hold values after the first four sample by sample, as heads want
+            them that work on samples and not on lanes.
+    """
+    n_by_lane = 4 if by_sample else n_floats
+    pack_fields = PACK_FIELDS
+    if n_by_lane < n_floats:
+        rows = wp.types.matrix((LANES, n_floats), wp.float32)
+        pack_fields += (("by_sample", rows), ("adj_by_sample", rows))
     return Encoding(
         n_floats=n_floats,
         Params=grid_type(n_floats),
@@ -343,8 +369,9 @@ def dense(n_floats: int) -> Encoding:
             adj_read_pack=adj_read_pack,
             fetch_pack=fetch_pack,
             add_records=add_records,
-            Record=record_type(n_floats),
-            pack_fields=PACK_FIELDS,
+            Record=record_type(n_floats, n_by_lane),
+            n_by_lane=n_by_lane,
+            pack_fields=pack_fields,
         ),
     )
 

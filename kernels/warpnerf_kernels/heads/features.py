@@ -64,7 +64,7 @@ for (int u = 0; u < WIDTH; u += LANES) {
 
 ROWS_OF_PACKS = r"""
 // Samples that get a colour are put side by side: a row of the MLP is a lane of one of n packs, and
-// keeps its inputs and hidden units with that pack.
+// keeps its hidden units with that pack.
 struct Place { int pack, lane, kept; };
 Place place[N_PACKS * LANES];
 int n_rows = 0;
@@ -74,7 +74,9 @@ for (int p = 0; p < n; ++p) {
         place[n_rows++] = {slot + p, lane, kept++};
     });
 }
-auto x_of = [&](int r) { return (float*)&packs.data[place[r].pack].inputs.data[place[r].kept]; };
+auto x_of = [&](int r) {
+    return (const float*)&packs.data[place[r].pack].by_sample.data[place[r].lane] + 1 + SKIPPED;
+};
 auto h_of = [&](int r) { return (float*)&packs.data[place[r].pack].hidden.data[place[r].kept]; };
 """
 
@@ -82,11 +84,6 @@ DECODE_PACK = (
     ROWS_OF_PACKS
     + r"""
 const auto* view = (const float*)&rows.data[row].view;
-for (int r = 0; r < n_rows; ++r) {
-    const auto& raw = packs.data[place[r].pack].raw;
-    float* x = x_of(r);
-    for (int i = 0; i < INPUTS; ++i) x[i] = raw.data[1 + SKIPPED + i][place[r].lane];
-}
 float y[N_PACKS * LANES][OUTPUTS];
 forward(n_rows, weights.values.data, x_of, [&](int) { return view; }, h_of,
         [&](int r) { return y[r]; });
@@ -126,8 +123,11 @@ for (int p = slot; p < slot + n; ++p) {
         for (int c = 0; c < 3; ++c) adj_y[r][c] = by_lane[c][place[r].lane];
         adj_y[r][3] = 0.0f;
     }
-    constexpr int FLOATS = sizeof(pack.raw) / sizeof(vec);
-    for (int f = 1 + SKIPPED; f < FLOATS; ++f) store(pack.adj_raw.data[f], all(0.0f));
+    for (int c = SKIPPED; c < 3; ++c) store(pack.adj_raw.data[1 + c], all(0.0f));
+    each(bits(load_int(pack.visited)), [&](int lane) {
+        auto& adj_of_sample = pack.adj_by_sample.data[lane];
+        __builtin_memset(&adj_of_sample, 0, sizeof(adj_of_sample));
+    });
 }
 const size_t n_transposed = weights.transposed.shape[1], n_weights = gradient.weights.shape[1];
 backward(n_rows, weights.transposed.data + (size_t)worker * n_transposed,
@@ -135,8 +135,11 @@ backward(n_rows, weights.transposed.data + (size_t)worker * n_transposed,
          [&](int r) { return (const float*)adj_y[r]; }, [&](int r) { return adj_x[r]; },
          (float*)&own.adj_view);
 for (r = 0; r < n_rows; ++r) {
-    auto& adj_raw = packs.data[place[r].pack].adj_raw;
-    for (int i = 0; i < INPUTS; ++i) adj_raw.data[1 + SKIPPED + i][place[r].lane] = adj_x[r][i];
+    auto& pack = packs.data[place[r].pack];
+    const int lane = place[r].lane;
+    float* adj = (float*)&pack.adj_by_sample.data[lane] + 1 + SKIPPED;
+    __builtin_memcpy(adj, adj_x[r], INPUTS * sizeof(float));
+    for (int c = SKIPPED; c < 3 && c < INPUTS; ++c) pack.adj_raw.data[1 + c][lane] = adj_x[r][c];
 }
 """
 )
@@ -274,10 +277,7 @@ def features(
             adj_prepare_row=adj_prepare_row,
             decode_pack=decode_pack,
             adj_decode_pack=adj_decode_pack,
-            pack_fields=(
-                ("inputs", wp.types.matrix((LANES, layout.n_padded), wp.float32)),
-                ("hidden", wp.types.matrix((LANES, layout.units), wp.float32)),
-            ),
+            pack_fields=(("hidden", wp.types.matrix((LANES, layout.units), wp.float32)),),
             row_fields=(
                 ("view", units),
                 ("adj_view", units),

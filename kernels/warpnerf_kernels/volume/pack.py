@@ -17,20 +17,16 @@ import warp as wp
 
 from ..base.parts import Encoding, Head, RayLoss
 from ..base.simd import LANES, VECTORS, lanes, lanes_int
-from ..base.types import Density, Ray
+from ..base.types import Density, Ray, struct
 from .ray_loss import NONE
 
 wp.set_module_options({"enable_backward": False})
 
 
-def _struct(name: str, fields: dict[str, Any]) -> type:
-    return wp.struct(type(name, (), {"__annotations__": fields, "__module__": __name__}))
-
-
 @cache
 def pack_type(encoding: Encoding, head: Head, loss: RayLoss) -> type:
     """Sixteen consecutive steps of a ray, which of them are samples, and what those hold."""
-    return _struct(
+    return struct(
         "Pack",
         {
             "step": int,  # of the first lane
@@ -49,14 +45,15 @@ def pack_type(encoding: Encoding, head: Head, loss: RayLoss) -> type:
             "weight": lanes,  # transmittance times alpha; 0 where not visited
             "transmittance": lanes,  # what passes the samples up to this one, it included
             "scale": lanes,  # of the gradient, by distance
-            "raw": wp.types.matrix((encoding.n_floats, LANES), wp.float32),
-            "adj_raw": wp.types.matrix((encoding.n_floats, LANES), wp.float32),
+            "raw": wp.types.matrix((encoding.vectors.n_by_lane, LANES), wp.float32),
+            "adj_raw": wp.types.matrix((encoding.vectors.n_by_lane, LANES), wp.float32),
             "channel": wp.types.matrix((head.n_channels, LANES), wp.float32),
             "sums": wp.types.vector(head.n_channels, wp.float32),  # of weight times channel
             **dict(encoding.vectors.pack_fields),
             **dict(head.vectors.pack_fields),
             **({"adj_weight": lanes} if loss is not NONE else {}),  # from the loss on the ray
         },
+        __name__,
     )
 
 
@@ -65,7 +62,7 @@ def row_type(head: Head, loss: RayLoss) -> type:
     """A ray between the two passes."""
     channels = wp.types.vector(head.n_channels, wp.float32)
     vec3 = wp.types.vector(3, wp.float32)
-    return _struct(
+    return struct(
         "Row",
         {
             "ray": Ray,
@@ -81,6 +78,7 @@ def row_type(head: Head, loss: RayLoss) -> type:
             **dict(head.vectors.row_fields),
             **({"loss": loss.State} if loss is not NONE else {}),  # sums over its samples
         },
+        __name__,
     )
 
 
