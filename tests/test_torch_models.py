@@ -1,5 +1,6 @@
 """warpnerf.torch.render_rays with the models whose colour depends on the view."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -23,7 +24,7 @@ from drive_models import (
 from torch import Tensor
 
 from warpnerf.checks import InputError
-from warpnerf.model.models import Model, SphericalHarmonics
+from warpnerf.model.models import Deferred, Model, SphericalHarmonics
 from warpnerf.torch import render_rays
 
 MODELS = (SH[3], DEFERRED_SMALL, DEFERRED, FEATURES_SMALL, FEATURES)
@@ -51,7 +52,7 @@ def tensors(p: Problem, dtype: torch.dtype, device: str) -> tuple[Tensor, list[T
 
 
 def call(
-    p: Problem, raw: Tensor, head: list[Tensor], scaling: Any = "clamped", **changes: Any
+    p: Problem, raw: Tensor, head: Iterable[Tensor], scaling: Any = "clamped", **changes: Any
 ) -> Any:
     def like_raw(values: Any) -> Tensor:
         return torch.tensor(values, dtype=raw.dtype, device=raw.device)
@@ -135,7 +136,7 @@ def test_layers_of_torch_modules_fit(device: str) -> None:
         torch.nn.Linear(32, 3),
     ).to(device=device, dtype=torch.float64)
     raw = tensors(p, torch.float64, device)[0]
-    call(p, raw, list(network.parameters())).rgb.sum().backward()
+    call(p, raw, network.parameters()).rgb.sum().backward()
     weights = np.zeros_like(p.weights)
     for layer, parameter in zip(layers_of(p.model, weights), network.parameters(), strict=True):
         values = parameter.detach().cpu().numpy()
@@ -205,6 +206,13 @@ def test_heads_of_models_without_one_are_refused(device: str) -> None:
     )
     sh = SphericalHarmonics(degree=0)
     refused(device, "head must be empty: the model sh has no MLP", lambda r: r[..., :4], model=sh)
+
+
+@pytest.mark.parametrize("model", [None, 5, Deferred])
+def test_what_is_no_model_is_refused(model: Any) -> None:
+    raw, ray = torch.zeros(2, 2, 2, 4), torch.eye(3)[:1]
+    with pytest.raises(InputError, match="model must be a name or a model, not "):
+        render_rays(raw, ray, ray, (-1, -1, -1), (1, 1, 1), step=0.1, model=model)
 
 
 def test_raw_of_another_width_is_refused(device: str) -> None:

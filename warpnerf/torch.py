@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 from types import ModuleType
 from typing import Any, NamedTuple, get_args
@@ -136,7 +136,7 @@ def render_rays(
     scaling: Scaling = "none",
     content_distance: float | torch.Tensor = 1.0,
     model: str | Model = "rgb",
-    head: Sequence[torch.Tensor] = (),
+    head: Iterable[torch.Tensor] = (),
 ) -> RenderedRays:
     """Render rays through a grid of raw values, differentiable with respect to these and the head.
 

@@ -143,7 +143,7 @@ def box_struct(types: ModuleType, box_min: np.ndarray, box_max: np.ndarray, bord
 
 
 def density_struct(types: ModuleType, shift: float, scale: float) -> Any:
-    """A kernel's Density, likewise."""
+    """A kernel's Density, in the precision of the given ``warpnerf_kernels.base.types``."""
     density = types.Density()
     density.shift = shift
     density.scale = scale

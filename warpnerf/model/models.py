@@ -495,7 +495,7 @@ def loader(precision: str) -> Load:
 def _uniform(layout: Any, seed: int, of_output: float) -> np.ndarray:
     """Weights between +-1 / sqrt(inputs of their layer), the output's that times a factor.
 
-    Hidden biases likewise, the output's are 0: torch.nn.Linear's beginning, and DVGO's.
+    So are hidden biases; the output's are 0. That is how torch.nn.Linear begins, and DVGO.
     """
     rng = np.random.default_rng(seed)
     weights = np.zeros(layout.n_weights, np.float32)

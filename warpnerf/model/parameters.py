@@ -27,7 +27,7 @@ class Parameter:
     learning_rates: np.ndarray
     """Of each number of a node, or [1]."""
     variation: np.ndarray
-    """Weights of total variation, likewise; 0: none."""
+    """Weights of total variation, of each number of a node or [1]; 0: none."""
 
 
 def parameters_of(

@@ -113,6 +113,9 @@ def variant_of(
         scaling: Of gradients.
         jacobian: Its term.
         packed: Sixteen samples at a time, where all parts of the model have such a form.
+
+    Returns:
+        ``warpnerf_kernels.launch.assembly.Variant`` in that precision.
     """
     parts = parts_of(model, precision)
     return loader(precision)("launch.assembly").Variant(
@@ -148,6 +151,9 @@ def scene_struct(
         density: A kernel's Density.
         weights: [n_weights] of the head.
         workers: Those that will be launched.
+
+    Returns:
+        A kernel's Scene.
     """
     load = loader(precision)
     scene = load("launch.assembly").scene_type(parts_of(model, precision))()
@@ -171,6 +177,9 @@ def march_struct(model: Model, precision: str, steps: Steps, workers: Workers) -
         precision: float32 or float64.
         steps: How to march.
         workers: Those that will be launched.
+
+    Returns:
+        A kernel's ``Params`` of the sampler.
     """
     return model.march(loader(precision), steps, workers.device)
 
@@ -185,6 +194,9 @@ def scratch_struct(variant: Any, n_packs: int, workers: Workers, assembly: Modul
             with all rays under way at once, reading a sample again is the cheaper way.
         workers: Where to work.
         assembly: ``warpnerf_kernels.launch.assembly`` in the variant's precision.
+
+    Returns:
+        A kernel's Scratch.
     """
     Scratch = assembly.scratch_type(variant)
     scratch = Scratch()
@@ -197,7 +209,17 @@ def scratch_struct(variant: Any, n_packs: int, workers: Workers, assembly: Modul
 
 
 def seen_struct(variant: Any, n_rays: int, workers: Workers, assembly: ModuleType) -> Any:
-    """Room for what rays see; likewise."""
+    """Room for what the rays of a forward launch see.
+
+    Args:
+        variant: Of the kernel to launch.
+        n_rays: How many.
+        workers: Where to work.
+        assembly: ``warpnerf_kernels.launch.assembly`` in the variant's precision.
+
+    Returns:
+        A kernel's Seen.
+    """
     Seen = assembly.seen_type(variant.parts.head.n_channels)
     seen = Seen()
     for name, variable in Seen.vars.items():
@@ -234,6 +256,9 @@ def render_rays(
         offsets: [n_rays] or [1], where in its step a sample sits.
         background: [n_rays] or [1] vec3, rgb in [0, 1].
         workers: Where to work.
+
+    Returns:
+        What each ray sees.
     """
     variant = variant_of(
         model, "float32", grid.contraction, "none", "none", packed=not workers.device.is_cuda

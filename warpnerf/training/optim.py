@@ -140,7 +140,7 @@ def adam_step(
 
     Args:
         parameters: Updated; an entry whose gradient is exactly zero is left alone.
-        states: Of each, from ``first_states``; updated likewise.
+        states: Of each, from ``first_states``; updated, too.
         gradients: Of the update's steps; zeroed.
         update: Counts from 1.
         factor: On the learning rates.

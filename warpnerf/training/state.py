@@ -64,7 +64,7 @@ class TrainingState:
     field: Field
     """Grid, weights, free space; live arrays if from a trainer, which its next update changes."""
     optimiser: dict[str, dict[str, wp.array]]
-    """What the optimiser keeps of each parameter, by its name; likewise."""
+    """What the optimiser keeps of each parameter, by its name."""
 
     def require_same(self, scene: Scene, config: TrainConfig) -> None:
         """Raise InputError unless a training of this scene and configuration would go on as begun.

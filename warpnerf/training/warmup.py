@@ -58,7 +58,7 @@ def training_kernels(
 
 
 def rendering_kernels(model: Model, contraction: Contraction, device: wp.Device) -> list[wp.Kernel]:
-    """The kernels that look at a field; likewise."""
+    """The kernels that render a field; at least one for each module."""
     packed = not device.is_cuda
     variant = variant_of(model, "float32", contraction, "none", "none", packed)
     return [camera.camera_rays, assembly.render_forward_kernel(variant)]

@@ -46,12 +46,12 @@ class Layout(NamedTuple):
 
     @property
     def n_inputs(self) -> int:
-        """In all; a row's own come first."""
+        """How many inputs there are; a row's own come first."""
         return self.n_own + self.n_shared
 
     @property
     def units(self) -> int:
-        """Of all hidden layers together."""
+        """How many units all hidden layers have together."""
         return self.width * self.n_hidden
 
     @property
@@ -76,7 +76,7 @@ class Layout(NamedTuple):
 
     @property
     def n_weights(self) -> int:
-        """In all."""
+        """How many weights and biases there are, padding included."""
         return self.at_output + OUTPUTS * (self.width + 1)
 
     @property

@@ -13,25 +13,25 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def add_nothing(state: Nothing, weight: real, t: real, dt: real) -> Nothing:
-    """No sum changes."""
+    """No loss: no sum changes."""
     return state
 
 
 @wp.func
 def zero(state: Nothing) -> real:
-    """Of no loss."""
+    """Value and weighted sum of no loss."""
     return real(0.0)
 
 
 @wp.func
 def no_slope(total: Nothing, before: Nothing, weight: real, t: real, dt: real) -> real:
-    """Of no loss."""
+    """Derivative of no loss by a weight."""
     return real(0.0)
 
 
 @wp.func
 def no_bound(total: Nothing, t_end: real) -> real:
-    """Of no loss."""
+    """Bound of that derivative."""
     return real(0.0)
 
 
