@@ -195,6 +195,7 @@ def walk_packs(sampler: Sampler, encoding: Encoding, head: Head, loss: RayLoss) 
             adj_transmittance, adj_channels, adj_depth * edge(scene.march, ray, ray.end), of_loss
         )
         before = State()
+        short = rows[row].n_samples < 4 * LANES  # else adj_read_pack asks for all but the first two
         transmittance = float(1.0)
         step = int(ray.begin)
         n = int(0)
@@ -230,9 +231,7 @@ def walk_packs(sampler: Sampler, encoding: Encoding, head: Head, loss: RayLoss) 
                         t[lane], content_distance, det_jacobian[lane], scaling, jacobian
                     )
                 packs[slot].scale = scale
-                if n + slot - first < wp.static(
-                    max(n_packs, 2)
-                ):  # adj_read_pack cares for later ones
+                if short and n + slot - first < wp.static(max(n_packs, 2)):
                     fetch_pack(scene.field, packs, slot, worker, sink)
                 if wp.static(has_loss):
                     before = adj_add_pack(rows[row].loss, before, adj_loss_value, packs, slot)
