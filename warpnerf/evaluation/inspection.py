@@ -23,6 +23,9 @@ from warpnerf.scenes.survey import Survey, survey
 MIN_SHARE_AIMED = 0.5
 """Share of cameras that aim at the focus, below which it is no common one."""
 
+MANY_TIMES = 20.0
+"""A content distance so many times the estimate, or as small a part of it, is likely a mistake."""
+
 FAR_OFF = 10.0
 """A camera this many times the median distance away from the median place is likely a mistake."""
 
@@ -194,7 +197,7 @@ def inspect(
         content_distance=distance,
         up=up_direction(scene.training_cameras),
         focus=_focus(scene.training_cameras),
-        oddities=(*scene.warnings, *_oddities(scene, found, distance, near)),
+        oddities=(*scene.warnings, *oddities(scene, found, distance, near)),
         costs={
             name: _cost(scene, replace(preset, model=model), threads)
             for name, preset in PRESETS.items()
@@ -203,10 +206,28 @@ def inspect(
     )
 
 
-def _oddities(scene: Scene, found: Survey, content_distance: float, near: float) -> list[str]:
+def oddities(scene: Scene, found: Survey, content_distance: float, near: float) -> list[str]:
+    """What may be a mistake, besides what the scene warns of.
+
+    Args:
+        scene: As it was loaded.
+        found: In its files.
+        content_distance: That training will use, scene units.
+        near: The near plane that training will use, scene units.
+
+    Returns:
+        A sentence each.
+    """
     odd = list(found.oddities)
+    times = content_distance / scene.content_distance
+    if not 1.0 / MANY_TIMES <= times <= MANY_TIMES:
+        odd.append(
+            f"the content distance {content_distance:.4g} is {times:.3g} times what the cameras "
+            f"suggest, {scene.content_distance:.4g} scene units: the scaling will "
+            + ("have no effect" if times < 1.0 else "hold back everything that is seen")
+        )
     cameras = scene.training_cameras
-    if found.files:  # built-in scenes look everywhere, and know their true distances
+    if not found.built_in:  # they look everywhere, and know their true distances
         odd += _odd_directions(cameras)
     odd += _odd_places(scene)
     nearest = max(near, _distance_to_box(scene))

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import stat
 from collections import Counter
 from collections.abc import Callable
@@ -205,6 +206,25 @@ def find_image(folder: Path, file_path: str, *, field: str) -> Path | None:
             "can be read."
         ) from None
     return path
+
+
+def photograph_folder(folder: Path) -> Path | None:
+    """Where the photographs of a COLMAP or LLFF scene are.
+
+    Args:
+        folder: The scene's.
+
+    Returns:
+        images/, or else the largest ones of images_2/, images_4/, ...; None where there are none.
+    """
+    if (folder / "images").is_dir():
+        return folder / "images"
+    try:
+        reduced = [path for path in folder.glob("images_*") if path.is_dir()]
+    except OSError:
+        return None
+    sizes = {int(m[1]): p for p in reduced if (m := re.fullmatch(r"images_(\d{1,3})", p.name))}
+    return sizes[min(sizes)] if sizes else None
 
 
 def printable(text: str) -> str:

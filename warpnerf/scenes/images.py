@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from PIL import Image, ImageFile, TiffImagePlugin, UnidentifiedImageError
@@ -28,6 +29,8 @@ OTHER_BYTE = {
 """Raw modes of 16-bit colour, of which Pillow keeps one byte without a word, and those by which it
 keeps the other byte: L, B and N stand for little-endian, big-endian and this machine's."""
 
+T = TypeVar("T")
+
 TIFF_BITS = 258
 TIFF_ORIENTATION = 274
 
@@ -45,16 +48,40 @@ def read_image(path: Path) -> np.ndarray:
         InputError: Not a regular file, not a whole image, or of a kind that 8-bit rgb cannot hold.
         MemoryError: It does not fit.
     """
+
+    def pixels(image: ImageFile.ImageFile) -> np.ndarray:
+        _check_kind(path, image)
+        if _raw_mode(image) not in OTHER_BYTE:
+            return _to_eight_bit(image)
+        with Image.open(path, formats=IMAGE_FORMATS) as again:
+            return _sixteen_bit_colour(image, again)
+
+    return _read(path, pixels)
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height of an image, pixels as they are stored, without reading these.
+
+    Args:
+        path: Of the image.
+
+    Returns:
+        Pixels in a row, rows.
+
+    Raises:
+        InputError: Not a regular file, or no image.
+    """
+    return _read(path, lambda image: image.size)
+
+
+def _read(path: Path, look: Callable[[ImageFile.ImageFile], T]) -> T:
+    """What something finds in an image, whose defects are all told in one way."""
     require_regular_file(path)
     _refuse_pointer(path)
     Image.init()  # else a format whose plugin is not loaded yet is a KeyError
     try:
         with Image.open(path, formats=IMAGE_FORMATS) as image:
-            _check_kind(path, image)
-            if _raw_mode(image) not in OTHER_BYTE:
-                return _to_eight_bit(image)
-            with Image.open(path, formats=IMAGE_FORMATS) as again:
-                return _sixteen_bit_colour(image, again)
+            return look(image)
     except (InputError, MemoryError):
         raise
     except (Image.DecompressionBombError, Image.DecompressionBombWarning):

@@ -6,12 +6,17 @@ import re
 from pathlib import Path
 
 from warpnerf.checks import InputError
+from warpnerf.scenes import llff
 from warpnerf.scenes.blender import SPLITS, load_blender, split_file
+from warpnerf.scenes.colmap import find_model, load_colmap
 from warpnerf.scenes.files import exists
 from warpnerf.scenes.scene import Scene
 from warpnerf.scenes.transforms import load_transforms
 
 __all__ = ["load_scene"]
+
+PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".heic", ".webp", ".tif", ".tiff")
+VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm")
 
 BUILTIN = "builtin:"
 BUILTIN_NAMES = ("room", "room-sparse")
@@ -21,10 +26,11 @@ def load_scene(path: str | Path, *, downscale: int = 1) -> Scene:
     """Load a scene: photographs, cameras, split, and the extent estimated from the cameras.
 
     A folder is tried as Blender / NeRF-synthetic (transforms_train.json), then as instant-ngp or
-    nerfstudio (transforms.json).
+    nerfstudio (transforms.json), COLMAP (sparse/0), and LLFF (poses_bounds.npy).
 
     Args:
-        path: A folder, a transforms*.json in it, or "builtin:" and the name of a built-in scene.
+        path: A folder, a transforms*.json or poses_bounds.npy in it, the folder of a COLMAP model,
+            or "builtin:" and the name of a built-in scene.
         downscale: Edge of the blocks of pixels that become one; 1 keeps the images as they are.
 
     Returns:
@@ -50,6 +56,8 @@ def load_scene(path: str | Path, *, downscale: int = 1) -> Scene:
         return load_blender(path.parent, downscale=downscale)
     if re.fullmatch(r"transforms.*\.json", path.name):
         return load_transforms(path, downscale=downscale)
+    if path.name == llff.FILE:
+        return llff.load_llff(path.parent, downscale=downscale)
     raise InputError(f"{path}: is not a scene; give its folder or a transforms*.json in it.")
 
 
@@ -58,11 +66,33 @@ def _load_folder(folder: Path, downscale: int) -> Scene:
         return load_blender(folder, downscale=downscale)
     if exists(folder / "transforms.json"):
         return load_transforms(folder / "transforms.json", downscale=downscale)
+    model = find_model(folder)
+    if model is not None:
+        return load_colmap(model, downscale=downscale)
+    if exists(folder / llff.FILE):
+        return llff.load_llff(folder, downscale=downscale)
     raise InputError(
-        f"{folder}: no scene found: the folder has neither {split_file('train')} (Blender) nor "
-        "transforms.json (instant-ngp, nerfstudio); convert a COLMAP model with colmap2nerf.py or "
-        "ns-process-data."
+        f"{folder}: no scene found: {_what_is_there(folder)}. A scene has {split_file('train')} "
+        "(Blender), transforms.json (instant-ngp, nerfstudio), sparse/0 (COLMAP) or "
+        f"{llff.FILE} (LLFF)."
     )
+
+
+def _what_is_there(folder: Path) -> str:
+    """What of use a folder without a scene holds, and the way from there."""
+    try:
+        names = [path.suffix.lower() for path in (*folder.iterdir(), *folder.glob("images/*"))]
+    except OSError as error:
+        return f"the folder cannot be read ({error.strerror})"
+    photographs = sum(name in PHOTOGRAPHS for name in names)
+    if photographs:
+        return (
+            f"it holds {photographs} photographs without poses; estimate them, as by `colmap "
+            f"automatic_reconstructor --image_path {folder} --workspace_path {folder}`"
+        )
+    if any(name in VIDEOS for name in names):
+        return "it holds a video; take frames from it and estimate their poses, as by COLMAP"
+    return "it holds neither poses nor photographs"
 
 
 def _load_builtin(name: str, downscale: int) -> Scene:

@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 
 from warpnerf.checks import InputError
+from warpnerf.scenes import llff
 from warpnerf.scenes.blender import SPLITS, split_file
+from warpnerf.scenes.colmap import find_model, model_kind
 from warpnerf.scenes.files import exists, printable, read_json
 from warpnerf.scenes.poses import check_pose
 from warpnerf.scenes.transforms import FrameEntry, TransformsFile
@@ -32,11 +34,16 @@ class Survey:
     format: str
     """In words."""
     files: tuple[Path, ...]
-    """That hold cameras; none of a built-in scene."""
+    """That hold cameras as JSON; none of other scenes."""
     refused: tuple[str, ...]
     """Frames whose poses are refused, as $.frames[0], after their file where there are several."""
     oddities: tuple[str, ...]
     """A sentence each."""
+
+    @property
+    def built_in(self) -> bool:
+        """Whether it is one of the built-in scenes."""
+        return self.format.startswith("built in")
 
 
 def survey(path: str | Path) -> Survey:
@@ -83,6 +90,14 @@ def _files(path: str | Path) -> tuple[str, list[Path]]:
         files = [folder / split_file(split) for split in SPLITS]
         names = [file for file in files if exists(file)]
         return f"Blender / NeRF-synthetic ({', '.join(file.name for file in names)})", names
+    if path.name == llff.FILE or not exists(folder / "transforms.json"):
+        model = find_model(folder)
+        kind = None if model is None else model_kind(model)
+        if model is not None and path.name != llff.FILE:
+            words = {"bin": "binary", "txt": "text"}[str(kind)]
+            return f"COLMAP ({model.relative_to(folder).as_posix()}, {words})", []
+        if exists(folder / llff.FILE):
+            return f"LLFF ({llff.FILE})", []
     file = path / "transforms.json" if path.is_dir() else path
     return f"instant-ngp / nerfstudio ({file.name})", [file] if exists(file) else []
 
