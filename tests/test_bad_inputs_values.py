@@ -63,6 +63,8 @@ NAN = math.nan
                 (usable_memory() or 0) > 40 * 21 * 10**8, reason="this machine has 84 GB"
             ),
         ),
+        pytest.param(["--voxels", "1e12"], "grid.voxels must be below 2^31", id="61-1e12"),
+        pytest.param(["--threads", "5000"], "threads must be at most ", id="threads-5000"),
         pytest.param(["--near", "-1"], "march.near", id="near-negative"),
         pytest.param(["--near", "nan"], "march.near", id="near-NaN"),
         pytest.param(["--near", "50"], "use a smaller --near", id="near-beyond-the-scene"),
@@ -77,7 +79,7 @@ def test_value(tmp_path: Path, options: list[str], says: str) -> None:
     [
         pytest.param(["--steps", "nan"], id="60-steps-NaN"),
         pytest.param(["--voxels", "nan"], id="60-resolution-NaN"),
-        pytest.param(["--voxels", "1e12"], id="61-1e12"),
+        pytest.param(["--voxels", "1.5"], id="60-resolution-1.5"),
     ],
 )
 def test_value_of_another_type(tmp_path: Path, options: list[str]) -> None:

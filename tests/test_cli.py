@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shlex
 import shutil
 import signal
@@ -42,8 +43,9 @@ def run(*arguments: str | Path) -> tuple[int, str, str]:
 def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """A tiny run, and what it printed."""
     folder = tmp_path_factory.mktemp("runs") / "room"
-    code, out, err = run("train", *TINY, "--steps", "30", "--output", folder)
+    code, out, err = run("train", *TINY, "--steps", "3e1", "--output", folder)
     assert code == 0, err
+    assert "CUDA" not in err
     return folder, out
 
 
@@ -227,7 +229,9 @@ def begun(folder: Path, *signals: int) -> tuple[int, str, str]:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGINT for one process there")
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
+)
 def test_stopped_it_saves_and_says_how_to_go_on(tmp_path: Path, number: int, code: int) -> None:
     folder = tmp_path / "my run"
     returned, out, err = begun(folder, number)
@@ -310,6 +314,8 @@ def test_other_threads_are_allowed_and_noted(trained: tuple[Path, str]) -> None:
         (("--downscale", "0"), "--downscale does not go with --resume"),
         (("--preset", "fast"), "--preset does not go with --resume"),
         (("--overwrite",), "--overwrite does not go with --resume"),
+        (("--scaling", "None"), "--scaling cannot be None; leave it out"),
+        (("--scaling=None",), "--scaling cannot be None; leave it out"),
         (("--output", "elsewhere"), "--output does not go with --resume"),
     ],
 )
@@ -374,3 +380,30 @@ def test_what_is_not_finite_ends_the_run(tmp_path: Path, bad_step: int, kept: st
     assert "Traceback" not in process.stderr
     for path in Run(folder).checkpoints:
         assert load_checkpoint(path).progress.step < bad_step
+
+
+def test_a_folder_that_is_trained_into_is_left_alone(trained: tuple[Path, str]) -> None:
+    folder = trained[0]
+    with Run(folder).only_writer():
+        for options in (("--resume", folder), (*TINY, "--output", folder, "--overwrite")):
+            code, _, err = run("train", *options)
+            assert code == 2 and f"process {os.getpid()} is training into this folder" in err
+    assert (folder / "field.safetensors").exists()
+
+
+def test_a_training_that_nobody_reads_goes_on(tmp_path: Path) -> None:
+    process = start("train", *TINY, "--steps", "30", "--output", tmp_path / "run")
+    assert process.stdout is not None and process.stderr is not None
+    assert process.stdout.readline().startswith("reading")
+    process.stdout.close()
+    err = process.stderr.read()
+    assert process.wait(timeout=120) == 0, err
+    assert "Traceback" not in err and "Broken pipe" not in err
+    assert (tmp_path / "run" / "metrics.json").exists()
+
+
+def test_what_is_odd_is_said_in_training(tmp_path: Path) -> None:
+    options = ("--steps", "3", "--content-distance", "5000", "--output", tmp_path / "run")
+    code, out, err = run("train", *TINY, *options)
+    assert code == 0, err
+    assert "odd: the content distance 5000 is " in out

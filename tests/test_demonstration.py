@@ -112,4 +112,6 @@ def test_bad_input_is_refused_before_anything_is_trained(tmp_path: Path) -> None
             demo(output)
     with pytest.raises(InputError, match="steps"):
         demo(tmp_path / "demo", steps=0)
+    with pytest.raises(InputError, match=r"holds other files \(file\); name a new folder"):
+        demo(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["file"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 from collections.abc import Callable
 from dataclasses import replace
@@ -253,7 +254,8 @@ def test_killed_while_replacing_a_run_one_of_the_two_is_whole(
 
 def test_a_run_is_put_aside_until_the_next_has_saved_something(tmp_path: Path) -> None:
     run_with(tmp_path, 8, 9)
-    (tmp_path / "test" / "old.png").write_bytes(b"")
+    picture = json.loads((tmp_path / "config.json").read_text())["pictures"][0]
+    (tmp_path / "test" / picture).write_bytes(b"")
     (tmp_path / "notes.txt").write_text("mine")
     run = new_run(tmp_path)
     assert run.checkpoints == [] and list((tmp_path / "test").iterdir()) == []
@@ -371,3 +373,48 @@ def test_a_state_of_the_same_step_replaces_it(tmp_path: Path) -> None:
     changed: TrainingState = replace(state_of(5), reach=1.0)
     run.save_checkpoint(changed)
     assert_same_state(run.load_state()[0], changed)
+
+
+def test_only_what_the_run_wrote_is_ever_removed(tmp_path: Path) -> None:
+    run = run_with(tmp_path, 5)
+    own = [tmp_path / "test" / f"{n}.png" for n in range(2)]
+    names = [path.name for path in own]
+    config = tmp_path / "config.json"
+    content = json.loads(config.read_text())
+    assert content["pictures"] and all(name.endswith(".png") for name in content["pictures"])
+    config.write_text(json.dumps(content | {"pictures": names}))
+    mine = [tmp_path / "test" / "mine.png", tmp_path / "notes.txt"]
+    for path in [*own, *mine]:
+        path.write_bytes(b"")
+    new_run(tmp_path).save_checkpoint(state_of(9))
+    assert all(path.exists() for path in mine)
+    assert not any(path.exists() for path in own)
+    assert not (tmp_path / "previous").exists()
+    assert steps_in(run) == ["checkpoint-00000009.safetensors"]
+
+
+def test_pictures_of_the_version_before_are_those_in_the_folder(tmp_path: Path) -> None:
+    run_with(tmp_path, 5)
+    config, picture = tmp_path / "config.json", tmp_path / "test" / "view.png"
+    content = json.loads(config.read_text())
+    del content["pictures"]
+    config.write_text(json.dumps(content))
+    picture.write_bytes(b"")
+    new_run(tmp_path)
+    assert not picture.exists() and (tmp_path / "previous" / "test" / "view.png").exists()
+
+
+def test_what_a_failed_beginning_leaves_can_be_begun_in(tmp_path: Path) -> None:
+    (tmp_path / "test").mkdir()
+    (tmp_path / ".lock").write_text("1\n")
+    Run.require_free(tmp_path, overwrite=False)
+    (tmp_path / "test" / "mine.png").write_bytes(b"")
+    with pytest.raises(InputError, match="holds other files"):
+        Run.require_free(tmp_path, overwrite=True)
+
+
+def test_pictures_have_a_folder_whatever_became_of_it(tmp_path: Path) -> None:
+    run = run_with(tmp_path, 5)
+    (tmp_path / "test").rmdir()
+    run.evaluate(state_of(5).field, small_scene(), "train")
+    assert any((tmp_path / "test").iterdir())

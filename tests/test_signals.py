@@ -29,7 +29,9 @@ def ask(number: int) -> None:
         pass
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
+)
 def test_the_first_signal_is_noted(number: int, code: int) -> None:
     with StopRequest() as stop:
         assert not stop.asked

@@ -9,6 +9,7 @@ import re
 import sys
 import warnings
 from collections.abc import Callable
+from decimal import Decimal
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -29,6 +30,7 @@ from warpnerf.cli.progress import ProgressBar
 from warpnerf.cli.render import render_command
 from warpnerf.config import PRESETS, Scaling, TrainConfig
 from warpnerf.runtime.signals import Stopped, StopRequest, raise_when_asked
+from warpnerf.runtime.terminal import UntilClosed
 
 if TYPE_CHECKING:
     from warpnerf.scenes.scene import Scene
@@ -187,22 +189,34 @@ def _begin(source: str, output: Path, downscale: int, config: TrainConfig, overw
     scene = _read(source, downscale)
 
     # Not before: these load Warp, and bad input is refused at once.
+    from warpnerf.evaluation.inspection import oddities
+    from warpnerf.scenes.survey import survey
     from warpnerf.training.run import Run
     from warpnerf.training.trainer import Trainer
 
     trainer = Trainer(scene, config)
     _describe(scene, trainer.content_distance, config)
+    for oddity in oddities(scene, survey(source), trainer.content_distance, config.march.near):
+        print(f"  odd: {oddity}", flush=True)
     run = Run(output)
-    run.create(scene, _absolute(source), downscale, trainer.content_distance, config)
-    return _train(run, scene, trainer)
+    with run.only_writer():
+        Run.require_free(output, overwrite)  # once more, now that nobody else begins there
+        run.create(scene, _absolute(source), downscale, trainer.content_distance, config)
+        return _train(run, scene, trainer)
 
 
 def _resume(folder: Path, moved: str | None, changed: Callable[[TrainConfig], TrainConfig]) -> int:
     """Train from the last checkpoint on."""
     from warpnerf.training.run import Run
+
+    Run(folder).read_config()
+    with Run(folder).only_writer():
+        return _go_on(Run(folder), moved, changed)
+
+
+def _go_on(run: Run, moved: str | None, changed: Callable[[TrainConfig], TrainConfig]) -> int:
     from warpnerf.training.trainer import Trainer
 
-    run = Run(folder)
     begun = run.read_config()
     state, notes = run.load_state()
     config = changed(state.config)
@@ -316,11 +330,35 @@ def _text(progress: Progress) -> str:
     )
 
 
+def _meant(option: str, word: str) -> str:
+    """A word of the command line as it is understood: counts such as 1e6 without their exponent.
+
+    Raises:
+        InputError: It is None, by which Python's default would be meant.
+    """
+    if (option.startswith("--") and word == "None") or re.fullmatch(r"--[\w-]+=None", word):
+        raise InputError(
+            f"{option if word == 'None' else word.removesuffix('=None')} cannot be None; leave it "
+            "out for what it is by default."
+        )
+    if option in ("--steps", "--voxels") and re.fullmatch(r"\d+(\.\d+)?e\d{1,2}", word.lower()):
+        count = Decimal(word)
+        return str(int(count)) if count == count.to_integral_value() else word
+    return word
+
+
+def _said(error: Exception) -> str:
+    """An error of the system as a sentence."""
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}; check that it exists and may be used."
+    return str(error)
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run the command.
 
     Returns:
-        0; 2 for bad input; 1 where training failed; 130 after Ctrl-C, 143 after SIGTERM.
+        0; 2 for bad input; 1 where training failed; 129, 130, 143 after SIGHUP, Ctrl-C, SIGTERM.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     if arguments == ["--version"]:
@@ -335,7 +373,9 @@ def main(arguments: list[str] | None = None) -> int:
     warnings.formatwarning = lambda message, *_: f"warpnerf: warning: {message}.\n"
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # file names may hold anything
+        sys.stdout = UntilClosed(sys.stdout)
     try:
+        arguments = [_meant(arguments[at - 1], word) for at, word in enumerate(arguments)]
         return tyro.extras.subcommand_cli_from_dict(
             {
                 "demo": demo_command,
@@ -363,7 +403,7 @@ def main(arguments: list[str] | None = None) -> int:
         )
         return BAD_INPUT
     except (OSError, FloatingPointError) as error:
-        print(f"warpnerf: error: {error}", file=sys.stderr)
+        print(f"warpnerf: error: {_said(error)}", file=sys.stderr)
         return FAILED
     except Stopped as stopped:
         print("stopped", file=sys.stderr)

@@ -27,15 +27,18 @@ class ProgressBar:
         """Show the bar, where there is a terminal."""
         from rich.console import Console
         from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+        from rich.table import Column
 
         console = Console()
         self._began = time.monotonic()
         if console.is_terminal:
             self._bar = Progress(
                 TextColumn("{task.percentage:3.0f}%"),
-                BarColumn(),
-                TextColumn("{task.description}"),
-                TimeRemainingColumn(),
+                BarColumn(bar_width=16),
+                TimeRemainingColumn(compact=True, table_column=Column(min_width=5, no_wrap=True)),
+                TextColumn(  # the end of which is left out where the terminal is narrow
+                    "{task.description}", table_column=Column(no_wrap=True, overflow="ellipsis")
+                ),
                 console=console,
             )
             self._bar.start()

@@ -50,6 +50,9 @@ PICTURE_SIZE = (400, 300)
 _LABELS = 210
 _GAP = 8
 
+OWN_FILES = {"floaters.png", "floaters.mp4", "floaters.gif", "figures.json"}
+"""What an older demonstration may have left."""
+
 Report = Callable[[str, float, str], None]
 """Told what is being done and why, the fraction of it that is done, and a few words."""
 
@@ -109,16 +112,19 @@ def demo(
         Figures and fields by scaling, and where the files are.
 
     Raises:
-        InputError: The folder cannot be written to, or the device is missing.
+        InputError: The folder cannot be written to or holds other files, or the device is missing.
     """
     require_whole("steps", steps, 1)
     folder = Path(output)
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        others = sorted({path.name for path in folder.iterdir()} - OWN_FILES)
     except OSError as error:
         raise InputError(
             f"--output {folder} cannot be written: {error.strerror}; name a folder."
         ) from error
+    if others:
+        raise InputError(f"--output {folder} holds other files ({others[0]}); name a new folder.")
     video, _ = video_file(folder / "floaters.mp4", FPS)
     report("tracing the photographs of the built-in room", 0.0, "")
     scene = load_scene("builtin:room-sparse", downscale=downscale)

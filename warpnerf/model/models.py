@@ -54,7 +54,7 @@ class Model:
 
         That is what its nodes cost, by benchmarks/models.py; a model with an MLP adds it.
         """
-        return 0.8 + 0.05 * self.n_floats
+        return 0.72 + 0.07 * self.n_floats
 
     def keep_plain(self) -> None:
         """Make each field of a frozen dataclass a plain int, float or bool, as its default is.
@@ -285,7 +285,7 @@ class Deferred(_WithMlp):
     @property
     def relative_time(self) -> float:
         """That of its nodes, and of an MLP once a ray."""
-        return super().relative_time + 1.5e-4 * self.multiplications()
+        return super().relative_time + 1e-4 * self.multiplications()
 
     @property
     def n_features(self) -> int:

@@ -14,9 +14,11 @@ import hashlib
 import logging
 import os
 import shutil
+import sys
 import tempfile
 import threading
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 
 import warp as wp
@@ -25,12 +27,15 @@ from warpnerf.checks import InputError
 
 SUMS = "SHA256SUMS"
 COMPILED = (".o", ".cubin", ".ptx", ".meta")
+NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
+"""In the line that Warp prints where there is no GPU. Who asks for one is told in a sentence."""
 
 _log = logging.getLogger("warpnerf")
 _loading = threading.Lock()
 """Warp would load a module twice where two threads ask for it, and free the code of one of them."""
 _temporary: Path | None = None
 _said = False
+_started = False
 
 
 class DamagedKernelError(Exception):
@@ -43,12 +48,39 @@ def start() -> None:
     Raises:
         InputError: Neither its cache nor a temporary folder can be made.
     """
+    global _started
     wp.config.log_level = wp.LOG_ERROR
+    if _started:
+        return
+    with _without_lines(NO_DRIVER):
+        try:
+            wp.init()
+        except OSError as error:
+            _leave_cache(error)
+            wp.init()
+    _started = True
+
+
+@contextlib.contextmanager
+def _without_lines(unwanted: bytes) -> Iterator[None]:
+    """Leave lines out of what is written to standard error meanwhile, by C code as well."""
     try:
-        wp.init()
-    except OSError as error:
-        _leave_cache(error)
-        wp.init()
+        sys.stderr.flush()
+        kept = os.dup(2)
+    except (OSError, AttributeError, ValueError):  # there is none
+        yield
+        return
+    with tempfile.TemporaryFile() as file:
+        os.dup2(file.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            file.seek(0)
+            for line in file:
+                if unwanted not in line:
+                    os.write(2, line)
 
 
 def load(kernel: wp.Kernel, device: wp.Device) -> None:

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: how a program is asked to end, and what it then exits with."""
+"""Ctrl-C, SIGTERM, SIGHUP: how a program is asked to end, and what it then exits with."""
 
 from __future__ import annotations
 
@@ -7,7 +7,10 @@ import signal
 import sys
 import threading
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = tuple(
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
+)
+"""SIGHUP comes where a terminal or connection is closed; Windows has none."""
 
 
 class Stopped(KeyboardInterrupt):
@@ -17,13 +20,17 @@ class Stopped(KeyboardInterrupt):
         """Keep the signal's number."""
         super().__init__()
         self.exit_code = 128 + number
-        """130 after Ctrl-C, 143 after SIGTERM, as shells have it."""
+        """130 after Ctrl-C, 143 after SIGTERM, 129 after SIGHUP, as shells have it."""
 
 
 def raise_when_asked() -> None:
-    """From now on, Ctrl-C and SIGTERM raise Stopped in the main thread."""
+    """From now on, signals raise Stopped in the main thread.
+
+    SIGHUP stays ignored where it is, as under nohup.
+    """
     for number in SIGNALS:
-        signal.signal(number, _raise)
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, _raise)
     sys.unraisablehook = _ask_again
 
 
@@ -33,7 +40,8 @@ class StopRequest:
     def __enter__(self) -> StopRequest:
         """Take the signals over."""
         self.exit_code: int | None = None
-        self._before = {number: signal.signal(number, self._note) for number in SIGNALS}
+        heard = [n for n in SIGNALS if signal.getsignal(n) is not signal.SIG_IGN]
+        self._before = {number: signal.signal(number, self._note) for number in heard}
         return self
 
     def __exit__(self, *error: object) -> None:

@@ -1,8 +1,54 @@
-"""Tables: drawn on a terminal, plain columns elsewhere."""
+"""What is printed: tables, and an output that may be closed while a program goes on."""
 
 from __future__ import annotations
 
+import io
+import os
 from collections.abc import Sequence
+from typing import Any
+
+
+class UntilClosed(io.TextIOBase):
+    """Standard output that is silent once nobody reads it, as in ``warpnerf train ... | head``.
+
+    A training that nobody listens to goes on, and is saved.
+    """
+
+    def __init__(self, stream: io.TextIOWrapper) -> None:
+        """Wrap a stream of a file descriptor."""
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        """Everything else is the stream's."""
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        """Write, where somebody reads."""
+        try:
+            return self._stream.write(text)
+        except BrokenPipeError:
+            self._close()
+            return len(text)
+
+    def flush(self) -> None:
+        """Hand on what was written, where somebody reads."""
+        try:
+            self._stream.flush()
+        except BrokenPipeError:
+            self._close()
+
+    def isatty(self) -> bool:
+        """Whether it is a terminal."""
+        return self._stream.isatty()
+
+    def fileno(self) -> int:
+        """The stream's."""
+        return self._stream.fileno()
+
+    def _close(self) -> None:
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, self._stream.fileno())  # so that flushing at exit fails no more
+        os.close(nowhere)
 
 
 def table_text(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -7,6 +7,7 @@ field.safetensors            the trained field
 metrics.json                 figures of the test views
 test.png                     a few test views, to look at first: truth, rendering, depth, PSNR
 test/                        truth, rendering and depth of each test view, side by side
+.lock                        while a training writes here
 previous/                    a run that was replaced, until this one has saved something
 """
 
@@ -16,7 +17,7 @@ import json
 import re
 import shlex
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
@@ -34,6 +35,7 @@ from warpnerf.model import models
 from warpnerf.rendering.field import Field, Rendering
 from warpnerf.scenes.files import read_json
 from warpnerf.scenes.scene import Scene, View, require_split
+from warpnerf.training import lock
 from warpnerf.training.checkpoint import (
     DamagedFileError,
     load_checkpoint,
@@ -61,6 +63,8 @@ class RunConfig(msgspec.Struct, frozen=True):
     """The one in use, scene units."""
     train: TrainConfig
     """What was asked for."""
+    pictures: list[str] | None = None
+    """File names of the pictures in test/; None in runs of the version before, which wrote all."""
 
 
 class Run:
@@ -107,7 +111,7 @@ class Run:
         path = Path(folder)
         if path.exists() and not path.is_dir():
             raise InputError(f"--output {path} is a file; name a folder.")
-        if not path.exists() or not any(path.iterdir()):
+        if not path.exists() or not any(map(_counts, path.iterdir())):
             return
         try:
             Run(path).read_config()
@@ -118,6 +122,14 @@ class Run:
                 f"--output {path} holds a run already; go on with it by --resume {path}, replace "
                 "it by --overwrite, or name another folder."
             )
+
+    def only_writer(self) -> AbstractContextManager[None]:
+        """Be the only process that writes to the folder, within a `with` statement.
+
+        Raises:
+            InputError: Another process trains into it, or it cannot be written to.
+        """
+        return lock.only_writer(self.folder)
 
     def create(
         self,
@@ -139,6 +151,7 @@ class Run:
             "box_min": scene.box_min.tolist(),
             "box_max": scene.box_max.tolist(),
             "notes": [*scene.warnings, *scene.notes],
+            "pictures": sorted(picture_files([view.name for view in scene.views]).values()),
             "train": config_to_json(config),
         }
         try:
@@ -283,6 +296,8 @@ class Run:
             if view.name in on_sheet:
                 seen[view.name] = view, target, rendering
 
+        with self._writing():
+            (self.folder / "test").mkdir(exist_ok=True)
         result = evaluate(field, scene, split, picture)
         rows = [
             SheetRow(
@@ -332,8 +347,18 @@ class Run:
     def _by_products(self) -> list[Path]:
         """What else a run writes, but its configuration."""
         files = [self.folder / "log.jsonl", self.folder / "metrics.json", self.sheet]
-        files += (self.folder / "test").glob("*.png")
+        files += [self.folder / "test" / name for name in self._pictures()]
         return [path for path in files if path.exists()]
+
+    def _pictures(self) -> list[str]:
+        """File names of the pictures that the run may have written to test/."""
+        try:
+            listed = self.read_config().pictures
+        except InputError:
+            return []
+        if listed is not None:
+            return [name for name in listed if Path(name).name == name]
+        return [path.name for path in (self.folder / "test").glob("*.png")]
 
     def _set_aside(self) -> None:
         """Move an older run to previous/, so that at any moment one of the two folders is whole."""
@@ -360,6 +385,13 @@ class Run:
             for folder in (older.folder / "test", older.folder):
                 with suppress(OSError):  # not empty
                     folder.rmdir()
+
+
+def _counts(path: Path) -> bool:
+    """Whether a file or folder of an output folder is more than an attempt to begin leaves."""
+    if path.name == lock.NAME:
+        return False
+    return not (path.name == "test" and path.is_dir() and not any(path.iterdir()))
 
 
 def _step_of(checkpoint: Path) -> str:
