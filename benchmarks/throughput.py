@@ -112,6 +112,7 @@ def check(
     Args:
         runs: By name and number of threads.
         at_kinks: The share of a gradient's values that is left out, those of greatest difference.
+            Where it is not 0, the network's gradient may differ by ten times as much.
 
     Returns:
         For each, the greatest differences in colours, gradient and the network's, if there is one,
@@ -137,10 +138,11 @@ def check(
             if what == "gradient" and at_kinks:
                 apart = np.sort(apart)[: int(len(apart) * (1.0 - at_kinks))]
             difference = by_value[what] = float(apart.max() / largest)
-            if not difference < TOLERANCE:
+            allowed = TOLERANCE * (10.0 if what == "network" and at_kinks else 1.0)
+            if not difference < allowed:
                 raise SystemExit(
                     f"throughput: {name} on {threads} threads differs in {what} by "
-                    f"{difference:.1e} of the largest value (allowed: {TOLERANCE}); there is "
+                    f"{difference:.1e} of the largest value (allowed: {allowed:g}); there is "
                     "nothing to time."
                 )
     return differences
