@@ -197,7 +197,7 @@ MUTANTS = [
     Mutant("pack's edge before growth begins", "sampling/steps.py",
            "step_edge(march, wp.max(step, march.n_linear))", "step_edge(march, step)", LINF),
     Mutant("early stop forgotten", "volume/walk_packs.py",
-           "packs[slot].passed < scene.march.transmittance_min", "packs[slot].passed < real(0.0)", STOP),
+           "packs[slot].passed < scene.march.transmittance_min", "packs[slot].passed < 0.0", STOP),
     Mutant("packs overlap", "volume/walk_packs.py",
            "wp.min(step + LANES, ray.end)", "wp.min(step + LANES - 1, ray.end)", ANY),
     Mutant("packs leave a gap", "volume/walk_packs.py",
