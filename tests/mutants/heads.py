@@ -56,11 +56,11 @@ MUTANTS = [
     Mutant("vectors: sines where cosines are", "heads/view.py",
            "out[6 + 6 * k + axis] = signed_cosine[m]", "out[6 + 6 * k + axis] = signed_sine[m]", PF),
     Mutant("vectors: pi less exact", "heads/view.py",
-           "r = fma(n, all(-4.83751297e-4f), r);", "r = fma(n, all(-4.8e-4f), r);", PF),
+           "        r = fma(n, all(-4.83751297e-4f), r);\n", "", PF),
     # ray losses in packs
     Mutant("loss: of lanes that are no samples", "volume/walk_packs.py",
            "            if packs[slot].visited[lane] != 0:\n                weight = packs[slot].weight[lane]\n                state",
-           "            if packs[slot].visited[0] != 0:\n                weight = packs[slot].weight[lane]\n                state", LOSS),
+           "            if packs[slot].visited[lane] == 0:\n                weight = packs[slot].weight[lane]\n                state", LOSS),
     Mutant("loss: sums do not grow", "volume/walk_packs.py",
            "                state = add_loss(state, weight, t, dt)\n", "", LOSS),
     Mutant("loss: its factor", "volume/walk_packs.py",
