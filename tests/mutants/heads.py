@@ -241,7 +241,7 @@ MUTANTS = [
     Mutant("packs, adjoint: first features twice", "heads/features.py",
            "c = SKIPPED; c < 3 && c < INPUTS", "c = 3; c < 3 && c < INPUTS", PF16),
     Mutant("by sample: records of others", "fields/dense.py",
-           "record.adj_by_sample = pack.adj_by_sample;", "", PF),
+           "record.adj_by_sample = pack.adj_by_sample;", ";", PF),
     Mutant("by sample: what adds to nodes", "fields/dense.py",
            "&samples.adj_by_sample.data[n]", "&samples.adj_by_sample.data[0]", PF),
     Mutant("packs, adjoint: features of other lanes", "heads/features.py",
