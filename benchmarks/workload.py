@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 from warpnerf_kernels.base.types import real, vec3, vector
 
-from warpnerf.model import models
+from warpnerf.model import interface, models
 from warpnerf.model.grid import FreeCells, VoxelGrid
 from warpnerf.rendering.rays import RayBatch
 from warpnerf.rendering.render import Steps
@@ -115,7 +115,7 @@ class Workload:
         """The grid as warpnerf takes it."""
         return voxel_grid(self.values, workers)
 
-    def warp_model(self) -> models.Model:
+    def warp_model(self) -> interface.Model:
         """The model as warpnerf takes it."""
         return models.model_of(self.model)
 
@@ -128,7 +128,7 @@ class Workload:
             np.pad(array, [*[(0, 0)] * (array.ndim - 1), (0, 1)]) for array in arrays[-2:]
         )
         flat = np.concatenate([np.zeros(0, np.float32), *(array.ravel() for array in arrays)])
-        if len(flat) != models.n_weights(self.warp_model()):
+        if len(flat) != interface.n_weights(self.warp_model()):
             raise SystemExit(f"workload: its network is not the one that {self.model} has.")
         return wp.array(flat, dtype=real, device=workers.device)
 

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from warpnerf_kernels.base import precision, tiles
 
 from warpnerf.model.grid import box_struct, density_struct, free_struct, grid_struct
-from warpnerf.model.models import Model, Rgb
+from warpnerf.model.interface import Model
+from warpnerf.model.models import Rgb
 from warpnerf.rendering.adjoint import AdjointLaunch, gradient_struct
 from warpnerf.rendering.rays import rays_struct
 from warpnerf.rendering.render import (

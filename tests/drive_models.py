@@ -11,7 +11,8 @@ import torch
 from drive import RGB, Float64, Kernels, Problem, in_float32, make_problem, oracle
 from torch import Tensor
 
-from warpnerf.model.models import Deferred, Features, Model, Rgb, SphericalHarmonics, n_weights
+from warpnerf.model.interface import Model, n_weights
+from warpnerf.model.models import Deferred, Features, Rgb, SphericalHarmonics
 
 SH = tuple(SphericalHarmonics(degree=degree) for degree in range(4))
 DEFERRED = Deferred(specular=4, width=32, hidden_layers=2, frequencies=1)

@@ -18,7 +18,8 @@ from tiny_scenes import camera_at, ring
 
 from warpnerf.checks import InputError
 from warpnerf.config import Contraction, GridConfig, MarchConfig, OptimConfig, TrainConfig
-from warpnerf.model.models import Deferred, Features, Model, Rgb, SphericalHarmonics, n_weights
+from warpnerf.model.interface import Model, n_weights
+from warpnerf.model.models import Deferred, Features, Rgb, SphericalHarmonics
 from warpnerf.training import checkpoint
 from warpnerf.training.checkpoint import (
     DamagedFileError,

@@ -6,7 +6,8 @@ import pytest
 import warp as wp
 from warpnerf_kernels.base import precision
 
-from warpnerf.model.models import Deferred, Features, Model, Rgb, SphericalHarmonics
+from warpnerf.model.interface import Model
+from warpnerf.model.models import Deferred, Features, Rgb, SphericalHarmonics
 from warpnerf.rendering.render import variant_of
 
 SHARED = ["sampling.occupancy", "space.camera"]

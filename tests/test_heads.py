@@ -23,7 +23,7 @@ from drive_models import (
 )
 from test_kernel_render import early, masked
 
-from warpnerf.model.models import Model
+from warpnerf.model.interface import Model
 
 CASES = [
     (SH[0], "none"),

@@ -24,7 +24,7 @@ from drive_models import (
 )
 from test_kernel_render import early, masked
 
-from warpnerf.model.models import Model
+from warpnerf.model.interface import Model
 from warpnerf.rendering import adjoint
 from warpnerf.rendering.render import Steps
 

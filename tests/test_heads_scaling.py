@@ -17,7 +17,7 @@ from drive_models import (
     problem_of,
 )
 
-from warpnerf.model.models import Model
+from warpnerf.model.interface import Model
 from warpnerf.rendering.render import Steps
 
 each_model = pytest.mark.parametrize("model", [SH[3], DEFERRED, FEATURES], ids=name_of)

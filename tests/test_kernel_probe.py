@@ -11,7 +11,8 @@ import torch
 from drive import N_SEEDS, assert_close
 
 from warpnerf.evaluation.gradient_check import ProblemKernels, make_problem, of_model
-from warpnerf.model.models import Deferred, Model, Rgb
+from warpnerf.model.interface import Model
+from warpnerf.model.models import Deferred, Rgb
 from warpnerf.runtime.parallel import Workers
 
 

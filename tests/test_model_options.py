@@ -9,11 +9,11 @@ from test_cli import TINY, run
 
 from warpnerf.checks import InputError
 from warpnerf.cli.model_options import chosen_model
+from warpnerf.model.interface import Model
 from warpnerf.model.models import (
     MODELS,
     Deferred,
     Features,
-    Model,
     Rgb,
     SphericalHarmonics,
     from_json,

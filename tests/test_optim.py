@@ -11,7 +11,8 @@ from warpnerf_kernels.base.types import vector
 
 from warpnerf.config import OptimConfig
 from warpnerf.model.grid import VoxelGrid
-from warpnerf.model.models import Deferred, Features, Model, Rgb
+from warpnerf.model.interface import Model
+from warpnerf.model.models import Deferred, Features, Rgb
 from warpnerf.model.parameters import Parameter, parameters_of
 from warpnerf.rendering.adjoint import Gradients
 from warpnerf.runtime.parallel import Workers

@@ -16,7 +16,8 @@ from test_kernel_render import early, masked
 from tiny_scenes import ring, tiny_scene
 
 from warpnerf.config import GridConfig, OptimConfig, TrainConfig
-from warpnerf.model.models import Model, model_of, parts_of
+from warpnerf.model.interface import Model, parts_of
+from warpnerf.model.models import model_of
 from warpnerf.runtime.parallel import Workers
 from warpnerf.scenes.scene import Scene
 from warpnerf.training import trainer

@@ -24,7 +24,8 @@ from drive_models import (
 from torch import Tensor
 
 from warpnerf.checks import InputError
-from warpnerf.model.models import Deferred, Model, SphericalHarmonics
+from warpnerf.model.interface import Model
+from warpnerf.model.models import Deferred, SphericalHarmonics
 from warpnerf.torch import render_rays
 
 MODELS = (SH[3], DEFERRED_SMALL, DEFERRED, FEATURES_SMALL, FEATURES)

@@ -15,7 +15,8 @@ from warpnerf.checks import InputError
 from warpnerf.evaluation import verify as checks
 from warpnerf.evaluation.gradient_check import Found, ProblemKernels
 from warpnerf.evaluation.verify import Result, relative_error, report, verify
-from warpnerf.model.models import Deferred, Model
+from warpnerf.model.interface import Model
+from warpnerf.model.models import Deferred
 from warpnerf.runtime.parallel import Workers
 
 

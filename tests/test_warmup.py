@@ -8,7 +8,8 @@ import pytest
 from test_determinism import small_scene
 
 from warpnerf.config import GridConfig, OptimConfig, TrainConfig
-from warpnerf.model.models import Deferred, Features, Model, Rgb
+from warpnerf.model.interface import Model
+from warpnerf.model.models import Deferred, Features, Rgb
 from warpnerf.training.trainer import Trainer
 from warpnerf.training.warmup import rendering_kernels, training_kernels, warm_up
 

@@ -10,7 +10,8 @@ from warpnerf_kernels.base.types import vector
 
 from warpnerf.config import Contraction, TrainConfig
 from warpnerf.model.grid import FreeCells, VoxelGrid
-from warpnerf.model.models import Model, Rgb, n_weights
+from warpnerf.model.interface import Model, n_weights
+from warpnerf.model.models import Rgb
 from warpnerf.model.parameters import parameters_of
 from warpnerf.rendering.field import Field
 from warpnerf.rendering.render import Steps

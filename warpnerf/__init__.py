@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from warpnerf.media.demonstration import Demo, demo
     from warpnerf.media.filming import render_stills, render_video
     from warpnerf.media.scene_plan import plan_picture
-    from warpnerf.model.models import Deferred, Features, Model, Rgb, SphericalHarmonics
+    from warpnerf.model.interface import Model
+    from warpnerf.model.models import Deferred, Features, Rgb, SphericalHarmonics
     from warpnerf.rendering.field import Field, Rendering
     from warpnerf.scenes.camera import Camera
     from warpnerf.scenes.load import load_scene
@@ -52,7 +53,7 @@ _HOMES = {
     "TrainConfig": "config",
     "Deferred": "model.models",
     "Features": "model.models",
-    "Model": "model.models",
+    "Model": "model.interface",
     "Rgb": "model.models",
     "SphericalHarmonics": "model.models",
     "load_scene": "scenes.load",

@@ -14,7 +14,8 @@ from warpnerf.checks import (
     require_shares,
     require_whole,
 )
-from warpnerf.model.models import Deferred, Model, model_of, to_json
+from warpnerf.model.interface import Model
+from warpnerf.model.models import Deferred, model_of, to_json
 
 Scaling = Literal["none", "quadratic", "clamped"]
 Jacobian = Literal["none", "density", "paper"]

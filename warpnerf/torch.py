@@ -16,7 +16,8 @@ import warp as wp
 from warpnerf.checks import InputError, require_at_least, require_one_of, require_positive
 from warpnerf.config import MAX_VOXELS, Scaling
 from warpnerf.model.grid import box_struct, density_struct, free_struct, grid_struct
-from warpnerf.model.models import Load, Model, loader, model_of
+from warpnerf.model.interface import Load, Model, loader
+from warpnerf.model.models import model_of
 from warpnerf.rendering.adjoint import AdjointLaunch, gradient_struct, n_tiles
 from warpnerf.rendering.rays import rays_struct
 from warpnerf.rendering.render import Steps, scene_struct, scratch_struct, variant_of

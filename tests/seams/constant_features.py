@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from warpnerf.config import OptimConfig
-from warpnerf.model.models import Load, Model
+from warpnerf.model.interface import Load, Model
 
 
 @cache

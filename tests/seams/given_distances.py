@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
-from warpnerf.model.models import Load, Model
+from warpnerf.model.interface import Load, Model
 
 
 @cache

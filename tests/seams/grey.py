@@ -6,7 +6,8 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warpnerf.model.models import Load, Model, register
+from warpnerf.model.interface import Load, Model
+from warpnerf.model.models import register
 
 
 @cache

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warpnerf.model.models import Load, Model
+from warpnerf.model.interface import Load, Model
 
 
 @cache

@@ -7,7 +7,8 @@ from dataclasses import fields, replace
 from typing import Any
 
 from warpnerf.checks import InputError, require_one_of
-from warpnerf.model.models import MODELS, Model, model_of
+from warpnerf.model.interface import Model
+from warpnerf.model.models import MODELS, model_of
 
 
 def chosen_model(begin: Model, name: str | None, options: Sequence[str]) -> Model:

@@ -13,7 +13,8 @@ from warpnerf_kernels.base import precision, tiles
 
 from warpnerf.config import Contraction, Scaling
 from warpnerf.model.grid import box_struct, density_struct, free_struct, grid_struct
-from warpnerf.model.models import Model, Rgb, n_weights
+from warpnerf.model.interface import Model, n_weights
+from warpnerf.model.models import Rgb
 from warpnerf.rendering.adjoint import AdjointLaunch, gradient_struct, n_tiles
 from warpnerf.rendering.rays import rays_struct
 from warpnerf.rendering.render import (

@@ -14,7 +14,8 @@ import numpy as np
 
 from warpnerf.checks import InputError, require_at_least, require_positive
 from warpnerf.config import PRESETS, TRAINING_BYTES, SceneKind, TrainConfig
-from warpnerf.model.models import Model, to_json
+from warpnerf.model.interface import Model
+from warpnerf.model.models import to_json
 from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.load import load_scene
 from warpnerf.scenes.scene import Scene, find_focus, share_aimed_at, up_direction

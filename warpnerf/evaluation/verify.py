@@ -28,7 +28,8 @@ from warpnerf.evaluation.gradient_check import (
     partly_free,
     stopping_early,
 )
-from warpnerf.model.models import Deferred, Features, Model, SphericalHarmonics
+from warpnerf.model.interface import Model
+from warpnerf.model.models import Deferred, Features, SphericalHarmonics
 from warpnerf.rendering.render import Steps
 from warpnerf.runtime.parallel import Workers
 from warpnerf.scenes.camera import Camera

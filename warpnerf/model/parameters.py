@@ -10,7 +10,7 @@ import warp as wp
 
 from warpnerf.config import OptimConfig
 from warpnerf.model.grid import VoxelGrid
-from warpnerf.model.models import Model
+from warpnerf.model.interface import Model
 from warpnerf.runtime.parallel import Workers
 
 

@@ -15,7 +15,7 @@ from warpnerf_kernels.base.types import real
 from warpnerf_kernels.cpu import schedule
 from warpnerf_kernels.launch import assembly
 
-from warpnerf.model.models import Model, n_weights
+from warpnerf.model.interface import Model, n_weights
 from warpnerf.runtime.parallel import LaunchCache, Workers
 
 SAMPLES = 1 << 21

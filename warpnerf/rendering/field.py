@@ -10,7 +10,7 @@ from warpnerf_kernels.base.types import real, vec3
 
 from warpnerf.checks import require_rays
 from warpnerf.model.grid import FreeCells, VoxelGrid
-from warpnerf.model.models import Model
+from warpnerf.model.interface import Model
 from warpnerf.rendering.rays import camera_rays
 from warpnerf.rendering.render import RenderedRays, Steps, render_rays
 from warpnerf.runtime.parallel import Workers

@@ -15,7 +15,7 @@ from warpnerf_kernels.volume import gradscale
 
 from warpnerf.config import Contraction, Jacobian, Scaling
 from warpnerf.model.grid import CONTRACTIONS, FreeCells, VoxelGrid
-from warpnerf.model.models import Model, loader, parts_of
+from warpnerf.model.interface import Model, loader, parts_of
 from warpnerf.rendering.adjoint import AdjointLaunch, Gradients
 from warpnerf.rendering.rays import RayBatch, rays_struct
 from warpnerf.runtime.parallel import Workers

@@ -23,7 +23,8 @@ from warpnerf_kernels.base.types import vector
 from warpnerf.checks import InputError
 from warpnerf.config import Contraction, TrainConfig, config_from_json, config_to_json
 from warpnerf.model.grid import FreeCells, VoxelGrid
-from warpnerf.model.models import MODELS, Model, Rgb, decode, n_weights, to_json
+from warpnerf.model.interface import Model, n_weights
+from warpnerf.model.models import MODELS, Rgb, decode, to_json
 from warpnerf.model.parameters import parameters_of
 from warpnerf.rendering.field import Field
 from warpnerf.rendering.render import Steps

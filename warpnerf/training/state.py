@@ -12,7 +12,7 @@ import warp as wp
 
 from warpnerf.checks import InputError
 from warpnerf.config import TrainConfig
-from warpnerf.model.models import Model
+from warpnerf.model.interface import Model
 from warpnerf.rendering.field import Field
 from warpnerf.scenes.scene import Scene
 

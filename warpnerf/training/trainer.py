@@ -14,7 +14,7 @@ from warpnerf_kernels.base.types import vector
 from warpnerf.checks import InputError
 from warpnerf.config import Contraction, TrainConfig
 from warpnerf.model.grid import FreeCells, VoxelGrid, grid_size, require_memory
-from warpnerf.model.models import Model, parts_of
+from warpnerf.model.interface import Model, parts_of
 from warpnerf.model.parameters import Parameter, first_weights, parameters_of
 from warpnerf.rendering.field import Field
 from warpnerf.rendering.rays import PixelSampler

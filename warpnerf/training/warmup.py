@@ -15,7 +15,7 @@ from warpnerf_kernels.sampling import occupancy
 from warpnerf_kernels.space import camera
 
 from warpnerf.config import PRESETS, Contraction, Jacobian, Scaling
-from warpnerf.model.models import Model
+from warpnerf.model.interface import Model
 from warpnerf.rendering.render import variant_of
 from warpnerf.runtime import kernel_cache
 from warpnerf.runtime.parallel import Workers

@@ -1,0 +1,211 @@
+"""What a model has to say: of which parts it is made, and what of them is trained and how.
+
+A model is a frozen value. It names the parts that ``warpnerf_kernels.launch.assembly`` puts
+together. ``warpnerf.model.models`` has those of the package.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import fields
+from functools import cache
+from types import ModuleType
+from typing import Any, ClassVar, Protocol
+
+import numpy as np
+
+from warpnerf.checks import InputError
+
+Load = Callable[[str], ModuleType]
+"""A module of the kernels, by its name in the package, in some precision."""
+
+
+class Rates(Protocol):
+    """What ``warpnerf.config.OptimConfig`` says of learning rates and total variation."""
+
+    @property
+    def learning_rate_density(self) -> float: ...  # noqa: D102
+    @property
+    def learning_rate_rgb(self) -> float: ...  # noqa: D102
+    @property
+    def tv_density(self) -> float: ...  # noqa: D102
+    @property
+    def tv_rgb(self) -> float: ...  # noqa: D102
+
+
+class Model(ABC):
+    """What a field stores, and how that becomes colour."""
+
+    name: ClassVar[str]
+    """What the command and files call it."""
+    learning_rate_mlp: float = 0.0
+    """Of the weights of the head's MLP, where it has one."""
+
+    @property
+    def relative_time(self) -> float:
+        """How long a step of training takes, about; rgb's is 1.
+
+        That is what its nodes cost, by benchmarks/models.py; a model with an MLP adds it.
+        """
+        return 0.72 + 0.07 * self.n_floats
+
+    def keep_plain(self) -> None:
+        """Make each field of a frozen dataclass a plain int, float or bool, as its default is.
+
+        So what files hold of it is read back as the same. For ``__post_init__``.
+
+        Raises:
+            InputError: A field whose default is a bool is given something else.
+        """
+        for f in fields(self):  # type: ignore[arg-type]
+            value, kind = getattr(self, f.name), type(f.default)
+            if kind is bool and not isinstance(value, bool | np.bool_):
+                raise InputError(f"model.{f.name} must be True or False, not {value!r}.")
+            if kind in (bool, int, float):
+                object.__setattr__(self, f.name, kind(value))
+
+    @property
+    @abstractmethod
+    def n_features(self) -> int:
+        """How many raw features a node has, besides its raw density."""
+
+    @property
+    def n_floats(self) -> int:
+        """Numbers of a node: density, features, and padding to a power of two, at least 4."""
+        return max(4, 1 << self.n_features.bit_length())
+
+    @abstractmethod
+    def parts(self, load: Load) -> Any:
+        """What the model is made of.
+
+        Args:
+            load: The kernels' modules, in the precision that is wanted.
+
+        Returns:
+            ``warpnerf_kernels.launch.assembly.Parts``.
+        """
+
+    def layout(self, load: Load) -> Any:
+        """The shape of the head's MLP.
+
+        Args:
+            load: The kernels' modules.
+
+        Returns:
+            ``warpnerf_kernels.heads.mlp.Layout``; None: the head has no MLP.
+        """
+        return None
+
+    def march(self, load: Load, steps: Any, device: Any) -> Any:
+        """The sampler's parameters, from ``warpnerf.rendering.render.Steps``.
+
+        Args:
+            load: The kernels' modules.
+            steps: What is configured.
+            device: The ``warp.Device`` where arrays among the parameters have to lie.
+
+        Returns:
+            The struct ``Params`` of the model's sampler.
+        """
+        return steps.struct(load("sampling.steps"))
+
+    def most_steps(self, steps: Any, length: float) -> int:
+        """How many steps a ray can take, at most: workers make room for as many.
+
+        Args:
+            steps: What is configured, ``warpnerf.rendering.render.Steps``.
+            length: Of the ray's way through the box, scene units; infinite where space is folded.
+
+        Returns:
+            That, or more.
+        """
+        return int(steps.most(length))
+
+    def first_weights(self, seed: int) -> np.ndarray:
+        """The MLP's weights before the first step.
+
+        Args:
+            seed: Of what is random.
+
+        Returns:
+            [n_weights] float32, as ``layout`` orders them; none without an MLP.
+        """
+        layout = self.layout(loader("float32"))
+        return np.zeros(0, np.float32) if layout is None else uniform_weights(layout, seed, 1.0)
+
+    def learning_rates(self, optim: Rates) -> np.ndarray:
+        """How far an update moves each number of a node, about, at the start.
+
+        Args:
+            optim: What is configured for all models.
+
+        Returns:
+            [n_floats]; 0 for padding.
+        """
+        rates = np.zeros(self.n_floats)
+        rates[0] = optim.learning_rate_density
+        rates[1 : 1 + self.n_features] = optim.learning_rate_rgb
+        return rates
+
+    def variation(self, optim: Rates) -> np.ndarray:
+        """How much each number of a node is smoothed by total variation.
+
+        Args:
+            optim: What is configured for all models.
+
+        Returns:
+            [n_floats] weights; 0 for padding.
+        """
+        weights = np.zeros(self.n_floats)
+        weights[0] = optim.tv_density
+        weights[1 : 1 + self.n_features] = optim.tv_rgb
+        return weights
+
+
+def n_weights(model: Model) -> int:
+    """Weights of a model's head; 0 without an MLP."""
+    layout = model.layout(loader("float32"))
+    return 0 if layout is None else int(layout.n_weights)
+
+
+@cache
+def parts_of(model: Model, precision: str) -> Any:
+    """A model's parts in float32 or float64."""
+    return model.parts(loader(precision))
+
+
+@cache
+def loader(precision: str) -> Load:
+    """The kernels' modules in float32 or float64; the same object each time, so a key for caches.
+
+    Args:
+        precision: float32 or float64.
+    """
+
+    def load(module: str) -> ModuleType:
+        from warpnerf_kernels.base import precision as precisions
+
+        return precisions.load(precision, module)
+
+    return load
+
+
+def uniform_weights(layout: Any, seed: int, of_output: float) -> np.ndarray:
+    """Weights between +-1 / sqrt(inputs of their layer), the output's that times a factor.
+
+    So are hidden biases; the output's are 0. That is how torch.nn.Linear begins, and DVGO.
+    """
+    rng = np.random.default_rng(seed)
+    weights = np.zeros(layout.n_weights, np.float32)
+
+    def fill(begin: int, end: int, n_inputs: int) -> None:
+        limit = 1.0 / np.sqrt(n_inputs)
+        weights[begin:end] = rng.uniform(-limit, limit, end - begin)
+
+    fill(0, layout.at_hidden, layout.n_inputs)
+    fill(layout.at_hidden, layout.at_output, layout.width)
+    last = weights[layout.at_output :].reshape(-1, 4)
+    limit = of_output / np.sqrt(layout.width)
+    last[:-1, :3] = rng.uniform(-limit, limit, (layout.width, 3))
+    return weights
