@@ -19,7 +19,7 @@ from measuring import Stopwatch, add_model, machine, median_interval, options, s
 from training import path_of
 from warpnerf_kernels.base.types import vec3
 from warpnerf_kernels.cpu import schedule
-from warpnerf_kernels.launch import assembly
+from warpnerf_kernels.launch import packed
 
 import warpnerf as wn
 from warpnerf.rendering.rays import PixelSampler
@@ -114,12 +114,13 @@ def as_drawn(field: wn.Field, workers: Workers) -> wp.Kernel:
     variant = variant_of(
         field.model, "float32", field.grid.contraction, "clamped", "none", packed=True
     )
-    # Both made anew, for what is kept of them has the cells.
+    # All made anew, for what is kept of them has the cells.
     with (
         mock.patch.object(schedule, "cell_at", cell_of_slab),
-        mock.patch.object(assembly, "ray_schedule", schedule.ray_schedule.__wrapped__),
+        mock.patch.object(packed, "ray_schedule", schedule.ray_schedule.__wrapped__),
+        mock.patch.object(packed, "ray_taker", packed.ray_taker.__wrapped__),
     ):
-        kernel = assembly._train_packs.__wrapped__(variant)
+        kernel = packed.train.__wrapped__(variant)
         workers.load(kernel)
     return kernel
 

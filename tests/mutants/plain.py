@@ -22,10 +22,10 @@ SCALING = (
 TRAINING = "test_kernel_render.py::test_training_launch_against_autograd[none-quadratic-none]"
 
 MUTANTS = [
-    # assembly.py, walk.py and compositing.py: values
-    Mutant("background forgotten", "launch/assembly.py",
+    # scalar.py, walk.py and compositing.py: values
+    Mutant("background forgotten", "launch/scalar.py",
            "rgb + total.transmittance * ray_value(rays.background, i)", "rgb", VALUES),
-    Mutant("background of ray 0", "launch/assembly.py",
+    Mutant("background of ray 0", "launch/scalar.py",
            "behind_all = ray_value(rays.background, i)",
            "behind_all = ray_value(rays.background, 0)", TRAINING),
     Mutant("attenuated twice", "volume/walk.py",
@@ -45,7 +45,7 @@ MUTANTS = [
            "if total.transmittance < scene.march.transmittance_min:\n",
            "if total.transmittance < scene.march.transmittance_min * matter.attenuation:\n",
            VALUES),
-    # assembly.py, walk.py and compositing.py: adjoint
+    # scalar.py, walk.py and compositing.py: adjoint
     Mutant("sign of the suffix", "volume/walk.py",
            "(transmittance * adj_weight - behind)",
            "(transmittance * adj_weight + behind)", ADJOINT),
@@ -54,14 +54,14 @@ MUTANTS = [
            "            scale_of_next = matter.attenuation\n            scale", ADJOINT),
     Mutant("T_end term dropped", "volume/walk.py",
            "            + adj_transmittance * total.transmittance\n", "", ADJOINT),
-    Mutant("opacity's sign", "launch/assembly.py",
+    Mutant("opacity's sign", "launch/scalar.py",
            "        adj_transmittance = wp.dot(adj_rgb[i], ray_value(rays.background, i)) - adj_opacity[i]",
            "        adj_transmittance = wp.dot(adj_rgb[i], ray_value(rays.background, i)) + adj_opacity[i]",
            ADJOINT),
-    Mutant("background term dropped", "launch/assembly.py",
+    Mutant("background term dropped", "launch/scalar.py",
            "        adj_transmittance = wp.dot(adj_rgb[i], ray_value(rays.background, i)) - adj_opacity[i]",
            "        adj_transmittance = -adj_opacity[i]", ADJOINT),
-    Mutant("background term dropped, training", "launch/assembly.py",
+    Mutant("background term dropped, training", "launch/scalar.py",
            "wp.dot(adj_rgb, behind_all) - adj_opacity", "-adj_opacity", TRAINING),
     Mutant("depth term dropped", "volume/walk.py",
            "adj_weight = adj_depth * sample.t + adj_loss_value", "adj_weight = adj_loss_value", ADJOINT),
@@ -83,10 +83,10 @@ MUTANTS = [
     Mutant("scale from the step's start", "volume/walk.py",
            "                sample.t, content_distance",
            "                sample.t - real(0.5) * sample.dt, content_distance", SCALING),
-    Mutant("content distance of ray 0", "launch/assembly.py",
-           "ray_value(rays.content_distance, i)", "ray_value(rays.content_distance, 0)", SCALING, 1, 4),
-    Mutant("content distance of ray 0, training", "launch/assembly.py",
-           "ray_value(rays.content_distance, i)", "ray_value(rays.content_distance, 0)", TRAINING, 2, 4),
+    Mutant("content distance of ray 0", "launch/scalar.py",
+           "ray_value(rays.content_distance, i)", "ray_value(rays.content_distance, 0)", SCALING, 1, 2),
+    Mutant("content distance of ray 0, training", "launch/scalar.py",
+           "ray_value(rays.content_distance, i)", "ray_value(rays.content_distance, 0)", TRAINING, 2, 2),
     Mutant("last sample not replayed", "volume/walk.py",
            "for _n in range(total.n_samples):", "for _n in range(total.n_samples - 1):", ADJOINT),
     Mutant("bound on what lies behind dropped", "volume/compositing.py",

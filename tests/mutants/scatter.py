@@ -147,7 +147,7 @@ MUTANTS = [
            "        sink.n_addressed[worker, receiver] = 0\n", "        pass\n",
            "test_kernel_scatter.py::test_rays_in_chunks[none]"),
     # which rays are whose
-    Mutant("rays as they come", "launch/assembly.py",
+    Mutant("rays as they come", "launch/packed.py",
            "i = chunk.rays[worker, begin + r]", "i = begin + r",
            "test_kernel_scatter.py::test_nothing_is_left_where_each_takes_its_own_rays", 1, 5),
 ]  # fmt: skip

@@ -83,7 +83,7 @@ def gradient_struct(
 
 
 class AdjointLaunch:
-    """One of assembly.py's kernels that end in a gradient, for batches of rays.
+    """A kernel that ends in a gradient, for batches of rays.
 
     On the CPU packed kernels leave part of it in records, and deliver these once all rays are
     through. Plain ones add to it directly: atomically on CUDA, and on one thread of the CPU.

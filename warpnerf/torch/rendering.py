@@ -1,0 +1,158 @@
+"""Rendering of rays as a torch operation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple, get_args
+
+import numpy as np
+import torch
+
+from warpnerf.checks import InputError, require_at_least, require_one_of, require_positive
+from warpnerf.config import Scaling
+from warpnerf.model.interface import Model
+from warpnerf.model.models import model_of
+from warpnerf.rendering.render import Steps
+from warpnerf.torch.launches import Call, Render
+from warpnerf.torch.tensors import (
+    corner_of,
+    flat_head,
+    rays_of,
+    require_dense,
+    require_grid,
+)
+
+MAX_STEPS = 1e9
+"""Steps that a ray can count, from its origin on."""
+
+
+class RenderedRays(NamedTuple):
+    """What rays see."""
+
+    rgb: torch.Tensor
+    """[n_rays, 3], with background."""
+    opacity: torch.Tensor
+    """[n_rays] in [0, 1]."""
+    depth: torch.Tensor
+    """[n_rays] sum of weight times t, scene units."""
+
+
+def render_rays(
+    raw: torch.Tensor,
+    origins: torch.Tensor,
+    directions: torch.Tensor,
+    box_min: Sequence[float] | torch.Tensor,
+    box_max: Sequence[float] | torch.Tensor,
+    *,
+    step: float,
+    near: float = 0.0,
+    far: float | None = None,
+    density_shift: float = 0.0,
+    background: Sequence[float] | torch.Tensor = (1.0, 1.0, 1.0),
+    scaling: Scaling = "none",
+    content_distance: float | torch.Tensor = 1.0,
+    model: str | Model = "rgb",
+    head: Iterable[torch.Tensor] = (),
+) -> RenderedRays:
+    """Render rays through a grid of raw values, differentiable with respect to these and the head.
+
+    Samples sit at t = near + (k + 1/2) step for every k >= 0 whose point lies in the box and whose
+    t is below far; sigma = softplus(raw density + density_shift), and c as the model says, for rgb
+    sigmoid(raw rgb);
+
+        rgb = sum_k T_k alpha_k c_k + T_end background,  alpha_k = 1 - exp(-sigma_k step)
+
+    The gradient is warpnerf's hand-written adjoint (kernels/README.md), in which each sample's
+    share is multiplied by its distance scaling. It is then the gradient of no loss: see the paper.
+
+    Args:
+        raw: [X, Y, Z, 1 + n_features] raw density and raw features, of rgb raw r, g, b, at nodes
+            box_min + index (box_max - box_min) / (size - 1); float32 or float64, CPU or CUDA.
+        origins: [n_rays, 3] scene units, on the same device.
+        directions: [n_rays, 3] of unit length.
+        box_min: [3] lower corner, scene units.
+        box_max: [3] upper corner.
+        step: Length of a step, scene units.
+        near: Where the first step begins, scene units.
+        far: No sample at or beyond it, scene units; None: where the box ends.
+        density_shift: Added to raw densities before their activation.
+        background: [3] or [n_rays, 3], rgb.
+        scaling: none, quadratic or clamped.
+        content_distance: Where gradients reach full strength, scene units; a number or [n_rays].
+        model: rgb, sh, deferred, features, or a model from ``warpnerf.model.models``.
+        head: The model's MLP, as torch.nn.Linear holds it: weight [outputs, inputs] and bias
+            [outputs] of each layer, in turn. Inputs are channels or features, then the encoded
+            direction. Its gradient is scaled where it passes samples, so for features.
+
+    Returns:
+        rgb [n_rays, 3], opacity [n_rays] and depth [n_rays], of raw's type and device.
+
+    Raises:
+        InputError: A shape, type, device or number does not fit.
+    """
+    require_one_of("scaling", scaling, get_args(Scaling))
+    require_positive("step", step)
+    require_at_least("near", near, 0.0)
+    if far is not None and not far > near:
+        raise InputError(f"far must lie beyond near, not at {far}.")
+    if not math.isfinite(density_shift):
+        raise InputError(f"density_shift must be finite, not {density_shift}.")
+    if isinstance(model, str):
+        model = model_of(model)
+    if not isinstance(model, Model):
+        raise InputError(f"model must be a name or a model, not {model!r}.")
+    require_grid(raw, model)
+    weights = flat_head(list(head), model, raw)
+    if raw.shape[3] < model.n_floats:
+        raw = torch.nn.functional.pad(raw, (0, model.n_floats - raw.shape[3]))
+    corners = corner_of("box_min", box_min), corner_of("box_max", box_max)
+    if not (corners[0] < corners[1]).all():
+        raise InputError(
+            f"box_max must lie above box_min on every axis, not {corners[1]} over {corners[0]}."
+        )
+    rays = rays_of("origins", origins, raw), rays_of("directions", directions, raw)
+    if len(rays[0]) != len(rays[1]):
+        raise InputError(
+            f"origins and directions must be equally many, not {len(rays[0])} and {len(rays[1])}."
+        )
+    length = rays[1].norm(dim=1)
+    if len(length) and not bool(((length - 1.0).abs() < 1e-3).all()):
+        raise InputError(
+            "directions must be unit vectors, so that t is a distance; divide them by their length."
+        )
+    reach = (
+        float((rays[0] - rays[0].new_tensor((corners[0] + corners[1]) / 2)).norm(dim=1).max())
+        if len(rays[0])
+        else 0.0
+    )
+    reach += float(np.linalg.norm(corners[1] - corners[0]))
+    if reach / step > MAX_STEPS:
+        raise InputError(
+            f"step {step:g} is too short for rays that reach {reach:g} scene units: more than "
+            f"{MAX_STEPS:g} steps; use a longer step, or scale the scene."
+        )
+    for field, value in (("background", background), ("content_distance", content_distance)):
+        require_dense(field, value)
+    behind = torch.as_tensor(background, dtype=raw.dtype, device=raw.device).detach()
+    if behind.shape not in ((3,), (len(rays[0]), 3)) or not bool(behind.isfinite().all()):
+        raise InputError(
+            f"background must be finite rgb, [3] or [n_rays, 3], not {list(behind.shape)}."
+        )
+    content = torch.as_tensor(content_distance, dtype=raw.dtype, device=raw.device).detach()
+    if content.shape not in ((), (1,), (len(rays[0]),)) or not bool((content > 0).all()):
+        raise InputError(
+            "content_distance must be above 0: a number or [n_rays], "
+            f"not {content.tolist() if content.dim() == 0 else list(content.shape)}."
+        )
+    steps = Steps(near=near, far=min(1e30, math.inf if far is None else far), step=step)
+    call = Call(
+        corners=corners,
+        steps=steps,
+        density_shift=density_shift,
+        background=behind.reshape(-1, 3).contiguous(),
+        scaling=scaling,
+        content_distance=content.reshape(-1).contiguous(),
+        model=model,
+    )
+    return RenderedRays(*Render.apply(raw, weights, *rays, call))
