@@ -1,0 +1,304 @@
+"""warpnerf as a method of nerfbaselines: ``nerfbaselines train --method warpnerf``.
+
+nerfbaselines imports this module through the entry point ``nerfbaselines.specs``; nothing else of
+warpnerf does. Its cameras have OpenCV axes and lengths as in the dataset's files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from nerfbaselines import register
+
+from warpnerf.checks import InputError
+from warpnerf.config import PRESETS, TrainConfig
+from warpnerf.scenes.camera import Camera
+from warpnerf.scenes.scene import Scene, View, estimate_extent
+from warpnerf.training.checkpoint import load_checkpoint, save_checkpoint
+from warpnerf.training.state import TrainingState
+from warpnerf.training.trainer import Trainer
+
+LENSES = ("pinhole", "opencv", "opencv_fisheye", "full_opencv")
+"""The lenses of nerfbaselines, by the number that its cameras hold."""
+READ_LENSES = ("pinhole", "opencv")
+
+CHECKPOINT = "checkpoint.safetensors"
+
+OPTIONS: dict[str, type] = {
+    "preset": str,
+    "model": str,
+    "scaling": str,
+    "steps": int,
+    "rays_per_step": int,
+    "seed": int,
+    "threads": int,
+    "voxels": int,
+    "content_distance": float,
+    "device": str,
+}
+"""What --set takes, and how each is read; fields of ``TrainConfig`` and ``GridConfig``."""
+
+
+class WarpnerfMethod:
+    """A training, or what one has left, behind the interface ``nerfbaselines.Method``.
+
+    An iteration is a step of training, a batch of rays. Later in a training one update follows
+    several steps, so the first iteration of these does the work of all.
+    """
+
+    def __init__(
+        self,
+        *,
+        checkpoint: str | None = None,
+        train_dataset: Any = None,
+        config_overrides: dict[str, Any] | None = None,
+    ) -> None:
+        """Begin a training, go on with one, or open what it has left.
+
+        Args:
+            checkpoint: A folder that ``save`` wrote; None: begin anew.
+            train_dataset: Photographs and cameras; None: only to render.
+            config_overrides: Names and values of ``OPTIONS``, for a new training.
+
+        Raises:
+            InputError: There is nothing to begin with, or an option does not fit.
+        """
+        state = None if checkpoint is None else load_checkpoint(Path(checkpoint) / CHECKPOINT)
+        self._checkpoint = checkpoint
+        self._loaded_step = None if state is None else state.progress.step
+        self._trainer: Trainer | None = None
+        self._state = state
+        if train_dataset is not None:
+            background = train_dataset["metadata"].get("background_color")
+            config = (
+                configured(config_overrides or {}, background) if state is None else state.config
+            )
+            self._trainer = Trainer(scene_of(train_dataset), config, state)
+            self._config = config
+        elif state is not None:
+            self._config = state.config
+        else:
+            raise InputError("there is nothing to render: give a checkpoint or a dataset.")
+
+    @classmethod
+    def get_method_info(cls) -> dict[str, Any]:
+        """What the method takes and gives."""
+        return {
+            "method_id": "warpnerf",
+            "required_features": frozenset(("color",)),
+            "supported_camera_models": frozenset(READ_LENSES),
+            "supported_outputs": ("color", "depth", "accumulation"),
+            "can_resume_training": True,
+        }
+
+    def get_info(self) -> dict[str, Any]:
+        """The same, and of this training its length, where it began and its configuration."""
+        config = asdict(self._config)
+        plain = {k: v for k, v in config.items() if isinstance(v, int | float | str | bool)}
+        return {
+            **self.get_method_info(),
+            "num_iterations": self._config.steps,
+            "loaded_step": self._loaded_step,
+            "loaded_checkpoint": self._checkpoint,
+            "batch_size": self._config.rays_per_step,
+            "hparams": plain,
+        }
+
+    def get_train_embedding(self, index: int) -> None:
+        """None: photographs have no embeddings."""
+
+    def optimize_embedding(self, dataset: Any, *, embedding: Any = None) -> dict[str, Any]:
+        """Refuse it: photographs have no embeddings.
+
+        Raises:
+            InputError: Always.
+        """
+        raise InputError("warpnerf has no embeddings of photographs to optimise.")
+
+    def train_iteration(self, step: int) -> dict[str, float]:
+        """Update, unless the last update went beyond this step already.
+
+        Args:
+            step: Steps before it.
+
+        Returns:
+            Loss and PSNR of the last batch of rays.
+        """
+        trainer = self._trainer
+        if trainer is None:
+            raise InputError("this was opened to render; give the dataset to train.")
+        while trainer.steps_done <= step:
+            trainer.update()
+        if not trainer.report_due:
+            return {"num_rays": self._config.rays_per_step}
+        progress = trainer.report()
+        return {
+            "num_rays": self._config.rays_per_step,
+            "loss": progress.loss,
+            "psnr": progress.psnr,
+        }
+
+    def render(
+        self, camera: Any, *, options: dict[str, Any] | None = None
+    ) -> dict[str, np.ndarray]:
+        """Look through a camera of nerfbaselines.
+
+        Args:
+            camera: One.
+            options: Which ``outputs`` are wanted, None: all; and by ``output_type_dtypes`` whether
+                color shall be float32.
+
+        Returns:
+            color [H, W, 3] uint8, depth [H, W] in the dataset's units, and accumulation [H, W],
+            both float32. Color is rounded to 8 bits here: nerfbaselines would cut it off, which
+            costs up to 0.1 dB.
+        """
+        seen = self._standing().field.render(camera_of(camera.item()))
+        color = seen.rgb
+        if (options or {}).get("output_type_dtypes", {}).get("color", "uint8") == "uint8":
+            color = np.rint(color * 255.0).astype(np.uint8)
+        outputs = {"color": color, "depth": seen.depth, "accumulation": seen.opacity}
+        wanted = (options or {}).get("outputs") or tuple(outputs)
+        return {name: outputs[name] for name in wanted if name in outputs}
+
+    def save(self, path: str) -> None:
+        """Write all that it takes to go on and to render.
+
+        Args:
+            path: A folder, which is made where it is missing.
+        """
+        Path(path).mkdir(parents=True, exist_ok=True)
+        save_checkpoint(Path(path) / CHECKPOINT, self._standing())
+
+    def _standing(self) -> TrainingState:
+        """The training as it stands, or as it was when it was saved."""
+        if self._trainer is not None:
+            return self._trainer.state()
+        assert self._state is not None
+        return self._state
+
+
+def configured(overrides: dict[str, Any], background: np.ndarray | None) -> TrainConfig:
+    """The configuration that --set asks for.
+
+    Args:
+        overrides: Names and values of ``OPTIONS``; a preset, "fast" unless named, is the start.
+        background: [3] uint8, what is behind the photographs of the dataset, if it says so.
+
+    Raises:
+        InputError: A name is unknown, or a value does not fit.
+    """
+    given: dict[str, Any] = {}
+    for name, value in overrides.items():
+        if name not in OPTIONS:
+            raise InputError(f"--set {name}: there is no such option; use {', '.join(OPTIONS)}.")
+        kind = OPTIONS[name]
+        try:
+            given[name] = value if value == "auto" else kind(value)
+        except ValueError:
+            raise InputError(f"--set {name} must be {kind.__name__}, not {value!r}.") from None
+    preset = given.pop("preset", "fast")
+    if preset not in PRESETS:
+        raise InputError(f"--set preset must be {' or '.join(PRESETS)}, not {preset!r}.")
+    config = PRESETS[preset]
+    if "voxels" in given:
+        given["grid"] = replace(config.grid, voxels=given.pop("voxels"))
+    if background is not None:
+        given["background"] = tuple(float(c) / 255.0 for c in background)
+    return replace(config, **given)
+
+
+def scene_of(dataset: Any) -> Scene:
+    """A scene of the training photographs of a dataset.
+
+    Args:
+        dataset: ``nerfbaselines.Dataset`` with its images loaded.
+
+    Raises:
+        InputError: A lens is of a kind that is not read, or cameras do not make a scene.
+    """
+    cameras, images = dataset["cameras"], dataset["images"]
+    names = _names(dataset["image_paths"], dataset["image_paths_root"])
+    views = []
+    for index, name in enumerate(names):
+        camera = camera_of(cameras[index])
+        image = np.asarray(images[index])[: camera.height, : camera.width]
+        views.append(View(name=name, camera=camera, image=np.ascontiguousarray(image)))
+    order = sorted(range(len(views)), key=lambda i: views[i].name)
+    views = [views[i] for i in order]
+    see_through = [v.image.shape[2] == 4 and bool((v.image[..., 3] < 255).any()) for v in views]
+    unbounded = sum(see_through) < len(views) / 2
+    extent = estimate_extent([view.camera for view in views], unbounded=unbounded)
+    return Scene(
+        name=str(dataset["metadata"].get("scene") or "dataset"),
+        views=views,
+        splits={"train": tuple(range(len(views))), "test": ()},
+        box_min=extent.box_min,
+        box_max=extent.box_max,
+        unbounded=unbounded,
+        content_distance=extent.content_distance,
+        notes=extent.notes,
+    )
+
+
+def camera_of(camera: Any) -> Camera:
+    """One camera of nerfbaselines as ours.
+
+    Args:
+        camera: Its pose [3, 4] camera to world in OpenCV axes, fx, fy, cx, cy in pixels, and
+            k1, k2, p1, p2 of OpenCV.
+
+    Raises:
+        InputError: The lens is of a kind that is not read.
+    """
+    lens = LENSES[int(camera.camera_models)]
+    if lens not in READ_LENSES:
+        raise InputError(
+            f"lenses of the kind {lens} are not read; undistort the photographs to one of "
+            f"{', '.join(READ_LENSES)}."
+        )
+    fx, fy, cx, cy = (float(value) for value in camera.intrinsics)
+    k = np.zeros(4)
+    if lens != "pinhole":
+        k[: len(camera.distortion_parameters)] = camera.distortion_parameters[:4]
+    c2w = np.array(camera.poses, np.float64)[:3, :4]
+    c2w[:, 1:3] *= -1.0  # from OpenCV's axes to OpenGL's
+    width, height = (int(value) for value in camera.image_sizes)
+    return Camera(
+        width=width,
+        height=height,
+        fx=fx,
+        fy=fy,
+        cx=cx,
+        cy=cy,
+        c2w=c2w,
+        k1=float(k[0]),
+        k2=float(k[1]),
+        p1=float(k[2]),
+        p2=float(k[3]),
+    )
+
+
+def _names(paths: Sequence[str], root: str) -> list[str]:
+    return [Path(path).relative_to(root).as_posix() if root else path for path in paths]
+
+
+register(
+    {
+        "id": "warpnerf",
+        "method_class": "warpnerf.nerfbaselines:WarpnerfMethod",
+        "metadata": {
+            "name": "warpnerf",
+            "description": "Voxel-grid radiance fields with NVIDIA Warp, on the CPU or on CUDA; "
+            "gradients are scaled by distance, so that fewer floaters grow near the cameras.",
+        },
+        "presets": {name: {"preset": name} for name in PRESETS},
+        "required_features": ["color"],
+        "supported_camera_models": list(READ_LENSES),
+        "supported_outputs": ["color", "depth", "accumulation"],
+    }
+)
