@@ -27,6 +27,11 @@ PARAMETERS = {
     "RADIAL": (10.0, 4.25, 2.75, -0.05, 0.01),
     "OPENCV": (10.0, 11.0, 4.25, 2.75, -0.05, 0.01, 0.002, -0.001),
     "FULL_OPENCV": (10.0, 11.0, 4.25, 2.75, -0.05, 0.01, 0.002, -0.001, 0.003, 0.0, 0.0, 0.0),
+    "OPENCV_FISHEYE": (10.0, 11.0, 4.25, 2.75, -0.05, 0.01, 0.002, -0.001),
+    "SIMPLE_RADIAL_FISHEYE": (10.0, 4.25, 2.75, -0.05),
+    "RADIAL_FISHEYE": (10.0, 4.25, 2.75, -0.05, 0.01),
+    "SIMPLE_FISHEYE": (10.0, 4.25, 2.75),
+    "FISHEYE": (10.0, 11.0, 4.25, 2.75),
 }
 
 
@@ -128,13 +133,15 @@ def test_every_lens(tmp_path: Path, model: str, text: bool) -> None:
     scene_with_model(tmp_path, model=model, text=text)
     camera = load_scene(tmp_path).views[0].camera
     given = PARAMETERS[model]
-    one_focal = model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+    one_focal = model.startswith("SIMPLE") or model.startswith("RADIAL")
     assert (camera.fx, camera.fy) == (given[0], given[0] if one_focal else given[1])
     rest = given[1 if one_focal else 2 :]
     assert (camera.cx, camera.cy) == rest[:2]
-    names = ("k1", "k2", "p1", "p2", "k3")
+    assert camera.fisheye == ("FISHEYE" in model)
+    names = ("k1", "k2", "k3", "k4") if camera.fisheye else ("k1", "k2", "p1", "p2", "k3")
     found = tuple(getattr(camera, name) for name in names)
-    assert found == (*rest[2:7], *[0.0] * (5 - len(rest[2:7])))
+    given = rest[2 : 2 + len(names)]
+    assert found == (*given, *[0.0] * (len(names) - len(given)))
 
 
 def test_reduced_photographs_have_a_reduced_lens(tmp_path: Path) -> None:
@@ -155,8 +162,8 @@ def change(file: Path, before: str, after: str) -> None:
     file.write_text(text.replace(before, after))
 
 
-def fisheye(model: Path) -> None:
-    change(model / "cameras.txt", "7 PINHOLE", "7 OPENCV_FISHEYE")
+def field_of_view(model: Path) -> None:
+    change(model / "cameras.txt", "7 PINHOLE", "7 FOV")
 
 
 def other_camera(model: Path) -> None:
@@ -204,7 +211,7 @@ def empty_model(model: Path) -> None:
 @pytest.mark.parametrize(
     ("act", "says"),
     [
-        (fisheye, "camera 7: the lens OPENCV_FISHEYE is not modelled; undistort"),
+        (field_of_view, "camera 7: the lens FOV is not modelled; undistort"),
         (other_camera, "its camera 8 is not in cameras.txt"),
         (no_photographs, r"none of the model\'s 4 photographs is in .*images .first: 000.png"),
         (no_folder, "the model's photographs are not there; put them into .*images"),

@@ -10,6 +10,7 @@ import warp as wp
 from drive import Kernels, unit
 
 from warpnerf.runtime.parallel import NODES
+from warpnerf.scenes.fisheye import largest_angle
 
 LENSES: list[dict[str, float]] = [
     {},
@@ -23,6 +24,14 @@ LENSES: list[dict[str, float]] = [
 ]
 # Where Newton's method alone goes astray, the oracle's too.
 TWISTED = {"k1": 1.6, "k2": -1.9, "k3": -0.6, "p1": -0.005, "p2": 0.006}
+# k1 to k4; the first sees 49 degrees to a corner, the second 86, the third 126.
+FISHEYES: list[tuple[float, float, float, float]] = [
+    (-0.04, 0.02, -0.006, 0.0008),
+    (0.08, -0.03, 0.01, -0.001),
+    (-0.06, 0.01, 0.0, 0.0),
+]
+WIDER = (1.0, 0.5, 0.4)
+"""Focal lengths of these lenses, times FX and FY."""
 FX, FY, CX, CY, WIDTH, HEIGHT = 62.0, 58.0, 41.0, 29.6, 80, 60
 
 
@@ -93,6 +102,84 @@ def test_float32_rays(kernels32: Kernels) -> None:
         directions = rays(kernels32, pose(3), lens)[1]
         np.testing.assert_allclose(directions, expected_rays(pose(3), lens)[1], rtol=0, atol=1e-6)
         np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1.0, atol=3e-7)
+
+
+def fisheye_view(kernels: Kernels, number: int) -> Any:
+    k1, k2, k3, k4 = FISHEYES[number]
+    return view(
+        kernels,
+        pose(number),
+        {"k1": k1, "k2": k2, "k3": k3},
+        focal=kernels.types.vec2(WIDER[number] * FX, WIDER[number] * FY),
+        fisheye=1,
+        k4=k4,
+        angle_max=largest_angle(FISHEYES[number]),
+    )
+
+
+def fisheye_directions(kernels: Kernels, view: Any) -> Any:
+    n, vec3 = WIDTH * HEIGHT, kernels.types.vec3
+    origins, directions = kernels.zeros(n, vec3), kernels.zeros(n, vec3)
+    camera = kernels.module("space.camera")
+    kernels.workers.launch(camera.camera_rays, n, view, origins, directions)
+    return directions.numpy()
+
+
+def expected_fisheye(number: int) -> Any:
+    v, u = np.divmod(np.arange(WIDTH * HEIGHT), WIDTH)
+    focal = WIDER[number] * FX, WIDER[number] * FY
+    return reference.fisheye_rays(*focal, CX, CY, pose(number), u, v, k=FISHEYES[number])[1]
+
+
+@pytest.mark.parametrize("number", range(len(FISHEYES)))
+def test_fisheye_rays_against_the_oracle(number: int, kernels64: Kernels) -> None:
+    expected = expected_fisheye(number)
+    found = fisheye_directions(kernels64, fisheye_view(kernels64, number))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+    farthest = np.degrees(np.arccos((expected @ -pose(number)[:, 2]).min()))
+    assert farthest == pytest.approx((49.0, 86.0, 126.0)[number], abs=1.0)
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_fisheye_rays_against_opencv(number: int, kernels64: Kernels) -> None:
+    """projectPoints brings a point on each ray back to the pixel centre, where it is ahead."""
+    directions = fisheye_directions(kernels64, fisheye_view(kernels64, number))
+    in_camera = directions @ pose(number)[:, :3] * [1.0, -1.0, -1.0]
+    ahead = in_camera[:, 2] > 0.02
+    assert ahead.mean() > 0.99
+    fx, fy = WIDER[number] * FX, WIDER[number] * FY
+    matrix = np.array([[fx, 0, CX], [0, fy, CY], [0, 0, 1]])
+    back = cv2.fisheye.projectPoints(
+        3.0 * in_camera[None, ahead], np.zeros(3), np.zeros(3), matrix, np.array(FISHEYES[number])
+    )[0][0]
+    v, u = np.divmod(np.arange(WIDTH * HEIGHT), WIDTH)
+    np.testing.assert_allclose(back, np.stack([u, v], axis=-1)[ahead] + 0.5, rtol=0, atol=1e-8)
+
+
+def test_float32_fisheye_rays(kernels32: Kernels) -> None:
+    for number in range(len(FISHEYES)):
+        found = fisheye_directions(kernels32, fisheye_view(kernels32, number))
+        np.testing.assert_allclose(found, expected_fisheye(number), rtol=0, atol=2e-6)
+        np.testing.assert_allclose(np.linalg.norm(found, axis=-1), 1.0, atol=3e-7)
+
+
+def test_beyond_what_a_fisheye_sees_is_its_rim(kernels64: Kernels) -> None:
+    # theta - 0.2 theta^3 rises up to theta^2 = 1 / 0.6, where it is 0.86.
+    view = fisheye_view(kernels64, 0)
+    view.radial, view.k4 = kernels64.types.vec3(-0.2, 0.0, 0.0), 0.0
+    view.focal = kernels64.types.vec2(30.0, 30.0)
+    view.angle_max = largest_angle((-0.2, 0.0, 0.0, 0.0))
+    assert view.angle_max == pytest.approx(np.sqrt(0.99 / 0.6), abs=1e-3)
+    directions = fisheye_directions(kernels64, view) @ pose(0)[:, :3]
+    v, u = np.divmod(np.arange(WIDTH * HEIGHT), WIDTH)
+    x, y = (u + 0.5 - CX) / 30.0, (v + 0.5 - CY) / 30.0
+    beyond = np.hypot(x, y) > 0.87
+    angles = np.arccos(-directions[:, 2])
+    assert 0.3 < beyond.mean() < 0.9
+    np.testing.assert_allclose(angles[beyond], view.angle_max, atol=1e-6)
+    assert (angles[~beyond] < view.angle_max).all()
+    turn = np.arctan2(directions[:, 1], directions[:, 0])
+    np.testing.assert_allclose(turn, np.arctan2(-y, x), atol=1e-12)
 
 
 def draw(

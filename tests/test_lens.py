@@ -5,13 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 from tiny_scenes import camera_at
 
 from warpnerf.checks import InputError
 from warpnerf.scenes.camera import Camera
-from warpnerf.scenes.lens import LensFields, has_invertible_distortion, read_lens
+from warpnerf.scenes.lens import LensFields, read_lens
+from warpnerf.scenes.undistort import directions, has_invertible_distortion, seen_pixels
 
 FILE = Path("scene/transforms.json")
 POSE = np.eye(3, 4)
@@ -71,8 +73,14 @@ def test_known_models_are_accepted(model: str) -> None:
         (LensFields(fl_x=10.0, cy=1e5), r"\.cy: means a principal point at 100000 pixels"),
         (LensFields(fl_x=10.0, k2=np.inf), r"\.k2: inf is not a finite number"),
         (LensFields(fl_x=10.0, k4=0.1), r"\.k4: is not modelled unless it is 0; undistort"),
-        (LensFields(fl_x=10.0, is_fisheye=True), r"\.is_fisheye: that lens is not modelled"),
-        (LensFields(fl_x=10.0, camera_model="OPENCV_FISHEYE"), r"\.camera_model: 'OPENCV_FISHEYE'"),
+        (LensFields(fl_x=10.0, camera_model="FISHEYE624"), r"\.camera_model: 'FISHEYE624' is none"),
+        (LensFields(fl_x=10.0, is_fisheye=True, p1=0.1), r"\.p1: a fisheye lens has no tangential"),
+        (LensFields(fl_x=10.0, is_fisheye=True, k5=0.1), r"\.k5: is not modelled unless it is 0"),
+        (
+            LensFields(camera_angle_x=1.0, is_fisheye=True),
+            r"\.camera_angle_x: does not give a fisheye lens's focal length; add fl_x",
+        ),
+        (LensFields(fl_x=4.0, is_fisheye=True, k1=-4.0), r"\.k1 = -4 folds over within the image"),
         (LensFields(fl_x=10.0, w=16.0, h=12.0), r"\.w: .* 16x12 pixels, but a\.png has 8x6"),
         (LensFields(fl_x=10.0, w=8.0, h=12.0), r"\.h: .* 8x12 pixels, but a\.png has 8x6"),
         (LensFields(fl_x=10.0, w=6.0, h=8.0), r"\.w: .* 6x8 pixels, but a\.png has 8x6"),
@@ -87,6 +95,84 @@ def test_bad_lens_is_refused_by_name(frame: LensFields, message: str) -> None:
 def test_message_names_the_level_that_is_wrong() -> None:
     with pytest.raises(InputError, match=r"transforms\.json: \$\.fl_x: -1"):
         camera(LensFields(cx=4.0), LensFields(fl_x=-1.0))
+
+
+@pytest.mark.parametrize(
+    ("frame", "whole"),
+    [
+        (LensFields(camera_model="OPENCV_FISHEYE"), LensFields(camera_model="OPENCV")),
+        (LensFields(), LensFields(camera_model="OPENCV_FISHEYE")),
+        (LensFields(is_fisheye=True), LensFields()),
+        (LensFields(k1=0.02), LensFields(is_fisheye=True)),
+    ],
+)
+def test_fisheye_lenses_are_recognised(frame: LensFields, whole: LensFields) -> None:
+    result = camera(frame, msgspec.structs.replace(whole, fl_x=10.0, k1=0.02, k4=0.01))
+    assert result.fisheye and result.radial == (0.02, 0.0, 0.0, 0.01)
+    assert not camera(LensFields(is_fisheye=False, fl_x=1.0), LensFields(is_fisheye=True)).fisheye
+
+
+def test_cameras_take_coefficients_of_their_lens_only() -> None:
+    with pytest.raises(InputError, match=r"Camera\.p2 must be 0 for a fisheye lens"):
+        camera_at(np.eye(4), fisheye=True, p2=0.1)
+    with pytest.raises(InputError, match=r"Camera\.k4 must be 0 for a lens that is no fisheye"):
+        camera_at(np.eye(4), k4=0.1)
+
+
+def fisheye(focal: float, *k: float, size: int = 100) -> Camera:
+    names = ("k1", "k2", "k3", "k4")
+    lens = dict(zip(names, k, strict=False))
+    half = size / 2
+    square = {"width": size, "height": size, "cx": half, "cy": half}
+    return camera_at(np.eye(4), **square, fx=focal, fy=focal, fisheye=True, **lens)
+
+
+def test_fisheye_distortion_agrees_with_opencv() -> None:
+    lens = fisheye(30.0, 0.08, -0.03, 0.01, -0.001)
+    points = np.random.default_rng(0).uniform(-2.0, 2.0, (20, 2))
+    points[0] = 1e-9
+    expected = cv2.fisheye.distortPoints(points[None], np.eye(3), np.array(lens.radial))[0]
+    distorted, jacobian = lens.distort(points)
+    np.testing.assert_allclose(distorted, expected, rtol=0, atol=1e-12)
+    step = 1e-6
+    for axis in range(2):
+        shift = step * np.eye(2)[axis]
+        slope = (lens.distort(points + shift)[0] - lens.distort(points - shift)[0]) / (2 * step)
+        np.testing.assert_allclose(jacobian[:, :, axis], slope, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("kind", ["pinhole", "distorted", "fisheye", "wide"])
+def test_directions_are_where_pixels_look(kind: str) -> None:
+    lens = {
+        "pinhole": camera_at(np.eye(4), fy=11.0),
+        "distorted": random_lens(1),
+        "fisheye": fisheye(60.0, 0.08, -0.03, 0.01, -0.001),
+        "wide": fisheye(25.0),
+    }[kind]
+    rng = np.random.default_rng(2)
+    pixels = rng.uniform(0.0, 1.0, (50, 2)) * [lens.width, lens.height]
+    found = directions(lens, pixels)
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1.0)
+    if kind == "wide":  # theta = r / f, behind the camera at the corners
+        away = np.linalg.norm(pixels - 50.0, axis=1) / 25.0
+        np.testing.assert_allclose(np.arccos(-found[:, 2]), away, atol=1e-12)
+        assert away.max() > np.pi / 2
+        found, pixels = found[away < 1.5], pixels[away < 1.5]
+    points = found[:, :2] * [1.0, -1.0] / -found[:, 2:]
+    back = lens.distort(points)[0] * [lens.fx, lens.fy] + [lens.cx, lens.cy]
+    np.testing.assert_allclose(back, pixels, rtol=0, atol=1e-7)
+
+
+def test_corners_that_a_fisheye_does_not_see_are_known() -> None:
+    assert seen_pixels(camera_at(np.eye(4))) is None
+    assert seen_pixels(fisheye(30.0)) is None
+    # 180 degrees, which is the most there is, lie pi f from the middle: 37.7 pixels.
+    seen = seen_pixels(fisheye(12.0))
+    assert seen is not None
+    v, u = np.indices(seen.shape) + 0.5
+    assert np.array_equal(seen, np.hypot(u - 50.0, v - 50.0) <= 12.0 * np.pi)
+    assert has_invertible_distortion(fisheye(12.0))
+    assert not has_invertible_distortion(fisheye(6.0))
 
 
 def random_lens(seed: int) -> Camera:

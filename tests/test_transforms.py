@@ -267,7 +267,7 @@ POSE = rf"{FRAME}\.transform_matrix"
         (in_frame(camera_angle_x=3.2), rf"{FRAME}\.camera_angle_x: 3.2 is not a field of view"),
         (in_file(w=16, h=12), r"\$\.w: .* 16x12 pixels, but images/000\.png has 8x6"),
         (in_file(k1=-3.0), r"\$\.k1 = -3 folds over within the image images/000\.png"),
-        (in_file(is_fisheye=True), r"\$\.is_fisheye"),
+        (in_file(ftheta_p0=0.1), r"\$\.ftheta_p0"),
         (in_file(k4=0.01), r"\$\.k4"),
         (in_frame(camera_model="FOV"), rf"{FRAME}\.camera_model: 'FOV' is none of OPENCV"),
         (in_frame(file_path="../a.png"), rf'{FRAME}\.file_path: "\.\./a\.png" leaves the scene'),

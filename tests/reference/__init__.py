@@ -7,11 +7,11 @@ Everything works for any floating dtype; float64 is what it is meant for.
     render    trilinear interpolation, the paper's gradient scaling, integration along rays
     heads     the models: view encoding, spherical harmonics, networks, what they make of features
     training  photometric loss, total variation, one Adam step
-    cameras   rays of a pinhole camera with lens distortion (numpy)
+    cameras   rays of a pinhole camera with lens distortion, and of a fisheye (numpy)
     numeric   directional derivatives by differences, relative error
 """
 
-from .cameras import distort, pinhole_rays, undistort
+from .cameras import distort, fisheye_rays, pinhole_rays, undistort
 from .geometry import (
     SampleDistances,
     contract,
@@ -65,6 +65,7 @@ __all__ = [
     "contract",
     "distance_scale",
     "distort",
+    "fisheye_rays",
     "grid_coordinates",
     "integrate",
     "jacobian_determinant",

@@ -1,4 +1,4 @@
-"""Rays of a pinhole camera with OpenCV's lens distortion, in numpy float64."""
+"""Rays of a pinhole camera with OpenCV's lens distortion, and of a fisheye, in numpy float64."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -149,3 +149,50 @@ def pinhole_rays(
     directions = in_world / np.linalg.norm(in_world, axis=-1, keepdims=True)
     origins = np.broadcast_to(pose[:3, 3], directions.shape).copy()
     return origins, directions
+
+
+def fisheye_rays(
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    c2w: ArrayLike,
+    u: ArrayLike,
+    v: ArrayLike,
+    k: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
+) -> tuple[Float64, Float64]:
+    """Rays through the centres of pixels of OpenCV's fisheye lens.
+
+    theta is the root in (0, pi) of theta + k1 theta^3 + k2 theta^5 + k3 theta^7 + k4 theta^9 = r,
+    by halving intervals, where (x, y) = ((u + 1/2 - cx) / fx, (v + 1/2 - cy) / fy) and r = |(x, y)|
+    d = R (sin theta x / r, -sin theta y / r, -cos theta)
+
+    Args:
+        fx: Focal length along a row, pixels.
+        fy: Focal length along a column, pixels.
+        cx: Principal point, pixels from the left edge of the image.
+        cy: Principal point, pixels from the top edge of the image.
+        c2w: Camera to world [3, 4] or [4, 4], OpenGL axes: x right, y up, looking along -z.
+        u: Column index of each pixel [...]; its centre is at u + 0.5.
+        v: Row index of each pixel [...]; row 0 is the top one.
+        k: k1, k2, k3, k4, with which the left side rises up to pi.
+
+    Returns:
+        (origins, directions), each [..., 3]; directions are unit vectors.
+    """
+    pose = np.asarray(c2w, dtype=np.float64)
+    x = (np.asarray(u, dtype=np.float64) + 0.5 - cx) / fx
+    y = (np.asarray(v, dtype=np.float64) + 0.5 - cy) / fy
+    r, azimuth = np.hypot(x, y), np.arctan2(-y, x)
+    low, high = np.zeros_like(r), np.full_like(r, np.pi)
+    for _ in range(60):
+        theta = 0.5 * (low + high)
+        powers = sum(c * theta ** (2 * n + 3) for n, c in enumerate(k))
+        beyond = theta + powers > r
+        low, high = np.where(beyond, low, theta), np.where(beyond, theta, high)
+    across = np.sin(theta)
+    in_camera = np.stack(
+        [across * np.cos(azimuth), across * np.sin(azimuth), -np.cos(theta)], axis=-1
+    )
+    directions = in_camera @ pose[:3, :3].T
+    return np.broadcast_to(pose[:3, 3], directions.shape).copy(), directions

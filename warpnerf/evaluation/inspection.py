@@ -17,9 +17,11 @@ from warpnerf.config import PRESETS, TRAINING_BYTES, SceneKind, TrainConfig
 from warpnerf.model.interface import Model
 from warpnerf.model.models import to_json
 from warpnerf.scenes.camera import Camera
+from warpnerf.scenes.fisheye import angle_of
 from warpnerf.scenes.load import load_scene
 from warpnerf.scenes.scene import Scene, find_focus, share_aimed_at, up_direction
 from warpnerf.scenes.survey import Survey, survey
+from warpnerf.scenes.undistort import COEFFICIENTS
 
 MIN_SHARE_AIMED = 0.5
 """Share of cameras that aim at the focus, below which it is no common one."""
@@ -92,9 +94,10 @@ class Inspection:
                 _range([c.cx / c.width for c in lenses]),
                 _range([c.cy / c.height for c in lenses]),
             ],
+            "fisheye": sum(c.fisheye for c in lenses),
             "distortion": {
                 name: _range([getattr(c, name) for c in lenses])
-                for name in ("k1", "k2", "k3", "p1", "p2")
+                for name in COEFFICIENTS
                 if any(getattr(c, name) for c in lenses)
             },
             "up": [round(float(x), 4) + 0.0 for x in self.up],  # no -0
@@ -124,6 +127,9 @@ class Inspection:
         x, y = facts["principal_point"]
         box = " x ".join(f"{edge:.4g}" for edge in scene.box_max - scene.box_min)
         bent = [f"{name} {_span(values, 3)}" for name, values in facts["distortion"].items()]
+        if facts["fisheye"]:
+            some = "" if facts["fisheye"] == len(scene.views) else f" ({facts['fisheye']})"
+            bent = [f"fisheye{some}", *bent]
         rows = [
             ("format", self.format),
             ("views", f"{len(scene.views)}: {splits}"),
@@ -330,8 +336,12 @@ def _range(values: Sequence[float]) -> list[float]:
 
 
 def _degrees(cameras: Sequence[Camera], size: str, focal: str) -> list[float]:
-    """The range of fields of view, without distortion."""
-    halves = [math.atan(0.5 * getattr(c, size) / getattr(c, focal)) for c in cameras]
+    """The range of fields of view, without distortion; of fisheye lenses, with it."""
+    halves = []
+    for camera in cameras:
+        half = 0.5 * getattr(camera, size) / getattr(camera, focal)
+        wide = camera.fisheye
+        halves.append(float(angle_of(camera.radial, np.array(half))) if wide else math.atan(half))
     return _range([math.degrees(2.0 * half) for half in halves])
 
 

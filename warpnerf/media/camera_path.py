@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal, get_args
@@ -10,6 +11,7 @@ import numpy as np
 
 from warpnerf.checks import InputError, require_one_of, require_positive, require_whole
 from warpnerf.scenes.camera import Camera
+from warpnerf.scenes.fisheye import angle_of
 from warpnerf.scenes.scene import Scene, find_focus, share_aimed_at, up_direction
 
 PathKind = Literal["orbit", "through", "back"]
@@ -112,6 +114,8 @@ def backed_away(c2w: np.ndarray, distance: float) -> np.ndarray:
 def path_lens(cameras: Sequence[Camera], size: tuple[int, int] | None) -> Camera:
     """A lens without distortion, whose shorter side sees what that of the photographs sees.
 
+    Through fisheye lenses that may be more than fits a plane: then it sees 90 degrees.
+
     Args:
         cameras: Of the photographs; the result stands where the first does.
         size: Width and height, pixels; None: those of the first camera.
@@ -124,7 +128,7 @@ def path_lens(cameras: Sequence[Camera], size: tuple[int, int] | None) -> Camera
         require_whole(f"the {name}", side, 1)
         if side > MAX_SIDE:
             raise InputError(f"the {name} is {side} pixels; choose one of at most {MAX_SIDE}.")
-    focal = float(np.median([c.fx / min(c.width, c.height) for c in cameras])) * min(width, height)
+    focal = float(np.median([_focal_share(camera) for camera in cameras])) * min(width, height)
     return Camera(
         width=width,
         height=height,
@@ -134,6 +138,15 @@ def path_lens(cameras: Sequence[Camera], size: tuple[int, int] | None) -> Camera
         cy=0.5 * height,
         c2w=cameras[0].c2w,
     )
+
+
+def _focal_share(camera: Camera) -> float:
+    """Focal length of ``path_lens`` for one camera, in shorter sides of its image."""
+    shorter = min(camera.width, camera.height)
+    if camera.fisheye:
+        angle = angle_of(camera.radial, np.array(0.5 * shorter / camera.fx))
+        return 0.5 / math.tan(min(float(angle), 0.25 * math.pi))
+    return camera.fx / shorter
 
 
 def look_at(position: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ from PIL import Image, ImageDraw
 from warpnerf.evaluation.inspection import Inspection
 from warpnerf.media.pictures import FAINT, INK, font
 from warpnerf.scenes.camera import Camera
+from warpnerf.scenes.undistort import directions
 
 _FINE = 2  # pixels are drawn twice as large, then averaged
 _PANEL = 640 * _FINE
@@ -166,12 +167,9 @@ class _Panel:
     def camera(self, camera: Camera, colour: Colour) -> None:
         """A pyramid whose base is the image."""
         length = _FRUSTUM * self._extent
-        x, y = 0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy
-        shrink = length / math.sqrt(1.0 + x * x + y * y)
-        base = [
-            camera.position + shrink * camera.c2w[:, :3] @ np.array([i * x, j * y, -1.0])
-            for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))
-        ]
+        w, h = float(camera.width), float(camera.height)
+        corners = np.array([(0.0, h), (w, h), (w, 0.0), (0.0, 0.0)])
+        base = [*(camera.position + length * directions(camera, corners) @ camera.c2w[:, :3].T)]
         self.line([*base, base[0]], colour)
         for corner in base:
             self.line([camera.position, corner], colour)

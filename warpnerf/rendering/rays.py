@@ -17,6 +17,7 @@ from warpnerf_kernels.space import camera as kernels
 from warpnerf.checks import InputError
 from warpnerf.runtime.parallel import LaunchCache, Workers
 from warpnerf.scenes.camera import Camera
+from warpnerf.scenes.fisheye import largest_angle
 from warpnerf.scenes.scene import View
 
 
@@ -81,6 +82,10 @@ def view_struct(camera: Camera, first_pixel: int = 0) -> kernels.View:
     view.principal = vec2(camera.cx, camera.cy)
     view.radial = vec3(camera.k1, camera.k2, camera.k3)
     view.tangential = vec2(camera.p1, camera.p2)
+    if camera.fisheye:
+        view.fisheye = 1
+        view.k4 = camera.k4
+        view.angle_max = largest_angle(camera.radial)
     view.width = camera.width
     view.first_pixel = first_pixel
     return view

@@ -12,16 +12,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from warpnerf.checks import InputError, require_at_least, require_positive
+from warpnerf.scenes.fisheye import Coefficients, distorted_angle
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Camera:
-    """Pinhole camera with OpenCV's radial and tangential distortion.
+    """Pinhole camera with OpenCV's radial and tangential distortion, or a fisheye lens.
 
     With (x, y) = (X/Z, Y/Z) in OpenCV axes and r^2 = x^2 + y^2, a point lands on the pixel
 
         x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2),   u = fx x' + cx
         y' = y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y,   v = fy y' + cy
+
+    and through a fisheye lens, with its angle theta to the optical axis, up to 180 degrees,
+
+        (x', y') = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) (X, Y) / |(X, Y)|
     """
 
     width: int
@@ -39,15 +44,19 @@ class Camera:
     c2w: np.ndarray
     """[3, 4] float64, camera to world, OpenGL axes, translation in scene units."""
     k1: float = 0.0
-    """Radial distortion, r^2."""
+    """Radial distortion, r^2 or theta^2."""
     k2: float = 0.0
-    """Radial distortion, r^4."""
+    """Radial distortion, r^4 or theta^4."""
     k3: float = 0.0
-    """Radial distortion, r^6."""
+    """Radial distortion, r^6 or theta^6."""
     p1: float = 0.0
-    """Tangential distortion."""
+    """Tangential distortion, not of a fisheye lens."""
     p2: float = 0.0
-    """Tangential distortion."""
+    """Tangential distortion, not of a fisheye lens."""
+    k4: float = 0.0
+    """Radial distortion of a fisheye lens, theta^8."""
+    fisheye: bool = False
+    """Whether it is a fisheye lens."""
 
     def __post_init__(self) -> None:
         """Refuse what makes no rays."""
@@ -57,16 +66,20 @@ class Camera:
         """Refuse what makes no rays; kernels would not notice.
 
         Raises:
-            InputError: A size or focal length is not above zero, a number is not finite, or the
-                pose has another shape.
+            InputError: A size or focal length is not above zero, a number is not finite, a
+                coefficient is of another lens, or the pose has another shape.
         """
         require_at_least("Camera.width", self.width, 1)
         require_at_least("Camera.height", self.height, 1)
         require_positive("Camera.fx", self.fx)
         require_positive("Camera.fy", self.fy)
-        for name in ("cx", "cy", "k1", "k2", "k3", "p1", "p2"):
+        for name in ("cx", "cy", "k1", "k2", "k3", "p1", "p2", "k4"):
             if not math.isfinite(getattr(self, name)):
                 raise InputError(f"Camera.{name} must be finite, not {getattr(self, name)}.")
+        for name in ("p1", "p2") if self.fisheye else ("k4",):
+            if getattr(self, name) != 0.0:
+                kind = "a fisheye lens" if self.fisheye else "a lens that is no fisheye"
+                raise InputError(f"Camera.{name} must be 0 for {kind}.")
         if not isinstance(self.c2w, np.ndarray) or self.c2w.shape != (3, 4):
             raise InputError(
                 f"Camera.c2w must be an array [3, 4], not {list(np.shape(self.c2w))}; leave out a "
@@ -85,6 +98,11 @@ class Camera:
         """Unit vector along the optical axis, into the scene, [3]."""
         return -self.c2w[:, 2]
 
+    @property
+    def radial(self) -> Coefficients:
+        """k1, k2, k3, k4."""
+        return self.k1, self.k2, self.k3, self.k4
+
     def distort(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Distort points on the plane Z = 1, as in the equation of the class.
 
@@ -94,6 +112,8 @@ class Camera:
         Returns:
             [n, 2] (x', y'), and [n, 2, 2] its derivative by (x, y).
         """
+        if self.fisheye:
+            return self._distort_angles(points)
         x, y = points[:, 0], points[:, 1]
         r2 = x * x + y * y
         radial = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
@@ -111,6 +131,16 @@ class Camera:
         jacobian[:, 1, 0] = jacobian[:, 0, 1]
         jacobian[:, 1, 1] = radial + slope * y * y + 6.0 * self.p1 * y + 2.0 * self.p2 * x
         return distorted, jacobian
+
+    def _distort_angles(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """``distort`` for a fisheye lens: x' = x theta_d / r with theta = atan(r)."""
+        r = np.maximum(np.linalg.norm(points, axis=1), 1e-12)
+        distorted, slope = distorted_angle(self.radial, np.arctan(r))
+        scale = distorted / r
+        bend = (slope / (1.0 + r * r) - scale) / (r * r)  # d scale / d(r^2/2)
+        jacobian = scale[:, None, None] * np.eye(2)
+        jacobian += bend[:, None, None] * points[:, :, None] * points[:, None, :]
+        return points * scale[:, None], jacobian
 
     def downscaled(self, factor: int) -> Camera:
         """Camera of the image whose pixels are means over ``factor`` by ``factor`` blocks.

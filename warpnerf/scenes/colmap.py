@@ -41,6 +41,11 @@ PARAMETERS = {
     "RADIAL": ("fl", "cx", "cy", "k1", "k2"),
     "OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"),
     "FULL_OPENCV": (*("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),),
+    "OPENCV_FISHEYE": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4"),
+    "SIMPLE_RADIAL_FISHEYE": ("fl", "cx", "cy", "k1"),
+    "RADIAL_FISHEYE": ("fl", "cx", "cy", "k1", "k2"),
+    "SIMPLE_FISHEYE": ("fl", "cx", "cy"),
+    "FISHEYE": ("fl_x", "fl_y", "cx", "cy"),
 }
 """Of the lenses that are read, in the order of the files."""
 
@@ -210,7 +215,7 @@ def _lens(file: Path, number: int, camera: _Camera, photograph: Path, reduced: b
     for name, value in zip(names, camera.parameters, strict=True):
         if not math.isfinite(value):
             raise InputError(f"{file}: {place}: {name} is not a finite number; export it again.")
-        if name in ("k4", "k5", "k6"):
+        if camera.model == "FULL_OPENCV" and name in ("k4", "k5", "k6"):
             if value != 0.0:
                 raise InputError(
                     f"{file}: {place}: {name} is not modelled unless it is 0; undistort the images "
@@ -231,7 +236,12 @@ def _lens(file: Path, number: int, camera: _Camera, photograph: Path, reduced: b
     for name, factor in (("fl_x", across), ("cx", across), ("fl_y", along), ("cy", along)):
         values[name] *= factor
     values |= {"w": camera.width * across, "h": camera.height * along}
-    return Lens(file=file, values=values, fields={name: f"{place}: {name}" for name in values})
+    return Lens(
+        file=file,
+        values=values,
+        fields={name: f"{place}: {name}" for name in values},
+        fisheye=camera.model.endswith("FISHEYE"),
+    )
 
 
 class _Bytes:

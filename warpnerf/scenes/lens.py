@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,8 +12,10 @@ import numpy as np
 
 from warpnerf.checks import InputError
 from warpnerf.scenes.camera import Camera
+from warpnerf.scenes.undistort import COEFFICIENTS, has_invertible_distortion
 
-CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+FISHEYE = "OPENCV_FISHEYE"
+CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", FISHEYE)
 
 FOCAL_KEYS = ("fl_x", "camera_angle_x", "fl_y", "camera_angle_y")
 
@@ -23,7 +24,7 @@ FOCAL_KEYS = ("fl_x", "camera_angle_x", "fl_y", "camera_angle_y")
 KEY_GROUPS = (
     FOCAL_KEYS[:2],
     FOCAL_KEYS[2:],
-    *((key,) for key in ("cx", "cy", "w", "h", "k1", "k2", "k3", "p1", "p2")),
+    *((key,) for key in ("cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2")),
 )
 
 MIN_FOCAL = 0.02
@@ -35,8 +36,9 @@ MIN_ANGLE = 1e-100
 MAX_OFF_CENTRE = 50.0
 """Largest distance of the principal point from the middle, in sizes of the image."""
 
-UNSUPPORTED_LENSES = ("is_fisheye", "ftheta_p0", "latlong", "equirectangular", "orthographic")
-UNSUPPORTED_COEFFICIENTS = ("k4", "k5", "k6")
+UNSUPPORTED_LENSES = ("ftheta_p0", "latlong", "equirectangular", "orthographic")
+UNSUPPORTED_COEFFICIENTS = ("k5", "k6")
+ADVICE = "undistort the images to a pinhole camera (colmap image_undistorter)"
 
 
 class LensFields(msgspec.Struct):
@@ -59,7 +61,7 @@ class LensFields(msgspec.Struct):
     k6: float | None = None
     p1: float | None = None
     p2: float | None = None
-    is_fisheye: object = None
+    is_fisheye: bool | None = None
     ftheta_p0: object = None
     latlong: object = None
     equirectangular: object = None
@@ -76,6 +78,8 @@ class Lens:
     """What the file says, under its own names: pixels of the whole image, radians, coefficients."""
     fields: Mapping[str, str]
     """Where in the file each of ``values`` stands."""
+    fisheye: bool = False
+    """Whether it is OpenCV's fisheye lens."""
 
     def camera(self, *, width: int, height: int, c2w: np.ndarray, image: str) -> Camera:
         """Complete the lens for an image of ``width`` by ``height`` pixels.
@@ -105,14 +109,11 @@ class Lens:
             cx=values.get("cx", width / 2),
             cy=values.get("cy", height / 2),
             c2w=c2w,
-            k1=values.get("k1", 0.0),
-            k2=values.get("k2", 0.0),
-            k3=values.get("k3", 0.0),
-            p1=values.get("p1", 0.0),
-            p2=values.get("p2", 0.0),
+            fisheye=self.fisheye,
+            **{name: values.get(name, 0.0) for name in COEFFICIENTS},
         )
         self._check_proportions(camera, image)
-        coefficients = {k: values[k] for k in ("k1", "k2", "k3", "p1", "p2") if values.get(k)}
+        coefficients = {k: values[k] for k in COEFFICIENTS if values.get(k)}
         if coefficients and not has_invertible_distortion(camera):
             named = ", ".join(f"{self.fields[k]} = {v:g}" for k, v in coefficients.items())
             raise InputError(
@@ -167,6 +168,8 @@ def read_lens(file: Path, levels: Sequence[tuple[str, LensFields]]) -> Lens:
     fields: dict[str, str] = {}
     for place, level in levels:
         _refuse_unsupported(file, place, level)
+    kinds = [_is_fisheye(level) for _, level in levels]
+    fisheye = next((kind for kind in kinds if kind is not None), False)
     for group in KEY_GROUPS:
         for place, level in levels:
             key = next((key for key in group if getattr(level, key) is not None), None)
@@ -180,7 +183,33 @@ def read_lens(file: Path, levels: Sequence[tuple[str, LensFields]]) -> Lens:
             f"{file}: {levels[0][0]}: has no focal length; add fl_x (pixels) or camera_angle_x "
             "(radians)."
         )
-    return Lens(file=file, values=values, fields=fields)
+    if not fisheye and values.get("k4"):
+        raise InputError(f"{file}: {fields['k4']}: is not modelled unless it is 0; {ADVICE}.")
+    if fisheye:
+        _check_fisheye(file, values, fields)
+    return Lens(file=file, values=values, fields=fields, fisheye=fisheye)
+
+
+def _is_fisheye(level: LensFields) -> bool | None:
+    """What one level says of the kind of lens; None: nothing."""
+    if level.camera_model is None:
+        return level.is_fisheye
+    return level.camera_model == FISHEYE or bool(level.is_fisheye)
+
+
+def _check_fisheye(file: Path, values: Mapping[str, float], fields: Mapping[str, str]) -> None:
+    for key in ("p1", "p2"):
+        if values.get(key):
+            raise InputError(
+                f"{file}: {fields[key]}: a fisheye lens has no tangential distortion; calibrate "
+                "the lens as OPENCV_FISHEYE, with k1 to k4 only."
+            )
+    for key in ("camera_angle_x", "camera_angle_y"):
+        if key in values:
+            raise InputError(
+                f"{file}: {fields[key]}: does not give a fisheye lens's focal length; add fl_x "
+                "(pixels)."
+            )
 
 
 def _check_value(file: Path, field: str, key: str, value: float) -> None:
@@ -197,78 +226,14 @@ def _check_value(file: Path, field: str, key: str, value: float) -> None:
 
 
 def _refuse_unsupported(file: Path, place: str, level: LensFields) -> None:
-    advice = "undistort the images to a pinhole camera (colmap image_undistorter)"
     for key in UNSUPPORTED_LENSES:
         if getattr(level, key):
-            raise InputError(f"{file}: {place}.{key}: that lens is not modelled; {advice}.")
+            raise InputError(f"{file}: {place}.{key}: that lens is not modelled; {ADVICE}.")
     for key in UNSUPPORTED_COEFFICIENTS:
         if getattr(level, key):
-            raise InputError(f"{file}: {place}.{key}: is not modelled unless it is 0; {advice}.")
+            raise InputError(f"{file}: {place}.{key}: is not modelled unless it is 0; {ADVICE}.")
     if level.camera_model is not None and level.camera_model not in CAMERA_MODELS:
         raise InputError(
             f"{file}: {place}.camera_model: {level.camera_model[:40]!r} is none of "
-            f"{', '.join(CAMERA_MODELS)}; {advice}."
+            f"{', '.join(CAMERA_MODELS)}; {ADVICE}."
         )
-
-
-def has_invertible_distortion(camera: Camera) -> bool:
-    """Whether every point of the image comes from one direction, so distortion can be undone.
-
-    Follows the straight lines from the principal point to a grid over the image and undoes the
-    distortion on the way by Newton's method. The distortion folds over where the determinant of
-    its Jacobian reaches 0; less than ``MIN_DETERMINANT`` on the way is refused already.
-    """
-    return _is_invertible(
-        *(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy),
-        *(camera.k1, camera.k2, camera.k3, camera.p1, camera.p2),
-    )
-
-
-MIN_DETERMINANT = 0.01
-N_GRID = 9
-N_PATH = 32
-N_NEWTON = 6
-MAX_RESIDUAL = 1e-6
-
-
-@functools.lru_cache(maxsize=64)
-def _is_invertible(*parameters: float) -> bool:
-    width, height, fx, fy, cx, cy, k1, k2, k3, p1, p2 = parameters
-    camera = Camera(
-        width=int(width),
-        height=int(height),
-        fx=fx,
-        fy=fy,
-        cx=cx,
-        cy=cy,
-        c2w=np.eye(3, 4),
-        k1=k1,
-        k2=k2,
-        k3=k3,
-        p1=p1,
-        p2=p2,
-    )
-    u, v = np.meshgrid(np.linspace(0.0, width, N_GRID), np.linspace(0.0, height, N_GRID))
-    targets = np.stack([(u.ravel() - cx) / fx, (v.ravel() - cy) / fy], axis=1)
-    points = np.zeros_like(targets)
-    with np.errstate(all="ignore"):
-        for share in np.linspace(0.0, 1.0, N_PATH + 1)[1:]:
-            for _ in range(N_NEWTON):
-                distorted, jacobian = camera.distort(points)
-                if not _keeps_orientation(jacobian):
-                    return False
-                residual = share * targets - distorted
-                points = points + np.linalg.solve(jacobian, residual[:, :, None])[:, :, 0]
-            distorted, jacobian = camera.distort(points)
-            if not _keeps_orientation(jacobian):
-                return False
-            if not np.abs(share * targets - distorted).max() < MAX_RESIDUAL:
-                return False
-    return True
-
-
-def _keeps_orientation(jacobian: np.ndarray) -> bool:
-    """Whether [n, 2, 2] matrices are all positive definite; false where they are not finite."""
-    determinant = np.linalg.det(jacobian)
-    trace = jacobian[:, 0, 0] + jacobian[:, 1, 1]
-    return bool((determinant > MIN_DETERMINANT).all() and (trace > 0.0).all())

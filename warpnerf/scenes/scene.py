@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -10,6 +11,7 @@ import numpy as np
 from warpnerf.checks import InputError, require_positive
 from warpnerf.config import SceneKind
 from warpnerf.scenes.camera import Camera
+from warpnerf.scenes.fisheye import angle_of
 
 UNBOUNDED_BOX_SHARE = 0.75
 """Half edge of the box of photographs, in content distances."""
@@ -22,6 +24,9 @@ MIN_LEVEL_SPREAD = 0.02
 
 MIN_SHARE_IN_FRONT = 0.75
 """Share of cameras that must have the focus in front of them for it to be what they look at."""
+
+MAX_HALF_ANGLE = math.radians(60.0)
+"""Of a fisheye lens, for the box of what its images show: their rims are mostly background."""
 
 MAX_OFFSET = 1e4
 """Largest distance from the origin, in spreads of the cameras, that single precision resolves."""
@@ -299,8 +304,7 @@ def estimate_extent(cameras: Sequence[Camera], *, unbounded: bool) -> Extent:
         half = focus.distance * UNBOUNDED_BOX_SHARE
         how = f"{UNBOUNDED_BOX_SHARE:g} of the content distance to each side of that point"
     else:
-        tangents = [max(c.width / c.fx, c.height / c.fy) / 2 for c in cameras]
-        half = focus.distance * float(np.median(tangents))
+        half = focus.distance * float(np.median([_half_tangent(camera) for camera in cameras]))
         how = "what the larger field of view spans at the content distance"
     return Extent(
         box_min=focus.point - half,
@@ -311,6 +315,15 @@ def estimate_extent(cameras: Sequence[Camera], *, unbounded: bool) -> Extent:
             f"box of edge {2.0 * half:.3g}: {how}",
         ),
     )
+
+
+def _half_tangent(camera: Camera) -> float:
+    """Tangent of half the larger field of view; of at most MAX_HALF_ANGLE through a fisheye."""
+    half = max(camera.width / camera.fx, camera.height / camera.fy) / 2
+    if camera.fisheye:
+        angle = angle_of(camera.radial, np.array(half))
+        return math.tan(min(float(angle), MAX_HALF_ANGLE))
+    return half
 
 
 def require_split(scene: Scene, split: str) -> tuple[int, ...]:

@@ -128,7 +128,8 @@ def scene_digest(scene: Scene) -> str:
         view = scene.views[index]
         camera = view.camera
         lens = (camera.fx, camera.fy, camera.cx, camera.cy)
-        distortion = (camera.k1, camera.k2, camera.k3, camera.p1, camera.p2)
+        distortion = [camera.k1, camera.k2, camera.k3, camera.p1, camera.p2]
+        distortion += [camera.k4, 1.0] if camera.fisheye else []
         numbers = (
             np.round(lens, 3),
             np.round([*distortion, *camera.c2w[:, :3].ravel()], 5),

@@ -27,6 +27,9 @@ class View:
     principal: vec2  # cx, cy, pixels
     radial: vec3  # k1, k2, k3
     tangential: vec2  # p1, p2
+    fisheye: int  # 1: radial and k4 distort the angle to the axis; 0: the point in the plane z = 1
+    k4: real  # of a fisheye lens
+    angle_max: real  # of a fisheye lens: up to where the distorted angle rises, radians
     width: int  # pixels
     first_pixel: int  # index of its pixel (0, 0)
 
@@ -100,9 +103,58 @@ def undistort(view: View, distorted: vec2) -> vec2:
 
 
 @wp.func
+def fisheye_angle(view: View, distorted: real) -> real:
+    """The angle to the axis whose distorted one is given, radians; at most view.angle_max.
+
+    distorted = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8), by Newton's method
+    between bounds, in whose middle it goes on where it would leave them.
+    """
+    low = real(0.0)
+    high = view.angle_max
+    theta = wp.min(distorted, high)
+    left = int(3)  # steps to take once theta is close: each doubles the digits
+    for _ in range(40):
+        t2 = theta * theta
+        rise = t2 * (view.radial[1] + t2 * (view.radial[2] + t2 * view.k4))
+        residual = theta * (real(1.0) + t2 * (view.radial[0] + rise)) - distorted
+        steep = real(7.0) * view.radial[2] + t2 * real(9.0) * view.k4
+        steep = t2 * (real(5.0) * view.radial[1] + t2 * steep)
+        slope = real(1.0) + t2 * (real(3.0) * view.radial[0] + steep)
+        if residual > real(0.0):
+            high = theta
+        else:
+            low = theta
+        step = residual / slope
+        if wp.abs(step) < real(1.0e-3) * slope:
+            left -= 1
+        theta = theta - step
+        if not (theta >= low and theta <= high):
+            theta = real(0.5) * (low + high)
+        if left == 0:
+            break
+    return theta
+
+
+@wp.func
+def fisheye_direction(view: View, p: vec2) -> vec3:
+    """Unit direction in camera axes of a distorted point, in focal lengths from the principal one.
+
+    Points beyond what the lens can see get the direction of the last that it sees on their side.
+    """
+    distorted = wp.length(p)
+    theta = fisheye_angle(view, distorted)
+    across = real(1.0)
+    if distorted > real(0.0):
+        across = wp.sin(theta) / distorted
+    return vec3(across * p[0], -across * p[1], -wp.cos(theta))
+
+
+@wp.func
 def pixel_direction(view: View, u: real, v: real) -> vec3:
     """Unit direction in world space of the ray through image position (u, v), in pixels."""
     p = vec2((u - view.principal[0]) / view.focal[0], (v - view.principal[1]) / view.focal[1])
+    if view.fisheye == 1:
+        return wp.normalize(view.rotation * fisheye_direction(view, p))
     if wp.length_sq(view.radial) + wp.length_sq(view.tangential) > real(0.0):
         p = undistort(view, p)
     return wp.normalize(view.rotation * vec3(p[0], -p[1], real(-1.0)))

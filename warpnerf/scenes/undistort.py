@@ -1,0 +1,150 @@
+"""From image positions back to directions: distortion undone, and whether it can be."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+
+from warpnerf.scenes.camera import Camera
+from warpnerf.scenes.fisheye import angle_of, distorted_angle, largest_angle
+
+COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
+"""Of a lens, by their names."""
+
+MIN_DETERMINANT = 0.01
+N_GRID = 9
+N_STRIDES = 32
+N_NEWTON = 6
+MAX_RESIDUAL = 1e-6
+
+MIN_SEEN = 0.25
+"""Share of a fisheye's image that must come from a direction: the rest may lie around a circle."""
+
+
+def has_invertible_distortion(camera: Camera) -> bool:
+    """Whether every point of the image comes from one direction, so distortion can be undone.
+
+    Follows the straight lines from the principal point to a grid over the image and undoes the
+    distortion on the way by Newton's method. The distortion folds over where the determinant of
+    its Jacobian reaches 0; less than ``MIN_DETERMINANT`` on the way is refused already. Of a
+    fisheye's image only a share of ``MIN_SEEN`` has to come from a direction.
+    """
+    if camera.fisheye:
+        return _share_seen(camera) >= MIN_SEEN
+    return _is_invertible(
+        *(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy),
+        *(camera.k1, camera.k2, camera.k3, camera.p1, camera.p2),
+    )
+
+
+@functools.lru_cache(maxsize=64)
+def _is_invertible(*parameters: float) -> bool:
+    width, height, fx, fy, cx, cy, k1, k2, k3, p1, p2 = parameters
+    camera = Camera(
+        width=int(width),
+        height=int(height),
+        fx=fx,
+        fy=fy,
+        cx=cx,
+        cy=cy,
+        c2w=np.eye(3, 4),
+        k1=k1,
+        k2=k2,
+        k3=k3,
+        p1=p1,
+        p2=p2,
+    )
+    return _undistorted(camera, (_grid(camera) - [cx, cy]) / [fx, fy], N_STRIDES) is not None
+
+
+def _grid(camera: Camera) -> np.ndarray:
+    """Image positions [N_GRID^2, 2] from corner to corner, pixels."""
+    u, v = np.linspace(0.0, camera.width, N_GRID), np.linspace(0.0, camera.height, N_GRID)
+    return np.stack(np.meshgrid(u, v), axis=2).reshape(-1, 2)
+
+
+def _undistorted(camera: Camera, targets: np.ndarray, n_strides: int) -> np.ndarray | None:
+    """Points on the plane Z = 1 whose distorted ones are given, [n, 2]; None where there are none.
+
+    For lenses that are no fisheye. The targets move out from the principal point in strides.
+    """
+    points = np.zeros_like(targets)
+    with np.errstate(all="ignore"):
+        for share in np.linspace(0.0, 1.0, n_strides + 1)[1:]:
+            for _ in range(N_NEWTON):
+                distorted, jacobian = camera.distort(points)
+                if not _keeps_orientation(jacobian):
+                    return None
+                residual = share * targets - distorted
+                points = points + np.linalg.solve(jacobian, residual[:, :, None])[:, :, 0]
+            distorted, jacobian = camera.distort(points)
+            if not _keeps_orientation(jacobian):
+                return None
+            if not np.abs(share * targets - distorted).max() < MAX_RESIDUAL:
+                return None
+    return points
+
+
+def _radii(camera: Camera, pixels: np.ndarray) -> np.ndarray:
+    """Distances of image positions [n, 2] from the principal point, in focal lengths."""
+    targets = (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    return np.asarray(np.linalg.norm(targets, axis=-1))
+
+
+def _last_radius(camera: Camera) -> float:
+    """How far from the principal point a fisheye's image comes from a direction, focal lengths."""
+    return float(distorted_angle(camera.radial, largest_angle(camera.radial))[0])
+
+
+def _share_seen(camera: Camera) -> float:
+    return float(np.mean(_radii(camera, _grid(camera)) <= _last_radius(camera)))
+
+
+def seen_pixels(camera: Camera) -> np.ndarray | None:
+    """The pixels of an image that come from a direction: all, but for corners of a fisheye's.
+
+    Args:
+        camera: Of the image.
+
+    Returns:
+        [H, W] bool; None where all do.
+    """
+    if not camera.fisheye:
+        return None
+    last = _last_radius(camera)
+    if (_radii(camera, _grid(camera)) <= last).all():  # the grid holds the corners
+        return None
+    across, along = np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5
+    x, y = (across - camera.cx) / camera.fx, (along - camera.cy) / camera.fy
+    return np.asarray(x * x + (y * y)[:, None] <= last * last)
+
+
+def directions(camera: Camera, pixels: np.ndarray) -> np.ndarray:
+    """Which way image positions look, in the camera's own axes.
+
+    Args:
+        camera: Its pose does not matter.
+        pixels: [n, 2] (u, v), pixels from the left and the top edge.
+
+    Returns:
+        [n, 3] unit vectors, OpenGL axes: x right, y up, the camera looks along -z.
+    """
+    targets = (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    if camera.fisheye:
+        radii = np.maximum(np.linalg.norm(targets, axis=1), 1e-12)
+        angles = angle_of(camera.radial, radii)
+        x, y = (targets * (np.sin(angles) / radii)[:, None]).T
+        return np.stack([x, -y, -np.cos(angles)], axis=1)
+    distorted = any(getattr(camera, name) for name in COEFFICIENTS)
+    points = _undistorted(camera, targets, N_STRIDES // 4) if distorted else targets
+    x, y = (targets if points is None else points).T
+    rays = np.stack([x, -y, -np.ones_like(x)], axis=1)
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+
+def _keeps_orientation(jacobian: np.ndarray) -> bool:
+    """Whether [n, 2, 2] matrices are all positive definite; false where they are not finite."""
+    determinant = np.linalg.det(jacobian)
+    trace = jacobian[:, 0, 0] + jacobian[:, 1, 1]
+    return bool((determinant > MIN_DETERMINANT).all() and (trace > 0.0).all())
