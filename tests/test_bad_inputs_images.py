@@ -249,19 +249,16 @@ def test_57_mixed_sizes_that_the_lens_is_not_for(tmp_path: Path) -> None:
     assert_refused(train(scene, folder=tmp_path), "$.w", "images/001.png has 32x24")
 
 
-@pytest.mark.parametrize(
-    "size",
-    [
-        pytest.param((8, 8), id="58-mask-of-another-size"),
-        pytest.param((WIDTH, HEIGHT), id="58-mask-all-black"),
-    ],
-)
-def test_mask(tmp_path: Path, size: tuple[int, int]) -> None:
+def test_58_mask_of_another_size(tmp_path: Path) -> None:
     scene = make_scene(tmp_path, lambda c: c["frames"][1].update(mask_path="mask.png"))
-    Image.new("L", size).save(scene / "mask.png")
-    assert_trained(
-        train(scene, folder=tmp_path), "mask_path is not used: masked pixels are trained"
-    )
+    Image.new("L", (8, 8), 255).save(scene / "mask.png")
+    assert_refused(train(scene, folder=tmp_path), "mask.png", "8x8", "as large as the photograph")
+
+
+def test_58_mask_all_black(tmp_path: Path) -> None:
+    scene = make_scene(tmp_path, lambda c: c["frames"][1].update(mask_path="mask.png"))
+    Image.new("L", (WIDTH, HEIGHT)).save(scene / "mask.png")
+    assert_trained(train(scene, folder=tmp_path), "left out 1 of 4 images of which masks leave no")
 
 
 def test_59_duplicate_frame(tmp_path: Path) -> None:

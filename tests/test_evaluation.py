@@ -55,6 +55,28 @@ def test_a_field_scores_well_on_its_own_pictures() -> None:
     assert result.mean["depth_error"] == pytest.approx(0.25, abs=1e-5)
 
 
+def test_what_masks_hide_is_not_measured() -> None:
+    field = tiny_field()
+    scene = scene_of(field, depth=True)
+    mask = np.zeros((12, 16), bool)
+    mask[:, :9] = True
+    views = []
+    for view in scene.views:
+        image = np.where(mask[..., None], view.image, 255 - view.image)
+        assert view.depth is not None
+        depth = np.where(mask, view.depth, 100.0).astype(np.float32)
+        views.append(replace(view, image=image, depth=depth, mask=mask))
+    mean = evaluate(field, replace(scene, views=views), split="all").mean
+    assert mean["psnr"] > 55.0 and mean["ssim"] > 0.999 and mean["flip"] < 0.02
+    assert mean["depth_error"] == pytest.approx(0.25, abs=1e-5)
+    corner = np.zeros_like(mask)
+    corner[0, 0] = True
+    views = [replace(view, mask=corner) for view in views]
+    figures = evaluate(field, replace(scene, views=views), split="test")
+    assert "ssim" not in figures.mean and figures.mean["psnr"] > 50.0
+    assert "ssim" not in json.loads(figures.to_json())["images"][0]
+
+
 def test_another_picture_scores_worse() -> None:
     field = tiny_field()
     scene = scene_of(field, depth=False)

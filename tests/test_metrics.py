@@ -83,3 +83,62 @@ def test_flip_without_its_package_says_how_to_get_it(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("warpnerf.evaluation.metrics.has_flip", lambda: False)
     with pytest.raises(InputError, match="pip install flip-evaluator"):
         flip(np.zeros((12, 12, 3)), np.zeros((12, 12, 3)))
+
+
+def masked_images(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rgb, truth = images(seed, 30, 40)
+    mask = np.random.default_rng(seed).random((30, 40)) < 0.5
+    mask[:, 20:30] = False
+    return rgb, truth, mask
+
+
+def test_what_a_mask_hides_does_not_count() -> None:
+    rgb, truth, mask = masked_images(1)
+    other = np.where(mask[..., None], rgb, 1.0 - rgb)
+    for measure in (psnr, ssim, flip):
+        assert measure(other, truth, mask) == measure(rgb, truth, mask)
+        assert measure(rgb, truth, mask) != measure(rgb, truth)
+    assert psnr(rgb, truth, mask) == pytest.approx(
+        -10 * np.log10(((rgb - truth)[mask] ** 2).mean())
+    )
+
+
+def test_ssim_with_a_mask_by_hand() -> None:
+    rgb, truth, mask = masked_images(2)
+    offsets = np.arange(-5, 6)
+    gaussian = np.exp(-0.5 * (offsets[:, None] ** 2 + offsets**2) / 1.5**2)
+    values = []
+    for row, column in np.argwhere(mask):
+        if not (5 <= row < 25 and 5 <= column < 35):
+            continue
+        window = slice(row - 5, row + 6), slice(column - 5, column + 6)
+        weights = (gaussian * mask[window])[..., None]
+        weights = weights / weights.sum()
+        a, b = rgb[window], truth[window]
+        mean_a, mean_b = (weights * a).sum((0, 1)), (weights * b).sum((0, 1))
+        var_a, var_b = (
+            (weights * (a - mean_a) ** 2).sum((0, 1)),
+            (weights * (b - mean_b) ** 2).sum((0, 1)),
+        )
+        both = (weights * (a - mean_a) * (b - mean_b)).sum((0, 1))
+        c1, c2 = 1e-4, 9e-4
+        values.append(
+            (2 * mean_a * mean_b + c1)
+            * (2 * both + c2)
+            / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))
+        )
+    assert ssim(rgb, truth, mask) == pytest.approx(np.mean(values), abs=1e-9)
+
+
+def test_a_mask_of_all_pixels_is_none() -> None:
+    rgb, truth, mask = masked_images(0)
+    everything = mask | True
+    assert psnr(rgb, truth, everything) == pytest.approx(psnr(rgb, truth))
+    assert ssim(rgb, truth, everything) == pytest.approx(ssim(rgb, truth), abs=1e-12)
+    assert flip(rgb, truth, everything) == pytest.approx(flip(rgb, truth), abs=1e-6)
+
+
+def test_where_a_mask_leaves_no_window_there_is_no_ssim() -> None:
+    rgb, truth, mask = masked_images(0)
+    mask[5:25, 5:35] = False
+    assert mask.any() and ssim(rgb, truth, mask) is None

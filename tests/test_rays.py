@@ -1,13 +1,14 @@
 """Batches of random pixels: each ray a function of its step and the seed."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 from test_determinism import small_scene
 
-from warpnerf.rendering.rays import PixelSampler, RayBatch
+from warpnerf.rendering.rays import PixelSampler, RayBatch, camera_rays, runs_of
 from warpnerf.runtime.parallel import Workers
+from warpnerf.scenes.scene import View
 
 N_RAYS = 64
 
@@ -42,3 +43,51 @@ def test_steps_and_seeds_draw_what_is_their_own(device: str) -> None:
             assert (one != other).any(axis=1).mean() > 0.9
     repeated = drawn(sampler(device).draw(2**32 // N_RAYS + 1))["directions"]
     assert np.array_equal(repeated, batches[1])
+
+
+def masked_views() -> list[View]:
+    """Three photographs that say in every pixel which one it is; the second has no mask."""
+    views = []
+    for number, view in enumerate(small_scene().views[:3]):
+        height, width = view.image.shape[:2]
+        row, column = np.indices((height, width))
+        image = np.stack([row, column, np.full_like(row, number)], axis=2).astype(np.uint8)
+        mask = np.random.default_rng(number).random((height, width)) < 0.4 - 0.1 * number
+        mask[: 2 + number] = number == 0
+        views.append(replace(view, image=image, mask=None if number == 1 else mask))
+    return views
+
+
+def test_masked_pixels_are_never_drawn_and_all_others_alike(device: str) -> None:
+    views = masked_views()
+    counting = [np.ones(v.image.shape[:2], bool) if v.mask is None else v.mask for v in views]
+    n_counting = sum(int(mask.sum()) for mask in counting)
+    n_rays = 400 * n_counting
+    sampler = PixelSampler(views, 2.0, (0.0, 0.0, 0.0), n_rays, False, 3, Workers(device, 2))
+    batch = drawn(sampler.draw(0))
+    row, column, number = np.round(255.0 * batch["target_rgb"]).astype(int).T
+    counts = np.zeros((len(views), *counting[0].shape), int)
+    np.add.at(counts, (number, row, column), 1)
+    assert (counts[~np.stack(counting)] == 0).all()
+    # Of a Poisson distribution with mean and variance 400.
+    scores = (counts[np.stack(counting)] - 400.0) / 20.0
+    assert np.abs(scores).max() < 5.0 and scores.std() == pytest.approx(1.0, abs=0.05)
+    for index, view in enumerate(views):
+        rays = camera_rays(view.camera, Workers(device, 1))[1].numpy()
+        at = row[number == index] * view.camera.width + column[number == index]
+        assert np.array_equal(batch["directions"][number == index], rays[at])
+
+
+def test_a_mask_of_all_pixels_changes_no_bit(device: str) -> None:
+    views = small_scene().views
+    whole = [replace(v, mask=np.ones(v.image.shape[:2], bool)) for v in views]
+    options = (2.0, None, N_RAYS, True, 0, Workers(device, 2))
+    one, other = (drawn(PixelSampler(v, *options).draw(5)) for v in (views, whole))
+    for name, found in one.items():
+        assert np.array_equal(found, other[name])
+
+
+def test_runs_by_hand() -> None:
+    mask = np.array([[0, 1, 1, 0], [1, 0, 0, 1], [1, 1, 0, 1]], bool)
+    assert runs_of(mask).tolist() == [[0, 1], [2, 4], [3, 7], [6, 11]]
+    assert runs_of(np.ones((2, 3), bool)).tolist() == [[0, 0]]

@@ -128,14 +128,14 @@ def test_image_listed_twice_is_noted(tmp_path: Path) -> None:
 
 def test_keys_that_change_the_picture_are_named(tmp_path: Path) -> None:
     def change(content: dict[str, Any]) -> None:
-        content["frames"][2]["mask_path"] = "masks/002.png"
+        content["frames"][2]["white_transparent"] = True
         content["frames"][2]["depth_file_path"] = "depth/002.png"
         content |= {"aabb_scale": 4, "scale": 0.33, "offset": [0.5, 0.5, 0.5]}
         content["applied_transform"] = np.eye(4)[:3].tolist()
 
     scene = load_changed(tmp_path, change)
     assert [note for note in scene.warnings if "is not used" in note] == [
-        "transforms.json: mask_path is not used: masked pixels are trained on like all others"
+        "transforms.json: white_transparent is not used: white stays opaque"
     ]
     assert scene.content_distance == pytest.approx(np.sqrt(10.0))
 

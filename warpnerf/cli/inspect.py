@@ -19,6 +19,7 @@ def inspect_command(
     output: Path | None = None,
     json: Path | None = None,
     downscale: int = 1,
+    masks: Path | None = None,
     content_distance: float | None = None,
     near: float = 0.0,
     model: str | None = None,
@@ -33,6 +34,7 @@ def inspect_command(
         output: FILE.png for a plan: cameras, box and content distance from above and the side.
         json: Also write all of it to this file.
         downscale: As training will be given.
+        masks: As training will be given.
         content_distance: As training will be given; by default the estimate.
         near: As training will be given.
         model: As training will be given: deferred, features, sh, or rgb.
@@ -52,6 +54,7 @@ def inspect_command(
     found = inspect(
         scene,
         downscale=downscale,
+        masks=masks,
         content_distance=content_distance,
         near=near,
         model=chosen_model(PRESETS["fast"].model, model, model_options),

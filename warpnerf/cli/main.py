@@ -60,6 +60,7 @@ def train_command(
     voxels: int | None = None,
     near: float | None = None,
     downscale: int | None = None,
+    masks: Path | None = None,
     device: str | None = None,
     threads: int | None = None,
     seed: int | None = None,
@@ -86,6 +87,8 @@ def train_command(
         voxels: Nodes of the final grid, in all; memory goes with their number.
         near: Nothing is sampled nearer to the camera than this, in the scene's units.
         downscale: Average blocks of so many pixels squared; by default 1, as they are.
+        masks: Folder of images named after the photographs, white where pixels count and black
+            where they are ignored; with --resume only if it has moved.
         device: cpu, cuda, cuda:1, ...
         threads: CPU threads; by default one per usable core, or as the resumed run had.
         seed: Same seed and threads: same result on the CPU.
@@ -123,19 +126,21 @@ def train_command(
                     f"--{name} does not go with --resume: the run in {resume} goes on as it was "
                     "begun; leave it out."
                 )
-        return _resume(resume, scene, changed)
+        return _resume(resume, scene, masks, changed)
     if scene is None or output is None:
         raise InputError(
             "train wants a SCENE and --output DIR for a new run, or --resume DIR to go on with one."
         )
     config = changed(PRESETS[preset or "fast"])
-    return _begin(scene, output, 1 if downscale is None else downscale, config, overwrite)
+    factor = 1 if downscale is None else downscale
+    return _begin(scene, output, factor, masks, config, overwrite)
 
 
 def eval_command(
     folder: tyro.conf.Positional[Path],
     /,
     scene: str | None = None,
+    masks: Path | None = None,
     split: Literal["test", "train", "val", "all"] = "test",
     lpips: Path | None = None,
     json: Path | None = None,
@@ -147,6 +152,7 @@ def eval_command(
     Args:
         folder: Output folder of a training run.
         scene: Other photographs in the same coordinates, reduced as those of the training were.
+        masks: Folder of masks for these photographs; without --scene by default as for training.
         split: Which views.
         lpips: Weights of LPIPS, to measure it as well; warpnerf/evaluation/lpips.py describes the
             file.
@@ -169,7 +175,8 @@ def eval_command(
     field, notes = run.load_field(device, threads)
     for note in notes:
         print(f"warpnerf: note: {note}", file=sys.stderr)
-    views = load_scene(scene or config.scene, downscale=config.downscale)
+    folder_of_masks = masks or (config.masks if scene is None else None)
+    views = load_scene(scene or config.scene, downscale=config.downscale, masks=folder_of_masks)
     require_measurable(views, split)
     result = evaluate(field, views, split, lpips=distance)
     print(result)
@@ -178,7 +185,14 @@ def eval_command(
     return 0
 
 
-def _begin(source: str, output: Path, downscale: int, config: TrainConfig, overwrite: bool) -> int:
+def _begin(
+    source: str,
+    output: Path,
+    downscale: int,
+    masks: Path | None,
+    config: TrainConfig,
+    overwrite: bool,
+) -> int:
     """Train from the first step on."""
     from warpnerf.scenes.files import exists
 
@@ -186,7 +200,7 @@ def _begin(source: str, output: Path, downscale: int, config: TrainConfig, overw
         from warpnerf.training.run import Run
 
         Run.require_free(output, overwrite)
-    scene = _read(source, downscale)
+    scene = _read(source, downscale, masks)
 
     # Not before: these load Warp, and bad input is refused at once.
     from warpnerf.evaluation.inspection import oddities
@@ -201,27 +215,39 @@ def _begin(source: str, output: Path, downscale: int, config: TrainConfig, overw
     run = Run(output)
     with run.only_writer():
         Run.require_free(output, overwrite)  # once more, now that nobody else begins there
-        run.create(scene, _absolute(source), downscale, trainer.content_distance, config)
+        folder = None if masks is None else str(masks.resolve())
+        distance = trainer.content_distance
+        run.create(scene, _absolute(source), downscale, distance, config, folder)
         return _train(run, scene, trainer)
 
 
-def _resume(folder: Path, moved: str | None, changed: Callable[[TrainConfig], TrainConfig]) -> int:
+def _resume(
+    folder: Path,
+    moved: str | None,
+    masks: Path | None,
+    changed: Callable[[TrainConfig], TrainConfig],
+) -> int:
     """Train from the last checkpoint on."""
     from warpnerf.training.run import Run
 
     Run(folder).read_config()
     with Run(folder).only_writer():
-        return _go_on(Run(folder), moved, changed)
+        return _go_on(Run(folder), moved, masks, changed)
 
 
-def _go_on(run: Run, moved: str | None, changed: Callable[[TrainConfig], TrainConfig]) -> int:
+def _go_on(
+    run: Run,
+    moved: str | None,
+    masks: Path | None,
+    changed: Callable[[TrainConfig], TrainConfig],
+) -> int:
     from warpnerf.training.trainer import Trainer
 
     begun = run.read_config()
     state, notes = run.load_state()
     config = changed(state.config)
     state.require_same_config(config)
-    scene = _read(moved or begun.scene, begun.downscale)
+    scene = _read(moved or begun.scene, begun.downscale, masks or begun.masks)
     trainer = Trainer(scene, config, state)
     _describe(scene, trainer.content_distance, config)
     for note in notes:
@@ -236,12 +262,12 @@ def _go_on(run: Run, moved: str | None, changed: Callable[[TrainConfig], TrainCo
     return _train(run, scene, trainer)
 
 
-def _read(source: str, downscale: int) -> Scene:
+def _read(source: str, downscale: int, masks: Path | str | None) -> Scene:
     from warpnerf.evaluation.evaluate import require_measurable
     from warpnerf.scenes.load import load_scene
 
     print(f"reading {source}", flush=True)
-    scene = load_scene(source, downscale=downscale)
+    scene = load_scene(source, downscale=downscale, masks=masks)
     require_measurable(scene, _split_to_look_at(scene))
     return scene
 

@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from warpnerf.checks import InputError
-from warpnerf.evaluation.metrics import SSIM_WINDOW, flip, has_flip, psnr, ssim
+from warpnerf.evaluation.metrics import (
+    SSIM_WINDOW,
+    alike_where_masked,
+    flip,
+    has_flip,
+    psnr,
+    ssim,
+)
 from warpnerf.evaluation.near_field import NearField, measure_near_field
 from warpnerf.runtime.terminal import table_text
 from warpnerf.scenes.scene import Scene, View, require_split
@@ -35,18 +42,19 @@ HEADINGS = {
 
 @dataclass(frozen=True, kw_only=True)
 class ImageMetrics:
-    """One view's figures."""
+    """One view's figures, over the pixels that its mask keeps."""
 
     name: str
     """The view's."""
     psnr: float
     """dB."""
-    ssim: float
-    """At most 1."""
+    ssim: float | None
+    """At most 1; None where a mask leaves no window of it."""
     flip: float | None = None
     """0 for equal images, at most 1; where the package flip-evaluator is installed."""
     lpips: float | None = None
-    """0 for equal images; where its weights were given."""
+    """0 for equal images; where its weights were given. Of the whole image: pixels that do not
+    count are taken to be alike."""
     depth_error: float | None = None
     """Mean |depth - true depth|, scene units, over the pixels whose true depth is known."""
 
@@ -124,16 +132,19 @@ def evaluate(
         target = truth(view, field.background)
         rgb = np.clip(rendering.rgb, 0.0, 1.0)
         depth_error = None
+        mask = view.mask
         if view.depth is not None:
-            error = np.abs(rendering.depth - view.depth)
-            depth_error = float(np.mean(error[np.isfinite(view.depth)]))
+            known = np.isfinite(view.depth) & (True if mask is None else mask)
+            if known.any():
+                depth_error = float(np.mean(np.abs(rendering.depth - view.depth)[known]))
+        alike = alike_where_masked(rgb, target, mask)
         images.append(
             ImageMetrics(
                 name=view.name,
-                psnr=psnr(rgb, target),
-                ssim=ssim(rgb, target),
-                flip=flip(rgb, target) if has_flip() else None,
-                lpips=None if lpips is None else lpips(rgb, target),
+                psnr=psnr(rgb, target, mask),
+                ssim=ssim(rgb, target, mask),
+                flip=flip(rgb, target, mask) if has_flip() else None,
+                lpips=None if lpips is None else lpips(alike, target),
                 depth_error=depth_error,
             )
         )

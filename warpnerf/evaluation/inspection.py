@@ -163,6 +163,7 @@ def inspect(
     path: str | Path,
     *,
     downscale: int = 1,
+    masks: str | Path | None = None,
     content_distance: float | None = None,
     near: float = 0.0,
     model: Model | None = None,
@@ -173,6 +174,7 @@ def inspect(
     Args:
         path: As for ``load_scene``.
         downscale: As for ``load_scene``.
+        masks: As for ``load_scene``.
         content_distance: The one that training will be given, scene units; None: the estimate.
         near: The near plane that training will be given, scene units.
         model: That will be trained; None: that of the presets.
@@ -189,7 +191,7 @@ def inspect(
         require_positive("content_distance", content_distance)
     found = survey(path)
     try:
-        scene = load_scene(path, downscale=downscale)
+        scene = load_scene(path, downscale=downscale, masks=masks)
     except InputError as error:
         others = [place for place in found.refused if place not in str(error)]
         if not others:

@@ -19,31 +19,39 @@ _RADIUS = SSIM_WINDOW // 2
 _SIGMA = 1.5
 
 
-def psnr(rgb: np.ndarray, target: np.ndarray) -> float:
+def psnr(rgb: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None) -> float:
     """Peak signal-to-noise ratio, dB: -10 log10 of the mean squared error, at most MAX_PSNR.
 
     Args:
         rgb: [H, W, 3] in [0, 1].
         target: The same shape.
+        mask: [H, W] bool, at least one pixel true: those that count; None: all.
 
     Raises:
         InputError: Shapes differ, or a value is not finite.
     """
     a, b = _checked(rgb, target)
-    error = float(np.mean((a - b) ** 2))
+    error = float(np.mean((a - b)[... if mask is None else mask] ** 2))
     return -10.0 * math.log10(max(error, 10.0 ** (-MAX_PSNR / 10.0)))
 
 
-def ssim(rgb: np.ndarray, target: np.ndarray) -> float:
+def ssim(rgb: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None) -> float | None:
     """Structural similarity, mean over pixels and channels; 1 for equal images.
 
     Windows are 11 x 11 Gaussians of deviation 1.5, variances are those of the window's weights
     (no sample correction), constants are (0.01)^2 and (0.03)^2, and only windows that lie inside
     the image count. Source: Wang et al. 2004, with the settings of mip-NeRF and DVGO.
 
+    With a mask only windows around pixels that count do, and in them the weights of pixels that do
+    not are 0, those of the others as much larger.
+
     Args:
         rgb: [H, W, 3] in [0, 1], at least 11 x 11.
         target: The same shape.
+        mask: [H, W] bool, true for pixels that count; None: all.
+
+    Returns:
+        At most 1; None where the mask leaves no window.
 
     Raises:
         InputError: Shapes differ, an image is too small, or a value is not finite.
@@ -51,14 +59,25 @@ def ssim(rgb: np.ndarray, target: np.ndarray) -> float:
     a, b = _checked(rgb, target)
     if min(a.shape[:2]) < SSIM_WINDOW:
         raise InputError(f"SSIM needs images of at least 11 x 11 pixels, not {a.shape[:2]}.")
-    mean_a, mean_b = _blur(a), _blur(b)
-    var_a, var_b = _blur(a * a) - mean_a**2, _blur(b * b) - mean_b**2
-    covariance = _blur(a * b) - mean_a * mean_b
+    mean, middles = _blur, None
+    if mask is not None:
+        middles = mask[_RADIUS:-_RADIUS, _RADIUS:-_RADIUS]
+        if not middles.any():
+            return None
+        weights = mask[..., None].astype(np.float64)
+        total = np.maximum(_blur(weights), 1e-12)  # 0 only around pixels that do not count
+
+        def mean(image: np.ndarray) -> np.ndarray:
+            return _blur(weights * image) / total
+
+    mean_a, mean_b = mean(a), mean(b)
+    var_a, var_b = mean(a * a) - mean_a**2, mean(b * b) - mean_b**2
+    covariance = mean(a * b) - mean_a * mean_b
     c1, c2 = 0.01**2, 0.03**2
     similarity = ((2 * mean_a * mean_b + c1) * (2 * covariance + c2)) / (
         (mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2)
     )
-    return float(similarity.mean())
+    return float((similarity if middles is None else similarity[middles]).mean())
 
 
 def has_flip() -> bool:
@@ -66,7 +85,7 @@ def has_flip() -> bool:
     return importlib.util.find_spec("flip_evaluator") is not None
 
 
-def flip(rgb: np.ndarray, target: np.ndarray) -> float:
+def flip(rgb: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None) -> float:
     """LDR-FLIP, mean over pixels: the difference seen when one image takes the other's place.
 
     Between 0, for equal images, and 1; of images 0.7 m away on a screen 0.7 m and 3840 pixels wide,
@@ -75,6 +94,8 @@ def flip(rgb: np.ndarray, target: np.ndarray) -> float:
     Args:
         rgb: [H, W, 3] in [0, 1], sRGB.
         target: The same shape.
+        mask: [H, W] bool, at least one pixel true: those that count; the others are taken to be
+            alike in both. None: all.
 
     Raises:
         InputError: Shapes differ, a value is not finite, or the package is not installed.
@@ -84,8 +105,15 @@ def flip(rgb: np.ndarray, target: np.ndarray) -> float:
         raise InputError("FLIP needs its package; install it with: pip install flip-evaluator.")
     from flip_evaluator import evaluate
 
+    a = alike_where_masked(a, b, mask)
     reference, test = (np.ascontiguousarray(image, np.float32) for image in (b, a))
-    return float(evaluate(reference, test, "LDR", applyMagma=False)[1])
+    errors, mean, _ = evaluate(reference, test, "LDR", applyMagma=False)
+    return float(mean if mask is None else np.asarray(errors).reshape(mask.shape)[mask].mean())
+
+
+def alike_where_masked(rgb: np.ndarray, target: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
+    """An image [H, W, 3] with the target's pixels where a mask [H, W] is false."""
+    return rgb if mask is None else np.where(mask[..., None], rgb, target)
 
 
 def _checked(rgb: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

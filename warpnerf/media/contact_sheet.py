@@ -9,7 +9,15 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image, ImageDraw
 
-from warpnerf.media.pictures import FAINT, INK, depth_legend, depth_picture, font, to_bytes
+from warpnerf.media.pictures import (
+    FAINT,
+    INK,
+    depth_legend,
+    depth_picture,
+    dimmed,
+    font,
+    to_bytes,
+)
 from warpnerf.rendering.field import Rendering
 
 N_ROWS = 4
@@ -42,6 +50,8 @@ class SheetRow:
     depth: np.ndarray | None = None
     """True distance along each pixel's ray, [H, W], scene units; not finite where it is unknown.
     None: not known."""
+    mask: np.ndarray | None = None
+    """[H, W] bool; the photograph is pale where it is false."""
 
 
 def spread(count: int, most: int = N_ROWS) -> list[int]:
@@ -99,7 +109,11 @@ def contact_sheet(rows: Sequence[SheetRow], title: str, near: float, far: float)
 
 def _panels(row: SheetRow, near: float, far: float) -> list[np.ndarray]:
     """[H, W, 3] in [0, 1], column by column."""
-    panels = [row.target, row.rendering.rgb, depth_picture(row.rendering, near, far)]
+    panels = [
+        dimmed(row.target, row.mask),
+        row.rendering.rgb,
+        depth_picture(row.rendering, near, far),
+    ]
     if row.depth is not None:
         known = np.isfinite(row.depth)
         truth = Rendering(

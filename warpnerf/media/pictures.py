@@ -80,7 +80,18 @@ def depth_picture(rendering: Rendering, near: float, far: float) -> np.ndarray:
     return opacity * depth_colours(surface, near, far) + (1.0 - opacity)
 
 
-def comparison(target: np.ndarray, rendering: Rendering, near: float, far: float) -> np.ndarray:
+def dimmed(rgb: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
+    """An image [H, W, 3] in [0, 1], pale where a mask [H, W] is false; None: as it is."""
+    return rgb if mask is None else np.where(mask[..., None], rgb, 0.25 * rgb + 0.7)
+
+
+def comparison(
+    target: np.ndarray,
+    rendering: Rendering,
+    near: float,
+    far: float,
+    mask: np.ndarray | None = None,
+) -> np.ndarray:
     """Truth, rendering and depth side by side, above a legend of the depths' colours.
 
     Args:
@@ -88,11 +99,14 @@ def comparison(target: np.ndarray, rendering: Rendering, near: float, far: float
         rendering: Of the same size.
         near: Depth of the first colour, scene units.
         far: Depth of the last.
+        mask: [H, W] bool; the truth is pale where it is false.
 
     Returns:
         [H + legend, 3 W + 8, 3] uint8.
     """
-    return _above_legend([target, rendering.rgb, depth_picture(rendering, near, far)], near, far)
+    return _above_legend(
+        [dimmed(target, mask), rendering.rgb, depth_picture(rendering, near, far)], near, far
+    )
 
 
 def colour_and_depth(rendering: Rendering, near: float, far: float) -> np.ndarray:

@@ -134,23 +134,26 @@ class PixelSampler:
         self._random_background = background is None
         self._background = vec3(*(background or (0.0, 0.0, 0.0)))
         self._jitter = jitter
-        firsts = np.cumsum([0] + [v.camera.width * v.camera.height for v in views])
+        firsts = np.cumsum([0] + [_n_counting(view) for view in views])
         if firsts[-1] >= 2**31:
             raise InputError(
                 f"the training views have {firsts[-1]} pixels, 2^31 or more; use --downscale."
             )
-        self._views = wp.array(
-            [
-                view_struct(v.camera, int(first))
-                for v, first in zip(views, firsts[:-1], strict=True)
-            ],
-            dtype=kernels.View,
-            device=workers.device,
-        )
+        structs = [
+            view_struct(v.camera, int(first)) for v, first in zip(views, firsts[:-1], strict=True)
+        ]
+        self._runs = []  # the structs only point to them
+        for view, struct in zip(views, structs, strict=True):
+            if view.mask is not None:
+                runs = wp.array(runs_of(view.mask), dtype=wp.vec2i, device=workers.device)
+                struct.runs = runs
+                self._runs.append(runs)
+        self._views = wp.array(structs, dtype=kernels.View, device=workers.device)
         pixels = np.full((firsts[-1], 4), 255, np.uint8)
         for view, first, end in zip(views, firsts[:-1], firsts[1:], strict=True):
             channels = view.image.shape[2]
-            pixels[first:end, :channels] = view.image.reshape(-1, channels)
+            counting = slice(None) if view.mask is None else view.mask.ravel()
+            pixels[first:end, :channels] = view.image.reshape(-1, channels)[counting]
         self._pixels = wp.array(pixels, dtype=wp.vec4ub, device=workers.device)
 
         self._content_distances = wp.full(
@@ -193,6 +196,29 @@ class PixelSampler:
             cache=self._launches,
         )
         return batch
+
+
+def _n_counting(view: View) -> int:
+    """Pixels of a view that its mask keeps."""
+    whole = view.camera.width * view.camera.height
+    return whole if view.mask is None else int(np.count_nonzero(view.mask))
+
+
+def runs_of(mask: np.ndarray) -> np.ndarray:
+    """Where the pixels that count lie, as ``View.runs`` of the kernels.
+
+    Args:
+        mask: [H, W] bool, true where a pixel counts.
+
+    Returns:
+        [n_runs, 2] int32: for each run of such pixels, row by row, how many come before it, and
+        its first pixel.
+    """
+    flat = mask.ravel()
+    edges = np.flatnonzero(np.diff(flat, prepend=False, append=False))
+    begins, ends = edges[::2], edges[1::2]
+    before = np.concatenate([[0], np.cumsum(ends - begins)[:-1]])
+    return np.stack([before, begins], axis=1).astype(np.int32)
 
 
 def _room(n_rays: int, workers: Workers) -> RayBatch:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +15,15 @@ from warpnerf.runtime.memory import usable_cores, usable_memory
 from warpnerf.scenes.files import find_image
 from warpnerf.scenes.images import read_image
 from warpnerf.scenes.lens import Lens
+from warpnerf.scenes.masks import Mask, masks_of_folder, read_mask
 from warpnerf.scenes.scene import Scene, View, estimate_extent
+from warpnerf.scenes.undistort import seen_pixels
 
 COPIED_BYTES = 8
 """Per pixel: with alpha for the device, and on the way there once more."""
+
+LITTLE = 0.1
+"""Share of the pixels that masks leave, below which they are likely to be inverted."""
 
 HOLD_OUT = 8
 """Without a split in the file every 8th image is for testing, as in LLFF and Mip-NeRF 360."""
@@ -35,6 +40,8 @@ class Frame:
     c2w: np.ndarray
     """[3, 4] float64, OpenGL axes, scene units."""
     lens: Lens
+    mask: Mask | None = None
+    """Which pixels count; None: all."""
 
 
 def find_images(
@@ -90,6 +97,7 @@ def assemble(
     splits: Mapping[str, set[str]],
     warnings: Sequence[str],
     downscale: int,
+    masks: Path | None,
 ) -> Scene:
     """Read the images and make the scene.
 
@@ -101,20 +109,28 @@ def assemble(
             ``complete_splits``.
         warnings: Of what is odd so far; the result's begin with them.
         downscale: Edge of the blocks of pixels that become one.
+        masks: Folder of masks, which take the place of those that frames have.
 
     Raises:
-        InputError: An image, the split or the placement of the cameras is of no use.
+        InputError: An image, a mask, the split or the placement of the cameras is of no use.
     """
     frames = sorted(frames, key=lambda frame: frame.name)
     complete, notes = complete_splits(file, [frame.name for frame in frames], splits)
     used = set().union(*complete.values())
     frames = [frame for frame in frames if frame.name in used]
+    if masks is not None:
+        found = masks_of_folder(masks, [frame.name for frame in frames])
+        frames = [replace(frame, mask=mask) for frame, mask in zip(frames, found, strict=True)]
 
     first = _read_view(frames[0], downscale)
-    _require_memory(file, first, len(frames), downscale)
+    if first is not None:
+        _require_memory(file, first, len(frames), downscale)
     # Decoders release the interpreter lock. The first error cancels what is not yet read.
     with ThreadPoolExecutor(usable_cores()) as pool:
-        views = [first, *pool.map(lambda frame: _read_view(frame, downscale), frames[1:])]
+        read = [first, *pool.map(lambda frame: _read_view(frame, downscale), frames[1:])]
+    views = [view for view in read if view is not None]
+    complete, mask_warnings = _without_masked(file, frames, views, complete)
+    notes += _mask_notes(views)
 
     index = {view.name: i for i, view in enumerate(views)}
     indices = {
@@ -136,7 +152,7 @@ def assemble(
         unbounded=unbounded,
         content_distance=extent.content_distance,
         notes=(*notes, *extent.notes),
-        warnings=(*warnings, *_oddities(views, complete)),
+        warnings=(*warnings, *mask_warnings, *_oddities(views, complete)),
     )
 
 
@@ -192,6 +208,54 @@ def _require_memory(file: Path, first: View, n_images: int, downscale: int) -> N
         )
 
 
+def _without_masked(
+    file: Path, frames: Sequence[Frame], views: Sequence[View], splits: dict[str, set[str]]
+) -> tuple[dict[str, set[str]], list[str]]:
+    """The splits without images of which masks leave nothing, and warnings of what masks leave.
+
+    Raises:
+        InputError: No training image is left.
+    """
+    left = {view.name for view in views}
+    gone = [frame.name for frame in frames if frame.name not in left]
+    splits = {split: names & left for split, names in splits.items()}
+    if not splits["train"]:
+        raise InputError(
+            f"{file}: the masks leave no pixel of any training image; white pixels count, black "
+            "ones are ignored, so invert the masks if they are the other way round."
+        )
+    warnings = []
+    if gone:
+        warnings.append(
+            f"left out {len(gone)} of {len(frames)} images of which masks leave no pixel (first: "
+            f"{gone[0]})"
+        )
+    share = _share_kept(views)
+    if share < LITTLE:
+        warnings.append(
+            f"masks leave {share:.1%} of the pixels: white ones count, black ones are ignored, so "
+            "invert the masks if they are the other way round"
+        )
+    return splits, warnings
+
+
+def _mask_notes(views: Sequence[View]) -> list[str]:
+    """That there are masks, and what they leave."""
+    masked = sum(view.mask is not None for view in views)
+    if not masked:
+        return []
+    return [
+        f"{masked} of {len(views)} images have pixels that are ignored; {_share_kept(views):.1%} "
+        "of all pixels count"
+    ]
+
+
+def _share_kept(views: Sequence[View]) -> float:
+    pixels = sum(view.camera.width * view.camera.height for view in views)
+    ignored = sum(int((~view.mask).sum()) for view in views if view.mask is not None)
+    return 1.0 - ignored / pixels
+
+
 def _oddities(views: Sequence[View], splits: Mapping[str, set[str]]) -> list[str]:
     """Warnings of photographs that can be used, and yet are likely not what was meant."""
     warnings = []
@@ -231,7 +295,8 @@ def _copies(views: Sequence[View]) -> list[tuple[str, str]]:
     return pairs
 
 
-def _read_view(frame: Frame, downscale: int) -> View:
+def _read_view(frame: Frame, downscale: int) -> View | None:
+    """The photograph of a frame; None where its mask leaves no pixel of it."""
     image = read_image(frame.path)
     height, width = image.shape[:2]
     camera = frame.lens.camera(width=width, height=height, c2w=frame.c2w, image=frame.name)
@@ -242,7 +307,15 @@ def _read_view(frame: Frame, downscale: int) -> View:
         )
     if downscale > 1:
         camera, image = camera.downscaled(downscale), box_filter(image, downscale)
-    return View(name=frame.name, camera=camera, image=image)
+    mask = seen_pixels(camera)
+    if frame.mask is not None:
+        given = read_mask(frame.mask, width=width, height=height, downscale=downscale)
+        mask = given if mask is None else mask & given
+    if mask is not None and not mask.any():
+        return None
+    if mask is not None and mask.all():
+        mask = None
+    return View(name=frame.name, camera=camera, image=image, mask=mask)
 
 
 def box_filter(image: np.ndarray, factor: int) -> np.ndarray:

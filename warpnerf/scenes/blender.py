@@ -22,7 +22,7 @@ def split_file(split: str) -> str:
     return f"transforms_{split}.json"
 
 
-def load_blender(folder: Path, *, downscale: int = 1) -> Scene:
+def load_blender(folder: Path, *, downscale: int = 1, masks: Path | None = None) -> Scene:
     """Load a scene from transforms_train.json and its siblings.
 
     Without transforms_test.json every 8th training image is for testing.
@@ -30,6 +30,7 @@ def load_blender(folder: Path, *, downscale: int = 1) -> Scene:
     Args:
         folder: The scene's folder; image paths are relative to it and stay inside it.
         downscale: Edge of the blocks of pixels that become one.
+        masks: Folder of masks for all photographs.
 
     Raises:
         InputError: Something in the files or the images is wrong; the message names it.
@@ -54,4 +55,5 @@ def load_blender(folder: Path, *, downscale: int = 1) -> Scene:
         splits=splits,
         warnings=warnings,
         downscale=downscale,
+        masks=masks,
     )

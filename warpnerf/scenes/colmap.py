@@ -28,6 +28,7 @@ from warpnerf.scenes.files import (
 )
 from warpnerf.scenes.images import image_size
 from warpnerf.scenes.lens import Lens
+from warpnerf.scenes.masks import mask_in
 from warpnerf.scenes.poses import check_pose
 from warpnerf.scenes.scene import Scene
 
@@ -111,7 +112,7 @@ def scene_folder(model: Path) -> Path:
     return model
 
 
-def load_colmap(model: Path, *, downscale: int = 1) -> Scene:
+def load_colmap(model: Path, *, downscale: int = 1, masks: Path | None = None) -> Scene:
     """Load a scene from a sparse model.
 
     Every 8th photograph is for testing. The model's points are not used.
@@ -119,6 +120,7 @@ def load_colmap(model: Path, *, downscale: int = 1) -> Scene:
     Args:
         model: Folder of cameras.bin and images.bin, or of cameras.txt and images.txt.
         downscale: Edge of the blocks of pixels that become one.
+        masks: Folder of masks for all photographs.
 
     Returns:
         The scene; distances are the model's.
@@ -156,7 +158,9 @@ def load_colmap(model: Path, *, downscale: int = 1) -> Scene:
             raise InputError(f"{field}: its camera {image.camera} is not in {camera_file.name}.")
         camera, reduced = cameras[image.camera], photographs.name != "images"
         lens = _lens(camera_file, image.camera, camera, path, reduced)
-        frames.append(Frame(name=image.name, path=path, c2w=_pose(image, field), lens=lens))
+        mask = mask_in(folder / "masks", image.name)
+        pose = _pose(image, field)
+        frames.append(Frame(name=image.name, path=path, c2w=pose, lens=lens, mask=mask))
     if not frames:
         raise InputError(
             f"{image_file}: none of the model's {len(images)} photographs is in {photographs} "
@@ -175,6 +179,7 @@ def load_colmap(model: Path, *, downscale: int = 1) -> Scene:
         splits={},
         warnings=warnings,
         downscale=downscale,
+        masks=masks,
     )
 
 

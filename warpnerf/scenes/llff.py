@@ -23,12 +23,13 @@ FILE = "poses_bounds.npy"
 ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".ppm")
 
 
-def load_llff(folder: Path, *, downscale: int = 1) -> Scene:
+def load_llff(folder: Path, *, downscale: int = 1, masks: Path | None = None) -> Scene:
     """Load a scene from poses_bounds.npy. Every 8th photograph is for testing.
 
     Args:
         folder: The scene's folder, with images/ or images_4/, images_8/, ...
         downscale: Edge of the blocks of pixels that become one.
+        masks: Folder of masks for all photographs.
 
     Returns:
         The scene; distances are the file's.
@@ -79,5 +80,11 @@ def load_llff(folder: Path, *, downscale: int = 1) -> Scene:
             )
         )
     return assemble(
-        folder=folder, file=file, frames=frames, splits={}, warnings=(), downscale=downscale
+        folder=folder,
+        file=file,
+        frames=frames,
+        splits={},
+        warnings=(),
+        downscale=downscale,
+        masks=masks,
     )

@@ -22,7 +22,7 @@ BUILTIN = "builtin:"
 BUILTIN_NAMES = ("room", "room-sparse")
 
 
-def load_scene(path: str | Path, *, downscale: int = 1) -> Scene:
+def load_scene(path: str | Path, *, downscale: int = 1, masks: str | Path | None = None) -> Scene:
     """Load a scene: photographs, cameras, split, and the extent estimated from the cameras.
 
     A folder is tried as Blender / NeRF-synthetic (transforms_train.json), then as instant-ngp or
@@ -32,6 +32,8 @@ def load_scene(path: str | Path, *, downscale: int = 1) -> Scene:
         path: A folder, a transforms*.json or poses_bounds.npy in it, the folder of a COLMAP model,
             or "builtin:" and the name of a built-in scene.
         downscale: Edge of the blocks of pixels that become one; 1 keeps the images as they are.
+        masks: Folder of masks, named after the photographs: pixels that are black there are neither
+            trained on nor measured. They take the place of masks that the scene brings itself.
 
     Returns:
         The scene; distances are the file's own.
@@ -43,34 +45,37 @@ def load_scene(path: str | Path, *, downscale: int = 1) -> Scene:
     if isinstance(downscale, bool) or not isinstance(downscale, int) or downscale < 1:
         raise InputError(f"downscale must be a whole number of at least 1, not {downscale!r}.")
     if isinstance(path, str) and path.startswith(BUILTIN):
+        if masks is not None:
+            raise InputError(f"--masks {masks}: {path} takes no masks; leave them out.")
         return _load_builtin(path.removeprefix(BUILTIN), downscale)
     path = Path(path)
+    masks = None if masks is None else Path(masks)
     if not exists(path):
         known = ", ".join(BUILTIN + name for name in BUILTIN_NAMES)
         raise InputError(
             f"{path}: does not exist; give a scene's folder, or a built-in scene ({known})."
         )
     if path.is_dir():
-        return _load_folder(path, downscale)
+        return _load_folder(path, downscale, masks)
     if path.name in [split_file(split) for split in SPLITS]:
-        return load_blender(path.parent, downscale=downscale)
+        return load_blender(path.parent, downscale=downscale, masks=masks)
     if re.fullmatch(r"transforms.*\.json", path.name):
-        return load_transforms(path, downscale=downscale)
+        return load_transforms(path, downscale=downscale, masks=masks)
     if path.name == llff.FILE:
-        return llff.load_llff(path.parent, downscale=downscale)
+        return llff.load_llff(path.parent, downscale=downscale, masks=masks)
     raise InputError(f"{path}: is not a scene; give its folder or a transforms*.json in it.")
 
 
-def _load_folder(folder: Path, downscale: int) -> Scene:
+def _load_folder(folder: Path, downscale: int, masks: Path | None) -> Scene:
     if exists(folder / split_file("train")):
-        return load_blender(folder, downscale=downscale)
+        return load_blender(folder, downscale=downscale, masks=masks)
     if exists(folder / "transforms.json"):
-        return load_transforms(folder / "transforms.json", downscale=downscale)
+        return load_transforms(folder / "transforms.json", downscale=downscale, masks=masks)
     model = find_model(folder)
     if model is not None:
-        return load_colmap(model, downscale=downscale)
+        return load_colmap(model, downscale=downscale, masks=masks)
     if exists(folder / llff.FILE):
-        return llff.load_llff(folder, downscale=downscale)
+        return llff.load_llff(folder, downscale=downscale, masks=masks)
     raise InputError(
         f"{folder}: no scene found: {_what_is_there(folder)}. A scene has {split_file('train')} "
         "(Blender), transforms.json (instant-ngp, nerfstudio), sparse/0 (COLMAP) or "

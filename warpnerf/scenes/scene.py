@@ -43,7 +43,11 @@ class View:
     image: np.ndarray
     """[H, W, 3] uint8 rgb, or [H, W, 4] uint8 rgb with straight (not premultiplied) alpha."""
     depth: np.ndarray | None = None
-    """[H, W] float32, true distance along each pixel's ray in scene units, where it is known."""
+    """[H, W] float32, true distance along each pixel's ray in scene units; not finite where it is
+    not known. None: not known."""
+    mask: np.ndarray | None = None
+    """[H, W] bool, true where a pixel counts; where it is false the pixel is neither trained on nor
+    measured. None: all count."""
 
     def __post_init__(self) -> None:
         """Refuse a photograph that is not its camera's.
@@ -67,6 +71,14 @@ class View:
                 f"{self.name}: depth must be {list(size)} as its camera is, not "
                 f"{list(self.depth.shape)}."
             )
+        if self.mask is not None:
+            if self.mask.shape != size or self.mask.dtype != np.bool_:
+                raise InputError(
+                    f"{self.name}: mask must be bool {list(size)} as its camera is, not "
+                    f"{self.mask.dtype} {list(self.mask.shape)}."
+                )
+            if not self.mask.any():
+                raise InputError(f"{self.name}: its mask leaves no pixel; leave out the view.")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

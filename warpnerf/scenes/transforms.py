@@ -14,11 +14,11 @@ from warpnerf.checks import InputError
 from warpnerf.scenes.assemble import Frame, assemble, find_images
 from warpnerf.scenes.files import find_image, read_json
 from warpnerf.scenes.lens import LensFields, read_lens
+from warpnerf.scenes.masks import Mask, mask_beside
 from warpnerf.scenes.poses import check_pose
 from warpnerf.scenes.scene import Scene
 
 IGNORED = {
-    "mask_path": "masked pixels are trained on like all others",
     "white_transparent": "white stays opaque",
     "black_transparent": "black stays opaque",
     "mask_color": "that colour stays opaque",
@@ -30,7 +30,6 @@ IGNORED = {
 class PictureKeys(LensFields):
     """A lens, and the keys that are named in a warning because they are not used."""
 
-    mask_path: object = None
     white_transparent: object = None
     black_transparent: object = None
     mask_color: object = None
@@ -42,18 +41,20 @@ class FrameEntry(PictureKeys, kw_only=True):
 
     file_path: str
     transform_matrix: list[list[float]]
+    mask_path: str | None = None
 
 
 class TransformsFile(PictureKeys, kw_only=True):
     """The whole file; other keys are allowed and not read."""
 
     frames: list[FrameEntry]
+    mask_path: str | None = None
     train_filenames: list[str] | None = None
     val_filenames: list[str] | None = None
     test_filenames: list[str] | None = None
 
 
-def load_transforms(file: Path, *, downscale: int = 1) -> Scene:
+def load_transforms(file: Path, *, downscale: int = 1, masks: Path | None = None) -> Scene:
     """Load a scene from a transforms.json.
 
     The split is the file's ``{train,val,test}_filenames``, else every 8th image is for testing.
@@ -61,6 +62,7 @@ def load_transforms(file: Path, *, downscale: int = 1) -> Scene:
     Args:
         file: The file; image paths in it are relative to its folder and stay inside it.
         downscale: Edge of the blocks of pixels that become one.
+        masks: Folder of masks for all photographs.
 
     Raises:
         InputError: Something in the file or its images is wrong; the message names it.
@@ -90,6 +92,7 @@ def load_transforms(file: Path, *, downscale: int = 1) -> Scene:
         splits=splits,
         warnings=warnings,
         downscale=downscale,
+        masks=masks,
     )
 
 
@@ -105,21 +108,42 @@ def read_frames(file: Path) -> tuple[TransformsFile, list[Frame], list[str]]:
     data = read_json(file, TransformsFile)
     found, warnings = find_images(file.parent, file, [entry.file_path for entry in data.frames])
     frames = []
+    unmasked = []
     for index, path in found.items():
         entry = data.frames[index]
         place = f"$.frames[{index}]"
+        mask = _mask(file, place, entry, data, path)
+        if mask is None and (entry.mask_path or data.mask_path):
+            unmasked.append(entry.file_path)
         frames.append(
             Frame(
                 name=path.relative_to(file.parent).as_posix(),
                 path=path,
                 c2w=check_pose(entry.transform_matrix, field=f"{file}: {place}.transform_matrix"),
                 lens=read_lens(file, [(place, entry), ("$", data)]),
+                mask=mask,
             )
+        )
+    if unmasked:
+        warnings.append(
+            f"{file.name}: the mask_path of {len(unmasked)} of {len(data.frames)} frames leads to "
+            f"no file, so all their pixels count (first: {unmasked[0]})"
         )
     for key, consequence in IGNORED.items():
         if getattr(data, key) or any(getattr(entry, key) for entry in data.frames):
             warnings.append(f"{file.name}: {key} is not used: {consequence}")
     return data, frames, warnings
+
+
+def _mask(
+    file: Path, place: str, entry: FrameEntry, data: TransformsFile, photograph: Path
+) -> Mask | None:
+    """The mask that a frame, or else the file, names, or that lies beside the photograph."""
+    for where, text in ((place, entry.mask_path), ("$", data.mask_path)):
+        if text:
+            path = find_image(file.parent, text, field=f"{file}: {where}.mask_path")
+            return None if path is None else Mask(path)
+    return mask_beside(photograph)
 
 
 def _listed_names(

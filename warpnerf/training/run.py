@@ -1,6 +1,6 @@
 """A run's folder: what was asked for, how it went, what came out.
 
-config.json                  scene, downscale, content distance used, training configuration
+config.json                  scene, downscale, masks, content distance used, training configuration
 log.jsonl                    a line for each progress report
 checkpoint-*.safetensors     the training after so many steps; the last two are kept
 field.safetensors            the trained field
@@ -63,6 +63,8 @@ class RunConfig(msgspec.Struct, frozen=True):
     """The one in use, scene units."""
     train: TrainConfig
     """What was asked for."""
+    masks: str | None = None
+    """Absolute path of the folder of masks that was given for all photographs; None: none was."""
     pictures: list[str] | None = None
     """File names of the pictures in test/; None in runs of the version before, which wrote all."""
 
@@ -138,6 +140,7 @@ class Run:
         downscale: int,
         content_distance: float,
         config: TrainConfig,
+        masks: str | None = None,
     ) -> None:
         """Make the folder and write its configuration; an older run's files go to previous/.
 
@@ -147,6 +150,7 @@ class Run:
         content = {
             "scene": source,
             "downscale": downscale,
+            "masks": masks,
             "content_distance": content_distance,
             "box_min": scene.box_min.tolist(),
             "box_max": scene.box_max.tolist(),
@@ -292,7 +296,7 @@ class Run:
         def picture(view: View, target: np.ndarray, rendering: Rendering) -> None:
             path = self.folder / "test" / files[view.name]
             with self._writing():
-                write_png(path, comparison(target, rendering, near, far))
+                write_png(path, comparison(target, rendering, near, far, view.mask))
             if view.name in on_sheet:
                 seen[view.name] = view, target, rendering
 
@@ -306,6 +310,7 @@ class Run:
                 target=seen[image.name][1],
                 rendering=seen[image.name][2],
                 depth=seen[image.name][0].depth,
+                mask=seen[image.name][0].mask,
             )
             for image in result.images
             if image.name in seen

@@ -80,7 +80,7 @@ class TrainingState:
         if scene_digest(scene) != self.scene_digest:
             raise InputError(
                 f"{scene.name} is not what the training to be resumed has seen: its photographs, "
-                "cameras or split have changed; bring them back, or start a new training."
+                "masks, cameras or split have changed; bring them back, or start a new training."
             )
 
     def require_same_config(self, config: TrainConfig) -> None:
@@ -118,7 +118,7 @@ def _pairs(prefix: str, ours: Any, theirs: Any) -> Iterator[tuple[str, Any, Any]
 
 
 def scene_digest(scene: Scene) -> str:
-    """SHA-256 over what training draws from: pixels and cameras of the training views.
+    """SHA-256 over what training draws from: pixels, masks and cameras of the training views.
 
     Poses count to 1e-5 of the content distance, and pixels of the camera to 1e-3: another machine
     may round what it computes of them otherwise.
@@ -138,4 +138,6 @@ def scene_digest(scene: Scene) -> str:
         digest.update(f"{view.image.shape}".encode())
         digest.update((np.concatenate(numbers) + 0.0).tobytes())  # no -0
         digest.update(np.ascontiguousarray(view.image).data)
+        if view.mask is not None:
+            digest.update(b"mask" + np.packbits(view.mask).tobytes())
     return digest.hexdigest()

@@ -31,7 +31,8 @@ class View:
     k4: real  # of a fisheye lens
     angle_max: real  # of a fisheye lens: up to where the distorted angle rises, radians
     width: int  # pixels
-    first_pixel: int  # index of its pixel (0, 0)
+    first_pixel: int  # how many pixels count in the views before
+    runs: wp.array(dtype=wp.vec2i)  # of pixels that count: how many before, the first; none: all
 
 
 @wp.func
@@ -188,12 +189,28 @@ def view_of_pixel(views: wp.array(dtype=View), pixel: int) -> int:
     return low
 
 
+@wp.func
+def counting_pixel(view: View, number: int) -> int:
+    """The pixel of a view that has so many before it that count."""
+    if view.runs.shape[0] == 0:
+        return number
+    low = int(0)
+    high = int(view.runs.shape[0])
+    while high - low > 1:
+        middle = (low + high) // 2
+        before = view.runs[middle][0] <= number
+        low = wp.where(before, middle, low)
+        high = wp.where(before, high, middle)
+    run = view.runs[low]
+    return run[1] + number - run[0]
+
+
 @wp.kernel
 def sample_pixels(
     first: int,  # this launch makes rays first, first + 1, ...
     # photographs
     views: wp.array(dtype=View),  # [n_views], by first_pixel
-    pixels: wp.array(dtype=wp.vec4ub),  # all photographs, one after another: rgb, straight alpha
+    pixels: wp.array(dtype=wp.vec4ub),  # those that count, one view after another: rgb, alpha
     content_distances: wp.array(dtype=real),  # [n_views] scene units
     # how
     seed: int,  # of the training
@@ -209,7 +226,7 @@ def sample_pixels(
     out_content_distance: wp.array(dtype=real),  # [n_rays] scene units
     out_target_rgb: wp.array(dtype=vec3),  # [n_rays] the pixel over its background, in [0, 1]
 ):
-    """A batch of rays through random pixels, all pixels equally likely."""
+    """A batch of rays through random pixels, all that count equally likely."""
     i = first + wp.tid()
     state = wp.rand_init(seed, int(rays_before + wp.uint32(i)))
     pixel = wp.randi(state, 0, pixels.shape[0])
@@ -217,7 +234,7 @@ def sample_pixels(
     prefetch(pixels, wp.randi(later, 0, pixels.shape[0]))
     v = view_of_pixel(views, pixel)
     view = views[v]
-    local = pixel - view.first_pixel
+    local = counting_pixel(view, pixel - view.first_pixel)
     out_origins[i] = view.position
     out_directions[i] = pixel_direction(
         view, real(local % view.width) + real(0.5), real(local // view.width) + real(0.5)
