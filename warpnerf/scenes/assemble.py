@@ -12,6 +12,7 @@ import numpy as np
 
 from warpnerf.checks import InputError
 from warpnerf.runtime.memory import usable_cores, usable_memory
+from warpnerf.scenes.depths import DepthFile, read_depth
 from warpnerf.scenes.files import find_image
 from warpnerf.scenes.images import read_image
 from warpnerf.scenes.lens import Lens
@@ -42,6 +43,10 @@ class Frame:
     lens: Lens
     mask: Mask | None = None
     """Which pixels count; None: all."""
+    depth: DepthFile | None = None
+    """True depth; None: not known."""
+    image: np.ndarray | None = None
+    """As a view has it, where it was read already; None: it is in ``path``."""
 
 
 def find_images(
@@ -197,7 +202,8 @@ def _require_memory(file: Path, first: View, n_images: int, downscale: int) -> N
     Without this, a system that promises more memory than it has ends the process without a word.
     """
     height, width, channels = first.image.shape
-    needed = n_images * height * width * (channels + COPIED_BYTES)
+    more = sum(array.itemsize for array in (first.mask, first.depth) if array is not None)
+    needed = n_images * height * width * (channels + more + COPIED_BYTES)
     usable = usable_memory()
     if usable is not None and needed > usable:
         factor = math.ceil(downscale * math.sqrt(needed / usable))
@@ -297,7 +303,7 @@ def _copies(views: Sequence[View]) -> list[tuple[str, str]]:
 
 def _read_view(frame: Frame, downscale: int) -> View | None:
     """The photograph of a frame; None where its mask leaves no pixel of it."""
-    image = read_image(frame.path)
+    image = read_image(frame.path) if frame.image is None else frame.image
     height, width = image.shape[:2]
     camera = frame.lens.camera(width=width, height=height, c2w=frame.c2w, image=frame.name)
     if downscale > min(width, height):
@@ -315,7 +321,8 @@ def _read_view(frame: Frame, downscale: int) -> View | None:
         return None
     if mask is not None and mask.all():
         mask = None
-    return View(name=frame.name, camera=camera, image=image, mask=mask)
+    depth = None if frame.depth is None else read_depth(frame.depth, camera)
+    return View(name=frame.name, camera=camera, image=image, depth=depth, mask=mask)
 
 
 def box_filter(image: np.ndarray, factor: int) -> np.ndarray:

@@ -59,6 +59,27 @@ def read_image(path: Path) -> np.ndarray:
     return _read(path, pixels)
 
 
+def read_values(path: Path) -> np.ndarray:
+    """Read an image of one channel as the numbers that it stores.
+
+    Returns:
+        [H, W] integers of 8, 16 or 32 bits, or floats.
+
+    Raises:
+        InputError: Not a regular file, not a whole image, or not of one channel.
+        MemoryError: It does not fit.
+    """
+
+    def values(image: ImageFile.ImageFile) -> np.ndarray:
+        if image.width * image.height > MAX_PIXELS:
+            raise _too_large(path)
+        if image.mode not in ("L", "I", "F", *SIXTEEN_BIT_GRAY):
+            raise InputError(f"{path}: its pixels are {image.mode}; save one channel of 16 bits.")
+        return np.array(image)
+
+    return _read(path, values)
+
+
 def image_size(path: Path) -> tuple[int, int]:
     """Width and height of an image, pixels as they are stored, without reading these.
 

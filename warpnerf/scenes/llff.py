@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from warpnerf.checks import InputError
+from warpnerf.scenes.arrays import read_npy
 from warpnerf.scenes.assemble import Frame, assemble
-from warpnerf.scenes.files import photograph_folder, require_regular_file
+from warpnerf.scenes.files import photograph_folder
 from warpnerf.scenes.lens import Lens
 from warpnerf.scenes.poses import check_pose
 from warpnerf.scenes.scene import Scene
@@ -38,15 +39,10 @@ def load_llff(folder: Path, *, downscale: int = 1, masks: Path | None = None) ->
         InputError: The file is damaged, or there are more or fewer photographs than poses.
     """
     file = folder / FILE
-    require_regular_file(file)
-    try:
-        rows = np.load(file, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"{file}: is not readable as an array ({error}).") from error
-    if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.shape[1] != 17:
-        shape = list(getattr(rows, "shape", ()))
-        raise InputError(f"{file}: must hold an array [n, 17], not {shape}.")
-    if not np.issubdtype(rows.dtype, np.floating) or not np.isfinite(rows).all():
+    rows = read_npy(file)
+    if rows.ndim != 2 or rows.shape[1] != 17:
+        raise InputError(f"{file}: must hold an array [n, 17], not {list(rows.shape)}.")
+    if not np.isfinite(rows).all():
         raise InputError(f"{file}: must hold finite numbers only; export it again.")
     photographs = photograph_folder(folder)
     if photographs is None:

@@ -10,6 +10,7 @@ from warpnerf.scenes import llff
 from warpnerf.scenes.blender import SPLITS, load_blender, split_file
 from warpnerf.scenes.colmap import find_model, load_colmap
 from warpnerf.scenes.files import exists
+from warpnerf.scenes.npz import load_npz, single_npz
 from warpnerf.scenes.scene import Scene
 from warpnerf.scenes.transforms import load_transforms
 
@@ -26,11 +27,11 @@ def load_scene(path: str | Path, *, downscale: int = 1, masks: str | Path | None
     """Load a scene: photographs, cameras, split, and the extent estimated from the cameras.
 
     A folder is tried as Blender / NeRF-synthetic (transforms_train.json), then as instant-ngp or
-    nerfstudio (transforms.json), COLMAP (sparse/0), and LLFF (poses_bounds.npy).
+    nerfstudio (transforms.json), COLMAP (sparse/0), LLFF (poses_bounds.npy), and one .npz file.
 
     Args:
-        path: A folder, a transforms*.json or poses_bounds.npy in it, the folder of a COLMAP model,
-            or "builtin:" and the name of a built-in scene.
+        path: A folder, a transforms*.json, poses_bounds.npy or .npz file in it, the folder of a
+            COLMAP model, or "builtin:" and the name of a built-in scene.
         downscale: Edge of the blocks of pixels that become one; 1 keeps the images as they are.
         masks: Folder of masks, named after the photographs: pixels that are black there are neither
             trained on nor measured. They take the place of masks that the scene brings itself.
@@ -63,6 +64,8 @@ def load_scene(path: str | Path, *, downscale: int = 1, masks: str | Path | None
         return load_transforms(path, downscale=downscale, masks=masks)
     if path.name == llff.FILE:
         return llff.load_llff(path.parent, downscale=downscale, masks=masks)
+    if path.suffix == ".npz":
+        return load_npz(path, downscale=downscale, masks=masks)
     raise InputError(f"{path}: is not a scene; give its folder or a transforms*.json in it.")
 
 
@@ -76,10 +79,13 @@ def _load_folder(folder: Path, downscale: int, masks: Path | None) -> Scene:
         return load_colmap(model, downscale=downscale, masks=masks)
     if exists(folder / llff.FILE):
         return llff.load_llff(folder, downscale=downscale, masks=masks)
+    archive = single_npz(folder)
+    if archive is not None:
+        return load_npz(archive, downscale=downscale, masks=masks)
     raise InputError(
         f"{folder}: no scene found: {_what_is_there(folder)}. A scene has {split_file('train')} "
-        "(Blender), transforms.json (instant-ngp, nerfstudio), sparse/0 (COLMAP) or "
-        f"{llff.FILE} (LLFF)."
+        "(Blender), transforms.json (instant-ngp, nerfstudio), sparse/0 (COLMAP), "
+        f"{llff.FILE} (LLFF), or one .npz file."
     )
 
 

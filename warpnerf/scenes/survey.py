@@ -13,6 +13,7 @@ from warpnerf.scenes import llff
 from warpnerf.scenes.blender import SPLITS, split_file
 from warpnerf.scenes.colmap import find_model, model_kind
 from warpnerf.scenes.files import exists, printable, read_json
+from warpnerf.scenes.npz import single_npz
 from warpnerf.scenes.poses import check_pose
 from warpnerf.scenes.transforms import FrameEntry, TransformsFile
 
@@ -21,8 +22,8 @@ SINGLE_PRECISION = 1e-5
 
 WITHOUT_EFFECT = {
     *("aabb_scale", "scale", "offset", "up", "n_frames", "sharpness", "colmap_im_id", "rotation"),
-    *("applied_transform", "applied_scale", "ply_file_path", "orientation_override", "time"),
-    *("depth_file_path", "camera_id", "image_id"),
+    *("applied_transform", "ply_file_path", "orientation_override", "time"),
+    *("camera_id", "image_id"),
 }
 """Keys that are not read and do not change the picture."""
 
@@ -90,6 +91,8 @@ def _files(path: str | Path) -> tuple[str, list[Path]]:
         files = [folder / split_file(split) for split in SPLITS]
         names = [file for file in files if exists(file)]
         return f"Blender / NeRF-synthetic ({', '.join(file.name for file in names)})", names
+    if path.suffix == ".npz" and path.is_file():
+        return f"npz ({printable(path.name)})", []
     if path.name == llff.FILE or not exists(folder / "transforms.json"):
         model = find_model(folder)
         kind = None if model is None else model_kind(model)
@@ -98,6 +101,9 @@ def _files(path: str | Path) -> tuple[str, list[Path]]:
             return f"COLMAP ({model.relative_to(folder).as_posix()}, {words})", []
         if exists(folder / llff.FILE):
             return f"LLFF ({llff.FILE})", []
+        archive = single_npz(folder)
+        if archive is not None:
+            return f"npz ({printable(archive.name)})", []
     file = path / "transforms.json" if path.is_dir() else path
     return f"instant-ngp / nerfstudio ({file.name})", [file] if exists(file) else []
 

@@ -3,15 +3,18 @@
 ``transform_matrix`` is camera to world in OpenGL axes, as everywhere in this project; distances are
 used as the file has them. ``aabb_scale``, ``scale`` and ``offset`` place the scene in instant-ngp's
 own unit cube, ``applied_transform`` tells where the poses came from: neither changes the picture.
+``applied_scale`` says how many of the file's units a metre is, and so what depth files mean.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
 from warpnerf.checks import InputError
 from warpnerf.scenes.assemble import Frame, assemble, find_images
+from warpnerf.scenes.depths import DEFAULT_UNIT, DepthFile
 from warpnerf.scenes.files import find_image, read_json
 from warpnerf.scenes.lens import LensFields, read_lens
 from warpnerf.scenes.masks import Mask, mask_beside
@@ -42,6 +45,7 @@ class FrameEntry(PictureKeys, kw_only=True):
     file_path: str
     transform_matrix: list[list[float]]
     mask_path: str | None = None
+    depth_file_path: str | None = None
 
 
 class TransformsFile(PictureKeys, kw_only=True):
@@ -49,6 +53,8 @@ class TransformsFile(PictureKeys, kw_only=True):
 
     frames: list[FrameEntry]
     mask_path: str | None = None
+    depth_unit_scale_factor: float = DEFAULT_UNIT
+    applied_scale: float = 1.0
     train_filenames: list[str] | None = None
     val_filenames: list[str] | None = None
     test_filenames: list[str] | None = None
@@ -107,43 +113,53 @@ def read_frames(file: Path) -> tuple[TransformsFile, list[Frame], list[str]]:
     """
     data = read_json(file, TransformsFile)
     found, warnings = find_images(file.parent, file, [entry.file_path for entry in data.frames])
+    unit = data.depth_unit_scale_factor * data.applied_scale
+    if not (unit > 0.0 and math.isfinite(unit)):
+        raise InputError(
+            f"{file}: $.depth_unit_scale_factor: {data.depth_unit_scale_factor:g} with an "
+            f"applied_scale of {data.applied_scale:g} is no unit of depth; give numbers above 0."
+        )
     frames = []
-    unmasked = []
+    lost: dict[str, list[str]] = {"mask_path": [], "depth_file_path": []}
     for index, path in found.items():
         entry = data.frames[index]
         place = f"$.frames[{index}]"
-        mask = _mask(file, place, entry, data, path)
-        if mask is None and (entry.mask_path or data.mask_path):
-            unmasked.append(entry.file_path)
+        mask = _named_file(file, place, "mask_path", entry.mask_path, lost)
+        if mask is None and not entry.mask_path:
+            mask = _named_file(file, "$", "mask_path", data.mask_path, lost)
+        depth = _named_file(file, place, "depth_file_path", entry.depth_file_path, lost)
         frames.append(
             Frame(
                 name=path.relative_to(file.parent).as_posix(),
                 path=path,
                 c2w=check_pose(entry.transform_matrix, field=f"{file}: {place}.transform_matrix"),
                 lens=read_lens(file, [(place, entry), ("$", data)]),
-                mask=mask,
+                mask=mask_beside(path) if mask is None else Mask(mask),
+                depth=None if depth is None else DepthFile(depth, unit),
             )
         )
-    if unmasked:
-        warnings.append(
-            f"{file.name}: the mask_path of {len(unmasked)} of {len(data.frames)} frames leads to "
-            f"no file, so all their pixels count (first: {unmasked[0]})"
-        )
+    for key, names in lost.items():
+        if names:
+            warnings.append(
+                f"{file.name}: the {key} of {len(names)} of {len(data.frames)} frames leads to no "
+                f"file (first: {names[0]})"
+            )
     for key, consequence in IGNORED.items():
         if getattr(data, key) or any(getattr(entry, key) for entry in data.frames):
             warnings.append(f"{file.name}: {key} is not used: {consequence}")
     return data, frames, warnings
 
 
-def _mask(
-    file: Path, place: str, entry: FrameEntry, data: TransformsFile, photograph: Path
-) -> Mask | None:
-    """The mask that a frame, or else the file, names, or that lies beside the photograph."""
-    for where, text in ((place, entry.mask_path), ("$", data.mask_path)):
-        if text:
-            path = find_image(file.parent, text, field=f"{file}: {where}.mask_path")
-            return None if path is None else Mask(path)
-    return mask_beside(photograph)
+def _named_file(
+    file: Path, place: str, key: str, text: str | None, lost: dict[str, list[str]]
+) -> Path | None:
+    """The file that a key names, if it does; one that is not there is added to the lost ones."""
+    if not text:
+        return None
+    path = find_image(file.parent, text, field=f"{file}: {place}.{key}")
+    if path is None:
+        lost[key].append(text)
+    return path
 
 
 def _listed_names(

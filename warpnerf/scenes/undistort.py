@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from typing import Any
 
 import numpy as np
 
@@ -12,11 +13,17 @@ from warpnerf.scenes.fisheye import angle_of, distorted_angle, largest_angle
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 """Of a lens, by their names."""
 
+_LENS = ("width", "height", "fx", "fy", "cx", "cy", *COEFFICIENTS, "fisheye")
+"""The fields of a camera that are not its pose."""
+
 MIN_DETERMINANT = 0.01
 N_GRID = 9
 N_STRIDES = 32
 N_NEWTON = 6
 MAX_RESIDUAL = 1e-6
+
+N_KNOTS = 65
+"""Along each side of an image, where ``axis_cosines`` undoes the distortion."""
 
 MIN_SEEN = 0.25
 """Share of a fisheye's image that must come from a direction: the rest may lie around a circle."""
@@ -32,35 +39,24 @@ def has_invertible_distortion(camera: Camera) -> bool:
     """
     if camera.fisheye:
         return _share_seen(camera) >= MIN_SEEN
-    return _is_invertible(
-        *(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy),
-        *(camera.k1, camera.k2, camera.k3, camera.p1, camera.p2),
-    )
+    return _is_invertible(*(getattr(camera, name) for name in _LENS))
 
 
 @functools.lru_cache(maxsize=64)
-def _is_invertible(*parameters: float) -> bool:
-    width, height, fx, fy, cx, cy, k1, k2, k3, p1, p2 = parameters
-    camera = Camera(
-        width=int(width),
-        height=int(height),
-        fx=fx,
-        fy=fy,
-        cx=cx,
-        cy=cy,
-        c2w=np.eye(3, 4),
-        k1=k1,
-        k2=k2,
-        k3=k3,
-        p1=p1,
-        p2=p2,
-    )
-    return _undistorted(camera, (_grid(camera) - [cx, cy]) / [fx, fy], N_STRIDES) is not None
+def _is_invertible(*lens: Any) -> bool:
+    camera = _posed(lens)
+    targets = (_grid(camera) - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    return _undistorted(camera, targets, N_STRIDES) is not None
 
 
-def _grid(camera: Camera) -> np.ndarray:
-    """Image positions [N_GRID^2, 2] from corner to corner, pixels."""
-    u, v = np.linspace(0.0, camera.width, N_GRID), np.linspace(0.0, camera.height, N_GRID)
+def _posed(lens: tuple[Any, ...]) -> Camera:
+    """A camera of a lens that is given by its fields ``_LENS``; its pose does not matter."""
+    return Camera(**dict(zip(_LENS, lens, strict=True)), c2w=np.eye(3, 4))
+
+
+def _grid(camera: Camera, n: int = N_GRID) -> np.ndarray:
+    """Image positions [n^2, 2] from corner to corner, row by row, pixels."""
+    u, v = np.linspace(0.0, camera.width, n), np.linspace(0.0, camera.height, n)
     return np.stack(np.meshgrid(u, v), axis=2).reshape(-1, 2)
 
 
@@ -141,6 +137,28 @@ def directions(camera: Camera, pixels: np.ndarray) -> np.ndarray:
     x, y = (targets if points is None else points).T
     rays = np.stack([x, -y, -np.ones_like(x)], axis=1)
     return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+
+def axis_cosines(camera: Camera) -> np.ndarray:
+    """Cosine of the angle between each pixel's ray and the optical axis, [H, W].
+
+    With distortion it is interpolated linearly, to about 1e-4.
+    """
+    across, along = np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5
+    if not camera.fisheye and not any(getattr(camera, name) for name in COEFFICIENTS):
+        x, y = (across - camera.cx) / camera.fx, (along - camera.cy) / camera.fy
+        return np.asarray(1.0 / np.sqrt(1.0 + x * x + (y * y)[:, None]))
+    knots = _knot_cosines(*(getattr(camera, name) for name in _LENS))
+    shares = (along * ((N_KNOTS - 1) / camera.height), across * ((N_KNOTS - 1) / camera.width))
+    down, right = (np.maximum(0.0, 1.0 - np.abs(s[:, None] - np.arange(N_KNOTS))) for s in shares)
+    return np.asarray(down @ knots @ right.T)
+
+
+@functools.lru_cache(maxsize=16)
+def _knot_cosines(*lens: Any) -> np.ndarray:
+    """Of a lens with the fields ``_LENS``, from corner to corner, [N_KNOTS, N_KNOTS]."""
+    camera = _posed(lens)
+    return -directions(camera, _grid(camera, N_KNOTS))[:, 2].reshape(N_KNOTS, N_KNOTS)
 
 
 def _keeps_orientation(jacobian: np.ndarray) -> bool:

@@ -286,7 +286,7 @@ class Run:
         views = [scene.views[index] for index in require_split(scene, split)]
         files = picture_files([view.name for view in views])
         known = [view.depth[np.isfinite(view.depth)] for view in views if view.depth is not None]
-        if len(known) == len(views):
+        if len(known) == len(views) and any(depths.size for depths in known):
             near, far = range_of(np.concatenate(known))
         else:
             near, far = depth_range(field, [view.camera for view in views])
