@@ -42,7 +42,7 @@ def cameras_of(cameras: list[Camera], model: int = 1) -> Cameras:
         poses=np.array([opencv(c) for c in cameras], np.float32),
         intrinsics=np.array([(c.fx, c.fy, c.cx, c.cy) for c in cameras], np.float32),
         camera_models=np.full(len(cameras), model, np.int32),
-        distortion_parameters=np.array([(c.k1, c.k2, c.p1, c.p2, 0, 0) for c in cameras]),
+        distortion_parameters=np.array([(c.k1, c.k2, c.p1, c.p2, c.k3, c.k4) for c in cameras]),
         image_sizes=np.array([(c.width, c.height) for c in cameras], np.int32),
     )
 
@@ -95,6 +95,10 @@ def test_distortion_stands_in_opencvs_order(method: Any) -> None:
     assert (camera.k1, camera.k2, camera.p1, camera.p2) == (0.1, 0.2, 0.3, 0.4)
     straight = method.camera_of(cameras_of([bent], model=0)[0])
     assert (straight.k1, straight.k2, straight.p1, straight.p2) == (0.0, 0.0, 0.0, 0.0)
+    wide = Camera(width=4, height=3, fx=2, fy=2, cx=2, cy=1.5, c2w=np.eye(4)[:3], k1=0.1, k2=0.01,
+                  k3=0.002, k4=0.001, fisheye=True)  # fmt: skip
+    camera = method.camera_of(cameras_of([wide], model=2)[0])
+    assert camera.fisheye and camera.radial == wide.radial
     with pytest.raises(wn.InputError, match="full_opencv are not read"):
         method.camera_of(cameras_of([bent], model=3)[0])
 
@@ -133,6 +137,15 @@ def test_train_save_go_on_and_render(method: Any, dataset: dict[str, Any], tmp_p
     assert wn.load_checkpoint(tmp_path / "again" / "checkpoint.safetensors").progress.step == 12
     with pytest.raises(wn.InputError, match="give the dataset to train"):
         opened.train_iteration(12)
+
+
+def test_masks_are_kept(method: Any, dataset: dict[str, Any]) -> None:
+    masks = [np.full(image.shape[:2], 255, np.uint8) for image in dataset["images"]]
+    masks[1][:, :3] = 0
+    masks[2][:] = 0
+    views = method.scene_of({**dataset, "masks": masks}).views
+    assert [view.name for view in views] == ["000.png", "001.png", "003.png", "004.png", "005.png"]
+    assert np.array_equal(views[1].mask, masks[1] > 0)
 
 
 def test_options(method: Any) -> None:

@@ -24,7 +24,7 @@ from warpnerf.training.trainer import Trainer
 
 LENSES = ("pinhole", "opencv", "opencv_fisheye", "full_opencv")
 """The lenses of nerfbaselines, by the number that its cameras hold."""
-READ_LENSES = ("pinhole", "opencv")
+READ_LENSES = ("pinhole", "opencv", "opencv_fisheye")
 
 CHECKPOINT = "checkpoint.safetensors"
 
@@ -221,13 +221,18 @@ def scene_of(dataset: Any) -> Scene:
     Raises:
         InputError: A lens is of a kind that is not read, or cameras do not make a scene.
     """
-    cameras, images = dataset["cameras"], dataset["images"]
+    cameras, images, masks = dataset["cameras"], dataset["images"], dataset.get("masks")
     names = _names(dataset["image_paths"], dataset["image_paths_root"])
     views = []
     for index, name in enumerate(names):
         camera = camera_of(cameras[index])
         image = np.asarray(images[index])[: camera.height, : camera.width]
-        views.append(View(name=name, camera=camera, image=np.ascontiguousarray(image)))
+        mask = None
+        if masks is not None and masks[index] is not None:
+            mask = np.asarray(masks[index])[: camera.height, : camera.width] > 0
+        if mask is not None and not mask.any():
+            continue
+        views.append(View(name=name, camera=camera, image=np.ascontiguousarray(image), mask=mask))
     order = sorted(range(len(views)), key=lambda i: views[i].name)
     views = [views[i] for i in order]
     see_through = [v.image.shape[2] == 4 and bool((v.image[..., 3] < 255).any()) for v in views]
@@ -250,7 +255,7 @@ def camera_of(camera: Any) -> Camera:
 
     Args:
         camera: Its pose [3, 4] camera to world in OpenCV axes, fx, fy, cx, cy in pixels, and
-            k1, k2, p1, p2 of OpenCV.
+            distortion parameters in the order k1, k2, p1, p2, k3, k4.
 
     Raises:
         InputError: The lens is of a kind that is not read.
@@ -262,9 +267,12 @@ def camera_of(camera: Any) -> Camera:
             f"{', '.join(READ_LENSES)}."
         )
     fx, fy, cx, cy = (float(value) for value in camera.intrinsics)
-    k = np.zeros(4)
-    if lens != "pinhole":
-        k[: len(camera.distortion_parameters)] = camera.distortion_parameters[:4]
+    k1, k2, p1, p2, k3, k4 = (float(value) for value in _six(camera.distortion_parameters))
+    bent: dict[str, Any] = {}
+    if lens == "opencv":
+        bent = {"k1": k1, "k2": k2, "p1": p1, "p2": p2}
+    if lens == "opencv_fisheye":
+        bent = {"k1": k1, "k2": k2, "k3": k3, "k4": k4, "fisheye": True}
     c2w = np.array(camera.poses, np.float64)[:3, :4]
     c2w[:, 1:3] *= -1.0  # from OpenCV's axes to OpenGL's
     width, height = (int(value) for value in camera.image_sizes)
@@ -276,11 +284,13 @@ def camera_of(camera: Any) -> Camera:
         cx=cx,
         cy=cy,
         c2w=c2w,
-        k1=float(k[0]),
-        k2=float(k[1]),
-        p1=float(k[2]),
-        p2=float(k[3]),
+        **bent,
     )
+
+
+def _six(parameters: np.ndarray) -> np.ndarray:
+    """The first six of distortion parameters, zeros for those that are left out."""
+    return np.pad(np.asarray(parameters, np.float64), (0, 6))[:6]
 
 
 def _names(paths: Sequence[str], root: str) -> list[str]:
