@@ -192,15 +192,21 @@ def draw(
     rays_before: int = 0,
     chunk: int = NODES,
 ) -> dict[str, Any]:
-    """Pixels of three views; the red and green of each pixel say which one it is."""
+    """Pixels of three views; the red and green of each pixel say which one it is.
+
+    The first view has no alpha.
+    """
     types, camera = kernels.types, kernels.module("space.camera")
-    views, pixels = [], []
+    views, photographs = [], []
     for number in range(3):
-        first = number * WIDTH * HEIGHT
-        views.append(view(kernels, pose(number), LENSES[2], first_pixel=first))
         v, u = np.divmod(np.arange(WIDTH * HEIGHT), WIDTH)
-        alpha = np.full_like(u, 255 if number == 0 else 51)
-        pixels.append(np.stack([u, v, 100 * np.full_like(u, number), alpha], axis=-1))
+        rgba = np.stack([u, v, np.full_like(u, 100 * number), np.full_like(u, 51)], axis=-1)
+        channels = 3 if number == 0 else 4
+        pixels = rgba[:, :channels].astype(np.uint8).ravel()
+        photographs.append(wp.array(pixels, dtype=wp.uint8, device=kernels.device))
+        place = {"first_pixel": number * WIDTH * HEIGHT, "channels": channels}
+        lens = LENSES[2]
+        views.append(view(kernels, pose(number), lens, pixels=photographs[-1], **place))
     vec3, real = types.vec3, types.real
     out = {
         "origins": kernels.zeros(n, vec3),
@@ -214,7 +220,7 @@ def draw(
         camera.sample_pixels,
         n,
         wp.array(views, dtype=camera.View, device=kernels.device),
-        wp.array(np.concatenate(pixels).astype(np.uint8), dtype=wp.vec4ub, device=kernels.device),
+        3 * WIDTH * HEIGHT,
         kernels.array([2.0, 3.0, 5.0]),
         seed,
         rays_before,
@@ -247,6 +253,40 @@ def test_sampled_pixels_are_their_rays(kernels64: Kernels) -> None:
         at = v[of_view], u[of_view]
         np.testing.assert_allclose(black["origins"][of_view], origins[at], rtol=1e-14)
         np.testing.assert_allclose(black["directions"][of_view], directions[at], atol=1e-12)
+
+
+def test_pixels_beyond_32_bits_are_drawn_evenly(kernels32: Kernels) -> None:
+    """Three photographs of 2^31 - 1 pixels each, all of which lie in one place."""
+    camera, n = kernels32.module("space.camera"), 20_000
+    black = wp.zeros(3, dtype=wp.uint8, device=kernels32.device)
+    views = []
+    for number in range(3):
+        place = {"first_pixel": number * (2**31 - 1), "channels": 0, "pixels": black}
+        views.append(view(kernels32, pose(number), {}, width=2**16, **place))
+    vec3, real = kernels32.types.vec3, kernels32.types.real
+    out = [kernels32.zeros(n, kind) for kind in (vec3, vec3, real, vec3, real, vec3)]
+    kernels32.workers.launch(
+        camera.sample_pixels,
+        n,
+        wp.array(views, dtype=camera.View, device=kernels32.device),
+        3 * (2**31 - 1),
+        kernels32.array([2.0, 3.0, 5.0]),
+        7,
+        0,
+        vec3(0.0, 0.0, 0.0),
+        0,
+        0,
+        *out,
+    )
+    number = np.searchsorted([2.0, 3.0, 5.0], out[4].numpy())
+    assert (np.abs(np.bincount(number, minlength=3) - n / 3) < 300).all()
+    for k in range(3):
+        # Rows and columns from the rays, as far as float32 tells them.
+        local = out[1].numpy()[number == k] @ pose(k)[:, :3]
+        u, v = CX - FX * local[:, 0] / local[:, 2], CY + FY * local[:, 1] / local[:, 2]
+        for values, size in ((u, 2**16), (v, 2**15)):
+            share = np.histogram(values / size, bins=8, range=(0.0, 1.0))[0] / len(values)
+            assert np.abs(share - 0.125).max() < 0.02
 
 
 def test_random_background_and_jitter(kernels64: Kernels) -> None:

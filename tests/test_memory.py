@@ -7,12 +7,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from tiny_scenes import write_transforms
 
-from warpnerf.checks import InputError
 from warpnerf.runtime import memory
-from warpnerf.scenes import assemble
-from warpnerf.scenes.load import load_scene
 
 GIB = 2**30
 
@@ -74,16 +70,31 @@ def test_the_limit_of_the_process_counts() -> None:
     assert 0 < int(done.stdout) <= GIB
 
 
-def test_images_that_would_not_fit_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("version", [1, 2])
+def test_files_in_a_container_s_memory_count_as_free(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, version: int
 ) -> None:
-    write_transforms(tmp_path, 5)
-    needed = 5 * 8 * 6 * (3 + assemble.COPIED_BYTES)
-    monkeypatch.setattr(assemble, "usable_memory", lambda: needed)
-    load_scene(tmp_path)
-    monkeypatch.setattr(assemble, "usable_memory", lambda: needed // 4)
-    with pytest.raises(InputError, match=r"5 images of 8x6 pixels need .*; use --downscale 2,"):
-        load_scene(tmp_path)
-    assert len(load_scene(tmp_path, downscale=2).views) == 5
-    monkeypatch.setattr(assemble, "usable_memory", lambda: None)
-    load_scene(tmp_path)
+    monkeypatch.setattr(memory, "CONTAINER_LIMITS", ())
+    free = memory.available_memory()
+    assert free is not None and 0 < free <= (memory.usable_memory() or 0)
+    limit, used, stat = (tmp_path / name for name in ("limit", "used", "stat"))
+    limit.write_text("1000000\n")
+    monkeypatch.setattr(memory, "CONTAINER_LIMITS", (limit,))
+    monkeypatch.setattr(memory, "CONTAINER_USES", ((used, stat),))
+    assert memory.available_memory() == 1000000  # what is used is not known
+    used.write_text("900000\n")
+    stat.write_text("anon 5\ninactive_file 300000\nactive_file 50000\n")
+    assert memory.available_memory() == 450000
+    used.write_text("1900000\n")
+    assert memory.available_memory() == 0
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no such limit there")
+def test_what_the_process_has_is_not_free() -> None:
+    code = (
+        "import resource; from warpnerf.runtime.memory import available_memory\n"
+        f"resource.setrlimit(resource.RLIMIT_AS, ({GIB}, resource.RLIM_INFINITY))\n"
+        "before = available_memory(); kept = bytearray(2**28); print(before - available_memory())"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert int(done.stdout) == pytest.approx(2**28, rel=0.05)

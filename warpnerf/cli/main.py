@@ -33,6 +33,7 @@ from warpnerf.runtime.signals import Stopped, StopRequest, raise_when_asked
 from warpnerf.runtime.terminal import UntilClosed
 
 if TYPE_CHECKING:
+    from warpnerf.scenes.photographs import Place
     from warpnerf.scenes.scene import Scene
     from warpnerf.training.run import Run
     from warpnerf.training.state import Progress
@@ -61,6 +62,7 @@ def train_command(
     near: float | None = None,
     downscale: int | None = None,
     masks: Path | None = None,
+    images: Literal["auto", "memory", "disk"] = "auto",
     device: str | None = None,
     threads: int | None = None,
     seed: int | None = None,
@@ -89,6 +91,8 @@ def train_command(
         downscale: Average blocks of so many pixels squared; by default 1, as they are.
         masks: Folder of images named after the photographs, white where pixels count and black
             where they are ignored; with --resume only if it has moved.
+        images: Where the photographs' pixels are during the training: memory, disk (decoded once,
+            into a file without a name in the output folder, gone at the end), or by what is free.
         device: cpu, cuda, cuda:1, ...
         threads: CPU threads; by default one per usable core, or as the resumed run had.
         seed: Same seed and threads: same result on the CPU.
@@ -126,14 +130,14 @@ def train_command(
                     f"--{name} does not go with --resume: the run in {resume} goes on as it was "
                     "begun; leave it out."
                 )
-        return _resume(resume, scene, masks, changed)
+        return _resume(resume, scene, masks, images, changed)
     if scene is None or output is None:
         raise InputError(
             "train wants a SCENE and --output DIR for a new run, or --resume DIR to go on with one."
         )
     config = changed(PRESETS[preset or "fast"])
     factor = 1 if downscale is None else downscale
-    return _begin(scene, output, factor, masks, config, overwrite)
+    return _begin(scene, output, factor, masks, images, config, overwrite)
 
 
 def eval_command(
@@ -176,7 +180,9 @@ def eval_command(
     for note in notes:
         print(f"warpnerf: note: {note}", file=sys.stderr)
     folder_of_masks = masks or (config.masks if scene is None else None)
-    views = load_scene(scene or config.scene, downscale=config.downscale, masks=folder_of_masks)
+    views = load_scene(
+        scene or config.scene, downscale=config.downscale, masks=folder_of_masks, images="files"
+    )
     require_measurable(views, split)
     result = evaluate(field, views, split, lpips=distance)
     print(result)
@@ -190,6 +196,7 @@ def _begin(
     output: Path,
     downscale: int,
     masks: Path | None,
+    images: Place,
     config: TrainConfig,
     overwrite: bool,
 ) -> int:
@@ -200,7 +207,7 @@ def _begin(
         from warpnerf.training.run import Run
 
         Run.require_free(output, overwrite)
-    scene = _read(source, downscale, masks)
+    scene = _read(source, downscale, masks, images, output)
 
     # Not before: these load Warp, and bad input is refused at once.
     from warpnerf.evaluation.inspection import oddities
@@ -225,6 +232,7 @@ def _resume(
     folder: Path,
     moved: str | None,
     masks: Path | None,
+    images: Place,
     changed: Callable[[TrainConfig], TrainConfig],
 ) -> int:
     """Train from the last checkpoint on."""
@@ -232,13 +240,14 @@ def _resume(
 
     Run(folder).read_config()
     with Run(folder).only_writer():
-        return _go_on(Run(folder), moved, masks, changed)
+        return _go_on(Run(folder), moved, masks, images, changed)
 
 
 def _go_on(
     run: Run,
     moved: str | None,
     masks: Path | None,
+    images: Place,
     changed: Callable[[TrainConfig], TrainConfig],
 ) -> int:
     from warpnerf.training.trainer import Trainer
@@ -247,7 +256,7 @@ def _go_on(
     state, notes = run.load_state()
     config = changed(state.config)
     state.require_same_config(config)
-    scene = _read(moved or begun.scene, begun.downscale, masks or begun.masks)
+    scene = _read(moved or begun.scene, begun.downscale, masks or begun.masks, images, run.folder)
     trainer = Trainer(scene, config, state)
     _describe(scene, trainer.content_distance, config)
     for note in notes:
@@ -262,12 +271,16 @@ def _go_on(
     return _train(run, scene, trainer)
 
 
-def _read(source: str, downscale: int, masks: Path | str | None) -> Scene:
+def _read(
+    source: str, downscale: int, masks: Path | str | None, images: Place, output: Path
+) -> Scene:
+    """The scene, whose photographs are kept where the run will be if they are kept on disk."""
     from warpnerf.evaluation.evaluate import require_measurable
     from warpnerf.scenes.load import load_scene
 
     print(f"reading {source}", flush=True)
-    scene = load_scene(source, downscale=downscale, masks=masks)
+    there = next((folder for folder in (output, *output.parents) if folder.is_dir()), None)
+    scene = load_scene(source, downscale=downscale, masks=masks, images=images, image_folder=there)
     require_measurable(scene, _split_to_look_at(scene))
     return scene
 

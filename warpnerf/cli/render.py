@@ -77,7 +77,7 @@ def render_command(
     field, notes = run.load_field(device, threads)
     for note in notes:
         print(f"warpnerf: note: {note}", file=sys.stderr)
-    views = load_scene(scene or config.scene, downscale=config.downscale)
+    views = load_scene(scene or config.scene, downscale=config.downscale, images="files")
 
     cameras: list[Camera]
     if stills is None:

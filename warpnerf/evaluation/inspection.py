@@ -6,6 +6,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from warpnerf.checks import InputError, require_at_least, require_positive
 from warpnerf.config import PRESETS, TRAINING_BYTES, SceneKind, TrainConfig
 from warpnerf.model.interface import Model
 from warpnerf.model.models import to_json
+from warpnerf.runtime.memory import usable_cores
 from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.fisheye import angle_of
 from warpnerf.scenes.load import load_scene
@@ -191,7 +193,8 @@ def inspect(
         require_positive("content_distance", content_distance)
     found = survey(path)
     try:
-        scene = load_scene(path, downscale=downscale, masks=masks)
+        scene = load_scene(path, downscale=downscale, masks=masks, images="files")
+        _read_once(scene)
     except InputError as error:
         others = [place for place in found.refused if place not in str(error)]
         if not others:
@@ -213,6 +216,13 @@ def inspect(
         },
         model=model,
     )
+
+
+def _read_once(scene: Scene) -> None:
+    """Raise InputError if an image is damaged; none of them stays in memory."""
+    with ThreadPoolExecutor(usable_cores()) as pool:
+        for _ in pool.map(lambda view: view.image is None, scene.views):
+            pass
 
 
 def oddities(scene: Scene, found: Survey, content_distance: float, near: float) -> list[str]:
@@ -314,9 +324,8 @@ def _distance_to_box(scene: Scene) -> float:
 
 def _cost(scene: Scene, config: TrainConfig, threads: int) -> Cost:
     voxels = config.grid.voxels
-    images = sum(view.image.nbytes for view in scene.views)
-    pixels = sum(camera.width * camera.height for camera in scene.training_cameras)
-    memory = TRAINING_BYTES * config.model.n_floats * voxels + images + 4 * pixels
+    images = sum(v.camera.width * v.camera.height * v.channels for v in scene.views)
+    memory = TRAINING_BYTES * config.model.n_floats * voxels + images
 
     samples, occupied = SAMPLES_AND_OCCUPIED[scene.kind]
     finer = (voxels / PRESETS["fast"].grid.voxels) ** (1.0 / 3.0) / config.march.step_voxels

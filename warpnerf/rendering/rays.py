@@ -14,10 +14,10 @@ from warpnerf_kernels.base.types import mat33, real, vec2, vec3
 from warpnerf_kernels.launch import assembly
 from warpnerf_kernels.space import camera as kernels
 
-from warpnerf.checks import InputError
 from warpnerf.runtime.parallel import LaunchCache, Workers
 from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.fisheye import largest_angle
+from warpnerf.scenes.pixel_file import expect_random_reads
 from warpnerf.scenes.scene import View
 
 
@@ -73,8 +73,8 @@ def rays_struct(
     return rays
 
 
-def view_struct(camera: Camera, first_pixel: int = 0) -> kernels.View:
-    """A camera as kernels take it."""
+def view_struct(camera: Camera) -> kernels.View:
+    """A camera as kernels take it, without a photograph."""
     view = kernels.View()
     view.rotation = mat33(*camera.c2w[:, :3].ravel())
     view.position = vec3(*camera.c2w[:, 3])
@@ -87,7 +87,6 @@ def view_struct(camera: Camera, first_pixel: int = 0) -> kernels.View:
         view.k4 = camera.k4
         view.angle_max = largest_angle(camera.radial)
     view.width = camera.width
-    view.first_pixel = first_pixel
     return view
 
 
@@ -105,7 +104,7 @@ def camera_rays(camera: Camera, workers: Workers) -> tuple[wp.array, wp.array]:
 
 
 class PixelSampler:
-    """Photographs on a device, from which batches of random pixels are drawn."""
+    """Photographs, from which batches of random pixels are drawn."""
 
     def __init__(
         self,
@@ -117,7 +116,7 @@ class PixelSampler:
         seed: int,
         workers: Workers,
     ) -> None:
-        """Load the photographs.
+        """Take the photographs, which must stay as they are; on CUDA copies of them.
 
         Args:
             views: What to draw from.
@@ -134,33 +133,38 @@ class PixelSampler:
         self._random_background = background is None
         self._background = vec3(*(background or (0.0, 0.0, 0.0)))
         self._jitter = jitter
-        firsts = np.cumsum([0] + [_n_counting(view) for view in views])
-        if firsts[-1] >= 2**31:
-            raise InputError(
-                f"the training views have {firsts[-1]} pixels, 2^31 or more; use --downscale."
-            )
-        structs = [
-            view_struct(v.camera, int(first)) for v, first in zip(views, firsts[:-1], strict=True)
-        ]
-        self._runs = []  # the structs only point to them
-        for view, struct in zip(views, structs, strict=True):
-            if view.mask is not None:
-                runs = wp.array(runs_of(view.mask), dtype=wp.vec2i, device=workers.device)
-                struct.runs = runs
-                self._runs.append(runs)
+        # Views of the kernel only point to these.
+        self._photographs: list[wp.array] = []
+        self._kept: list[np.ndarray] = []
+        self._runs: list[wp.array] = []
+        self._n_pixels = 0
+        structs = [self._add(view) for view in views]
         self._views = wp.array(structs, dtype=kernels.View, device=workers.device)
-        pixels = np.full((firsts[-1], 4), 255, np.uint8)
-        for view, first, end in zip(views, firsts[:-1], firsts[1:], strict=True):
-            channels = view.image.shape[2]
-            counting = slice(None) if view.mask is None else view.mask.ravel()
-            pixels[first:end, :channels] = view.image.reshape(-1, channels)[counting]
-        self._pixels = wp.array(pixels, dtype=wp.vec4ub, device=workers.device)
-
         self._content_distances = wp.full(
             len(views), content_distance, dtype=real, device=workers.device
         )
         self._batch = _room(n_rays, workers)
         self._launches = LaunchCache()
+
+    def _add(self, view: View) -> kernels.View:
+        """A photograph as the kernel takes it: on the CPU where it lies, on CUDA a copy there."""
+        image = np.ascontiguousarray(view.image)
+        expect_random_reads(image)
+        if self._workers.device.is_cuda:
+            pixels = wp.array(image.ravel(), dtype=wp.uint8, device=self._workers.device)
+        else:
+            pixels = wp.array(ptr=image.ctypes.data, shape=image.size, dtype=wp.uint8, device="cpu")
+            self._kept.append(image)
+        self._photographs.append(pixels)
+        struct = view_struct(view.camera)
+        struct.first_pixel = self._n_pixels
+        struct.channels = image.shape[2]
+        struct.pixels = pixels
+        if view.mask is not None:
+            struct.runs = wp.array(runs_of(view.mask), dtype=wp.vec2i, device=self._workers.device)
+            self._runs.append(struct.runs)
+        self._n_pixels += _n_counting(view)
+        return struct
 
     def draw(self, step: int, n_steps: int = 1) -> RayBatch:
         """The batches of some steps as one, each a function of its step and the seed.
@@ -180,7 +184,7 @@ class PixelSampler:
             kernels.sample_pixels,
             batch.count,
             self._views,
-            self._pixels,
+            self._n_pixels,
             self._content_distances,
             self._seed,
             (step * self._n_rays) % 2**32,

@@ -12,6 +12,14 @@ CONTAINER_LIMITS = (
     Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"),
 )
 """Where Linux says how much a container may use: control groups of version 2, and of version 1."""
+CONTAINER_USES = (
+    (Path("/sys/fs/cgroup/memory.current"), Path("/sys/fs/cgroup/memory.stat")),
+    (
+        Path("/sys/fs/cgroup/memory/memory.usage_in_bytes"),
+        Path("/sys/fs/cgroup/memory/memory.stat"),
+    ),
+)
+"""Likewise, what it uses, and how much of that are files, which make room when it is asked for."""
 CORE_LIMITS = (
     (Path("/sys/fs/cgroup/cpu.max"),),
     (
@@ -29,6 +37,44 @@ def usable_memory() -> int | None:
     """
     limits = [limit for limit in (_machine(), *map(_container, CONTAINER_LIMITS), _own()) if limit]
     return min(limits, default=None)
+
+
+def available_memory() -> int | None:
+    """Bytes of ``usable_memory`` that are free, or taken by files that would make room.
+
+    None where the system does not tell.
+    """
+    left = [_free(), _own_left(), *map(_container_left, CONTAINER_LIMITS, CONTAINER_USES)]
+    known = [max(0, n_bytes) for n_bytes in (*left, usable_memory()) if n_bytes is not None]
+    return min(known, default=None)
+
+
+def _free() -> int | None:
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        return next(int(line.split()[1]) << 10 for line in lines if "MemAvailable:" in line)
+    except (OSError, ValueError, StopIteration):
+        return None
+
+
+def _container_left(limit: Path, uses: tuple[Path, Path]) -> int | None:
+    total = _container(limit)
+    try:
+        used = int(uses[0].read_text())
+        words = dict(line.split()[:2] for line in uses[1].read_text().splitlines())
+        files = sum(int(words.get(name, 0)) for name in ("inactive_file", "active_file"))
+    except (OSError, ValueError):
+        return total
+    return None if total is None else total - used + files
+
+
+def _own_left() -> int | None:
+    limit = _own()
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+    except (OSError, ValueError):
+        return limit
+    return None if limit is None else limit - pages * os.sysconf("SC_PAGE_SIZE")
 
 
 def _machine() -> int | None:

@@ -1,8 +1,7 @@
-"""From the frames of a scene file to a Scene: find the images, read, downscale, split, estimate."""
+"""From the frames of a scene file to a Scene: find the images, split, read, estimate."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -11,17 +10,16 @@ from pathlib import Path
 import numpy as np
 
 from warpnerf.checks import InputError
-from warpnerf.runtime.memory import usable_cores, usable_memory
+from warpnerf.runtime.memory import usable_cores
+from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.depths import DepthFile, read_depth
 from warpnerf.scenes.files import find_image
-from warpnerf.scenes.images import read_image
+from warpnerf.scenes.images import image_shape
 from warpnerf.scenes.lens import Lens
 from warpnerf.scenes.masks import Mask, masks_of_folder, read_mask
+from warpnerf.scenes.photographs import Keeping, Photograph, keep
 from warpnerf.scenes.scene import Scene, View, estimate_extent
 from warpnerf.scenes.undistort import seen_pixels
-
-COPIED_BYTES = 8
-"""Per pixel: with alpha for the device, and on the way there once more."""
 
 LITTLE = 0.1
 """Share of the pixels that masks leave, below which they are likely to be inverted."""
@@ -103,6 +101,7 @@ def assemble(
     warnings: Sequence[str],
     downscale: int,
     masks: Path | None,
+    keeping: Keeping,
 ) -> Scene:
     """Read the images and make the scene.
 
@@ -115,6 +114,7 @@ def assemble(
         warnings: Of what is odd so far; the result's begin with them.
         downscale: Edge of the blocks of pixels that become one.
         masks: Folder of masks, which take the place of those that frames have.
+        keeping: Where the images' pixels are kept.
 
     Raises:
         InputError: An image, a mask, the split or the placement of the cameras is of no use.
@@ -127,13 +127,21 @@ def assemble(
         found = masks_of_folder(masks, [frame.name for frame in frames])
         frames = [replace(frame, mask=mask) for frame, mask in zip(frames, found, strict=True)]
 
-    first = _read_view(frames[0], downscale)
-    if first is not None:
-        _require_memory(file, first, len(frames), downscale)
     # Decoders release the interpreter lock. The first error cancels what is not yet read.
     with ThreadPoolExecutor(usable_cores()) as pool:
-        read = [first, *pool.map(lambda frame: _read_view(frame, downscale), frames[1:])]
-    views = [view for view in read if view is not None]
+        read = list(pool.map(lambda frame: _read_frame(frame, downscale), frames))
+    left = [entry for entry in read if entry is not None]
+    kept = keep([entry.photograph for entry in left], keeping, file=file, downscale=downscale)
+    views = [
+        View(
+            name=entry.name,
+            camera=entry.camera,
+            image=image,
+            depth=entry.depth,
+            mask=entry.mask,
+        )
+        for entry, image in zip(left, kept.images, strict=True)
+    ]
     complete, mask_warnings = _without_masked(file, frames, views, complete)
     notes += _mask_notes(views)
 
@@ -142,8 +150,7 @@ def assemble(
         split: tuple(sorted(index[name] for name in names)) for split, names in complete.items()
     }
     training = [views[i] for i in indices["train"]]
-    see_through = sum(_has_transparency(view.image) for view in training)
-    unbounded = see_through < len(training) / 2
+    unbounded = sum(kept.see_through[i] for i in indices["train"]) < len(training) / 2
     try:
         extent = estimate_extent([view.camera for view in training], unbounded=unbounded)
     except InputError as error:
@@ -156,7 +163,7 @@ def assemble(
         box_max=extent.box_max,
         unbounded=unbounded,
         content_distance=extent.content_distance,
-        notes=(*notes, *extent.notes),
+        notes=(*notes, *kept.notes, *extent.notes),
         warnings=(*warnings, *mask_warnings, *_oddities(views, complete)),
     )
 
@@ -194,24 +201,6 @@ def complete_splits(
             f"in no split and not used: {len(unused)} of {len(names)} images (first: {min(unused)})"
         )
     return complete, notes
-
-
-def _require_memory(file: Path, first: View, n_images: int, downscale: int) -> None:
-    """Raise InputError if images like the first would not fit: they are kept, and copied to train.
-
-    Without this, a system that promises more memory than it has ends the process without a word.
-    """
-    height, width, channels = first.image.shape
-    more = sum(array.itemsize for array in (first.mask, first.depth) if array is not None)
-    needed = n_images * height * width * (channels + more + COPIED_BYTES)
-    usable = usable_memory()
-    if usable is not None and needed > usable:
-        factor = math.ceil(downscale * math.sqrt(needed / usable))
-        raise InputError(
-            f"{file}: $.frames: {n_images} images of {width}x{height} pixels need "
-            f"{needed / 2**30:.1f} GiB, but there is {usable / 2**30:.1f} GiB of memory; use "
-            f"--downscale {factor}, or fewer images."
-        )
 
 
 def _without_masked(
@@ -301,10 +290,21 @@ def _copies(views: Sequence[View]) -> list[tuple[str, str]]:
     return pairs
 
 
-def _read_view(frame: Frame, downscale: int) -> View | None:
-    """The photograph of a frame; None where its mask leaves no pixel of it."""
-    image = read_image(frame.path) if frame.image is None else frame.image
-    height, width = image.shape[:2]
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Read:
+    """A frame, all of which is read but its photograph."""
+
+    name: str
+    camera: Camera
+    photograph: Photograph
+    depth: np.ndarray | None
+    mask: np.ndarray | None
+
+
+def _read_frame(frame: Frame, downscale: int) -> _Read | None:
+    """What belongs to a frame; None where its mask leaves no pixel of it."""
+    shape = image_shape(frame.path) if frame.image is None else frame.image.shape
+    height, width, channels = shape
     camera = frame.lens.camera(width=width, height=height, c2w=frame.c2w, image=frame.name)
     if downscale > min(width, height):
         raise InputError(
@@ -312,7 +312,7 @@ def _read_view(frame: Frame, downscale: int) -> View | None:
             "smaller factor."
         )
     if downscale > 1:
-        camera, image = camera.downscaled(downscale), box_filter(image, downscale)
+        camera = camera.downscaled(downscale)
     mask = seen_pixels(camera)
     if frame.mask is not None:
         given = read_mask(frame.mask, width=width, height=height, downscale=downscale)
@@ -321,38 +321,11 @@ def _read_view(frame: Frame, downscale: int) -> View | None:
         return None
     if mask is not None and mask.all():
         mask = None
-    depth = None if frame.depth is None else read_depth(frame.depth, camera)
-    return View(name=frame.name, camera=camera, image=image, depth=depth, mask=mask)
-
-
-def box_filter(image: np.ndarray, factor: int) -> np.ndarray:
-    """Average an image over blocks of ``factor`` by ``factor`` pixels, rounded to nearest.
-
-    Colour is weighted by alpha, so that what is behind transparent pixels does not bleed in.
-
-    Args:
-        image: [H, W, 3] or [H, W, 4] uint8, straight alpha.
-        factor: Edge of a block; pixels at the right and bottom that fill none are cropped.
-
-    Returns:
-        [H // factor, W // factor, 3 or 4] uint8, straight alpha.
-    """
-    height, width, channels = image.shape[0] // factor, image.shape[1] // factor, image.shape[2]
-    blocks = image[: height * factor, : width * factor].reshape(
-        height, factor, width, factor, channels
+    photograph = Photograph(
+        path=frame.path,
+        shape=(camera.height, camera.width, channels),
+        downscale=downscale,
+        image=frame.image,
     )
-    if channels == 3:
-        return _divide(blocks.sum(axis=(1, 3), dtype=np.uint64), factor**2)
-    alpha = blocks[..., 3:].astype(np.uint64)
-    total = alpha.sum(axis=(1, 3))
-    rgb = _divide((blocks[..., :3] * alpha).sum(axis=(1, 3)), np.maximum(total, 1))
-    return np.concatenate([rgb, _divide(total, factor**2)], axis=2)
-
-
-def _divide(total: np.ndarray, count: np.ndarray | int) -> np.ndarray:
-    divisor = np.asarray(count, dtype=np.uint64)
-    return ((total + divisor // np.uint64(2)) // divisor).astype(np.uint8)
-
-
-def _has_transparency(image: np.ndarray) -> bool:
-    return image.shape[2] == 4 and bool((image[:, :, 3] < 255).any())
+    depth = None if frame.depth is None else read_depth(frame.depth, camera)
+    return _Read(name=frame.name, camera=camera, photograph=photograph, depth=depth, mask=mask)

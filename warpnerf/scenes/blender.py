@@ -11,6 +11,7 @@ from pathlib import Path
 
 from warpnerf.scenes.assemble import Frame, assemble
 from warpnerf.scenes.files import exists
+from warpnerf.scenes.photographs import KEEPING, Keeping
 from warpnerf.scenes.scene import Scene
 from warpnerf.scenes.transforms import read_frames
 
@@ -22,7 +23,13 @@ def split_file(split: str) -> str:
     return f"transforms_{split}.json"
 
 
-def load_blender(folder: Path, *, downscale: int = 1, masks: Path | None = None) -> Scene:
+def load_blender(
+    folder: Path,
+    *,
+    downscale: int = 1,
+    masks: Path | None = None,
+    keeping: Keeping = KEEPING,
+) -> Scene:
     """Load a scene from transforms_train.json and its siblings.
 
     Without transforms_test.json every 8th training image is for testing.
@@ -31,6 +38,7 @@ def load_blender(folder: Path, *, downscale: int = 1, masks: Path | None = None)
         folder: The scene's folder; image paths are relative to it and stay inside it.
         downscale: Edge of the blocks of pixels that become one.
         masks: Folder of masks for all photographs.
+        keeping: Where the images' pixels are kept.
 
     Raises:
         InputError: Something in the files or the images is wrong; the message names it.
@@ -56,4 +64,5 @@ def load_blender(folder: Path, *, downscale: int = 1, masks: Path | None = None)
         warnings=warnings,
         downscale=downscale,
         masks=masks,
+        keeping=keeping,
     )

@@ -29,6 +29,7 @@ from warpnerf.scenes.files import (
 from warpnerf.scenes.images import image_size
 from warpnerf.scenes.lens import Lens
 from warpnerf.scenes.masks import mask_in
+from warpnerf.scenes.photographs import KEEPING, Keeping
 from warpnerf.scenes.poses import check_pose
 from warpnerf.scenes.scene import Scene
 
@@ -112,7 +113,13 @@ def scene_folder(model: Path) -> Path:
     return model
 
 
-def load_colmap(model: Path, *, downscale: int = 1, masks: Path | None = None) -> Scene:
+def load_colmap(
+    model: Path,
+    *,
+    downscale: int = 1,
+    masks: Path | None = None,
+    keeping: Keeping = KEEPING,
+) -> Scene:
     """Load a scene from a sparse model.
 
     Every 8th photograph is for testing. The model's points are not used.
@@ -121,6 +128,7 @@ def load_colmap(model: Path, *, downscale: int = 1, masks: Path | None = None) -
         model: Folder of cameras.bin and images.bin, or of cameras.txt and images.txt.
         downscale: Edge of the blocks of pixels that become one.
         masks: Folder of masks for all photographs.
+        keeping: Where the images' pixels are kept.
 
     Returns:
         The scene; distances are the model's.
@@ -180,6 +188,7 @@ def load_colmap(model: Path, *, downscale: int = 1, masks: Path | None = None) -
         warnings=warnings,
         downscale=downscale,
         masks=masks,
+        keeping=keeping,
     )
 
 

@@ -95,6 +95,49 @@ def image_size(path: Path) -> tuple[int, int]:
     return _read(path, lambda image: image.size)
 
 
+def image_shape(path: Path) -> tuple[int, int, int]:
+    """The shape of what ``read_image`` returns, without reading the pixels.
+
+    Raises:
+        InputError: As ``read_image``, but for damage that only the pixels have.
+    """
+
+    def shape(image: ImageFile.ImageFile) -> tuple[int, int, int]:
+        _check_kind(path, image)
+        return image.height, image.width, 4 if _has_alpha(image) else 3
+
+    return _read(path, shape)
+
+
+def box_filter(image: np.ndarray, factor: int) -> np.ndarray:
+    """Average an image over blocks of ``factor`` by ``factor`` pixels, rounded to nearest.
+
+    Colour is weighted by alpha, so that what is behind transparent pixels does not bleed in.
+
+    Args:
+        image: [H, W, 3] or [H, W, 4] uint8, straight alpha.
+        factor: Edge of a block; pixels at the right and bottom that fill none are cropped.
+
+    Returns:
+        [H // factor, W // factor, 3 or 4] uint8, straight alpha.
+    """
+    height, width, channels = image.shape[0] // factor, image.shape[1] // factor, image.shape[2]
+    blocks = image[: height * factor, : width * factor].reshape(
+        height, factor, width, factor, channels
+    )
+    if channels == 3:
+        return _divide(blocks.sum(axis=(1, 3), dtype=np.uint64), factor**2)
+    alpha = blocks[..., 3:].astype(np.uint64)
+    total = alpha.sum(axis=(1, 3))
+    rgb = _divide((blocks[..., :3] * alpha).sum(axis=(1, 3)), np.maximum(total, 1))
+    return np.concatenate([rgb, _divide(total, factor**2)], axis=2)
+
+
+def _divide(total: np.ndarray, count: np.ndarray | int) -> np.ndarray:
+    divisor = np.asarray(count, dtype=np.uint64)
+    return ((total + divisor // np.uint64(2)) // divisor).astype(np.uint8)
+
+
 def _read(path: Path, look: Callable[[ImageFile.ImageFile], T]) -> T:
     """What something finds in an image, whose defects are all told in one way."""
     require_regular_file(path)
@@ -181,10 +224,14 @@ def _other_byte(arguments: Any) -> Any:
     return OTHER_BYTE[arguments]
 
 
+def _has_alpha(image: Image.Image) -> bool:
+    return image.mode in EIGHT_BIT_MODES and image.has_transparency_data
+
+
 def _to_eight_bit(image: Image.Image) -> np.ndarray:
     image.load()
     if image.mode in EIGHT_BIT_MODES:
-        return np.array(image.convert("RGBA" if image.has_transparency_data else "RGB"))
+        return np.array(image.convert("RGBA" if _has_alpha(image) else "RGB"))
     return np.repeat(_rounded(np.asarray(image, np.uint32))[:, :, None], 3, axis=2)
 
 

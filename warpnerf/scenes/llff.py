@@ -17,6 +17,7 @@ from warpnerf.scenes.arrays import read_npy
 from warpnerf.scenes.assemble import Frame, assemble
 from warpnerf.scenes.files import photograph_folder
 from warpnerf.scenes.lens import Lens
+from warpnerf.scenes.photographs import KEEPING, Keeping
 from warpnerf.scenes.poses import check_pose
 from warpnerf.scenes.scene import Scene
 
@@ -24,13 +25,20 @@ FILE = "poses_bounds.npy"
 ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".ppm")
 
 
-def load_llff(folder: Path, *, downscale: int = 1, masks: Path | None = None) -> Scene:
+def load_llff(
+    folder: Path,
+    *,
+    downscale: int = 1,
+    masks: Path | None = None,
+    keeping: Keeping = KEEPING,
+) -> Scene:
     """Load a scene from poses_bounds.npy. Every 8th photograph is for testing.
 
     Args:
         folder: The scene's folder, with images/ or images_4/, images_8/, ...
         downscale: Edge of the blocks of pixels that become one.
         masks: Folder of masks for all photographs.
+        keeping: Where the images' pixels are kept.
 
     Returns:
         The scene; distances are the file's.
@@ -83,4 +91,5 @@ def load_llff(folder: Path, *, downscale: int = 1, masks: Path | None = None) ->
         warnings=(),
         downscale=downscale,
         masks=masks,
+        keeping=keeping,
     )

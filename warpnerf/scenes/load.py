@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import get_args
 
-from warpnerf.checks import InputError
+from warpnerf.checks import InputError, require_one_of
 from warpnerf.scenes import llff
 from warpnerf.scenes.blender import SPLITS, load_blender, split_file
 from warpnerf.scenes.colmap import find_model, load_colmap
 from warpnerf.scenes.files import exists
 from warpnerf.scenes.npz import load_npz, single_npz
+from warpnerf.scenes.photographs import Keeping, Place
 from warpnerf.scenes.scene import Scene
 from warpnerf.scenes.transforms import load_transforms
 
@@ -23,7 +25,14 @@ BUILTIN = "builtin:"
 BUILTIN_NAMES = ("room", "room-sparse")
 
 
-def load_scene(path: str | Path, *, downscale: int = 1, masks: str | Path | None = None) -> Scene:
+def load_scene(
+    path: str | Path,
+    *,
+    downscale: int = 1,
+    masks: str | Path | None = None,
+    images: Place = "auto",
+    image_folder: Path | None = None,
+) -> Scene:
     """Load a scene: photographs, cameras, split, and the extent estimated from the cameras.
 
     A folder is tried as Blender / NeRF-synthetic (transforms_train.json), then as instant-ngp or
@@ -35,6 +44,10 @@ def load_scene(path: str | Path, *, downscale: int = 1, masks: str | Path | None
         downscale: Edge of the blocks of pixels that become one; 1 keeps the images as they are.
         masks: Folder of masks, named after the photographs: pixels that are black there are neither
             trained on nor measured. They take the place of masks that the scene brings itself.
+        images: Where their pixels are kept: memory; disk, in a file that takes their place there
+            and is gone when the scene is; files, read anew whenever one is looked at; auto, memory
+            or disk by what is free. Built-in scenes are in memory.
+        image_folder: For the file on disk; None: a folder for large temporary files.
 
     Returns:
         The scene; distances are the file's own.
@@ -45,10 +58,12 @@ def load_scene(path: str | Path, *, downscale: int = 1, masks: str | Path | None
     """
     if isinstance(downscale, bool) or not isinstance(downscale, int) or downscale < 1:
         raise InputError(f"downscale must be a whole number of at least 1, not {downscale!r}.")
+    require_one_of("images", images, get_args(Place))
     if isinstance(path, str) and path.startswith(BUILTIN):
         if masks is not None:
             raise InputError(f"--masks {masks}: {path} takes no masks; leave them out.")
         return _load_builtin(path.removeprefix(BUILTIN), downscale)
+    keeping = Keeping(place=images, folder=image_folder)
     path = Path(path)
     masks = None if masks is None else Path(masks)
     if not exists(path):
@@ -57,31 +72,33 @@ def load_scene(path: str | Path, *, downscale: int = 1, masks: str | Path | None
             f"{path}: does not exist; give a scene's folder, or a built-in scene ({known})."
         )
     if path.is_dir():
-        return _load_folder(path, downscale, masks)
+        return _load_folder(path, downscale, masks, keeping)
     if path.name in [split_file(split) for split in SPLITS]:
-        return load_blender(path.parent, downscale=downscale, masks=masks)
+        return load_blender(path.parent, downscale=downscale, masks=masks, keeping=keeping)
     if re.fullmatch(r"transforms.*\.json", path.name):
-        return load_transforms(path, downscale=downscale, masks=masks)
+        return load_transforms(path, downscale=downscale, masks=masks, keeping=keeping)
     if path.name == llff.FILE:
-        return llff.load_llff(path.parent, downscale=downscale, masks=masks)
+        return llff.load_llff(path.parent, downscale=downscale, masks=masks, keeping=keeping)
     if path.suffix == ".npz":
-        return load_npz(path, downscale=downscale, masks=masks)
+        return load_npz(path, downscale=downscale, masks=masks, keeping=keeping)
     raise InputError(f"{path}: is not a scene; give its folder or a transforms*.json in it.")
 
 
-def _load_folder(folder: Path, downscale: int, masks: Path | None) -> Scene:
+def _load_folder(folder: Path, downscale: int, masks: Path | None, keeping: Keeping) -> Scene:
     if exists(folder / split_file("train")):
-        return load_blender(folder, downscale=downscale, masks=masks)
+        return load_blender(folder, downscale=downscale, masks=masks, keeping=keeping)
     if exists(folder / "transforms.json"):
-        return load_transforms(folder / "transforms.json", downscale=downscale, masks=masks)
+        return load_transforms(
+            folder / "transforms.json", downscale=downscale, masks=masks, keeping=keeping
+        )
     model = find_model(folder)
     if model is not None:
-        return load_colmap(model, downscale=downscale, masks=masks)
+        return load_colmap(model, downscale=downscale, masks=masks, keeping=keeping)
     if exists(folder / llff.FILE):
-        return llff.load_llff(folder, downscale=downscale, masks=masks)
+        return llff.load_llff(folder, downscale=downscale, masks=masks, keeping=keeping)
     archive = single_npz(folder)
     if archive is not None:
-        return load_npz(archive, downscale=downscale, masks=masks)
+        return load_npz(archive, downscale=downscale, masks=masks, keeping=keeping)
     raise InputError(
         f"{folder}: no scene found: {_what_is_there(folder)}. A scene has {split_file('train')} "
         "(Blender), transforms.json (instant-ngp, nerfstudio), sparse/0 (COLMAP), "

@@ -23,6 +23,7 @@ from warpnerf.scenes.assemble import Frame, assemble
 from warpnerf.scenes.files import require_regular_file
 from warpnerf.scenes.images import MAX_PIXELS
 from warpnerf.scenes.lens import Lens
+from warpnerf.scenes.photographs import KEEPING, Keeping
 from warpnerf.scenes.poses import check_pose
 from warpnerf.scenes.scene import Scene
 
@@ -38,13 +39,20 @@ MAX_SMALL = 2**26
 """Bytes of all poses, at most."""
 
 
-def load_npz(file: Path, *, downscale: int = 1, masks: Path | None = None) -> Scene:
+def load_npz(
+    file: Path,
+    *,
+    downscale: int = 1,
+    masks: Path | None = None,
+    keeping: Keeping = KEEPING,
+) -> Scene:
     """Load a scene from an .npz file. Every 8th image is for testing.
 
     Args:
         file: With images, poses and focal; other arrays are not read.
         downscale: Edge of the blocks of pixels that become one.
         masks: Folder of masks for all photographs, which are called 000, 001, ...
+        keeping: Where the images' pixels are kept.
 
     Returns:
         The scene; distances are those of the poses.
@@ -83,6 +91,7 @@ def load_npz(file: Path, *, downscale: int = 1, masks: Path | None = None) -> Sc
         warnings=(),
         downscale=downscale,
         masks=masks,
+        keeping=keeping,
     )
 
 

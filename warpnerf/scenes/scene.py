@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Protocol, overload
 
 import numpy as np
 
@@ -32,6 +33,34 @@ MAX_OFFSET = 1e4
 """Largest distance from the origin, in spreads of the cameras, that single precision resolves."""
 
 
+class ImageFile(Protocol):
+    """A photograph that is not kept in memory."""
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """H, W, channels."""
+
+    def read(self) -> np.ndarray:
+        """Its pixels, [H, W, channels] uint8."""
+
+
+class _Image:
+    """The field ``View.image``. One that is not kept in memory is read whenever it is looked at."""
+
+    @overload
+    def __get__(self, view: None, owner: type) -> _Image: ...
+    @overload
+    def __get__(self, view: View, owner: type) -> np.ndarray: ...
+    def __get__(self, view: View | None, owner: type) -> np.ndarray | _Image:
+        if view is None:
+            raise AttributeError("image")  # so a dataclass knows that there is no default
+        image = view.__dict__["image"]
+        return image if isinstance(image, np.ndarray) else image.read()
+
+    def __set__(self, view: View, image: np.ndarray | ImageFile) -> None:
+        view.__dict__["image"] = image
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class View:
     """One photograph and the camera that took it."""
@@ -40,8 +69,9 @@ class View:
     """Unique within the scene; the image's path relative to the scene's folder, or made up."""
     camera: Camera
     """Its width and height are those of ``image``."""
-    image: np.ndarray
-    """[H, W, 3] uint8 rgb, or [H, W, 4] uint8 rgb with straight (not premultiplied) alpha."""
+    image: _Image = _Image()
+    """[H, W, 3] uint8 rgb, or [H, W, 4] uint8 rgb with straight (not premultiplied) alpha. Given as
+    an ``ImageFile`` it is read whenever it is looked at."""
     depth: np.ndarray | None = None
     """[H, W] float32, true distance along each pixel's ray in scene units; not finite where it is
     not known. None: not known."""
@@ -56,15 +86,12 @@ class View:
             InputError: Shapes or types do not fit.
         """
         size = (self.camera.height, self.camera.width)
-        image = self.image
-        if (
-            image.dtype != np.uint8
-            or image.shape[:2] != size
-            or image.shape[2:] not in ((3,), (4,))
-        ):
+        image = self.__dict__["image"]
+        dtype = image.dtype if isinstance(image, np.ndarray) else np.dtype(np.uint8)
+        if dtype != np.uint8 or image.shape[:2] != size or image.shape[2:] not in ((3,), (4,)):
             raise InputError(
                 f"{self.name}: image must be uint8 [{size[0]}, {size[1]}, 3 or 4] as its camera "
-                f"is, not {image.dtype} {list(image.shape)}."
+                f"is, not {dtype} {list(image.shape)}."
             )
         if self.depth is not None and self.depth.shape != size:
             raise InputError(
@@ -79,6 +106,11 @@ class View:
                 )
             if not self.mask.any():
                 raise InputError(f"{self.name}: its mask leaves no pixel; leave out the view.")
+
+    @property
+    def channels(self) -> int:
+        """Of its image: 3, or 4 with alpha."""
+        return int(self.__dict__["image"].shape[2])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -138,7 +170,7 @@ class Scene:
     @property
     def has_alpha(self) -> bool:
         """Whether any training photograph has an alpha channel, opaque or not."""
-        return any(self.views[index].image.shape[2] == 4 for index in self.splits["train"])
+        return any(self.views[index].channels == 4 for index in self.splits["train"])
 
     @property
     def kind(self) -> SceneKind:

@@ -18,6 +18,7 @@ from warpnerf.scenes.depths import DEFAULT_UNIT, DepthFile
 from warpnerf.scenes.files import find_image, read_json
 from warpnerf.scenes.lens import LensFields, read_lens
 from warpnerf.scenes.masks import Mask, mask_beside
+from warpnerf.scenes.photographs import KEEPING, Keeping
 from warpnerf.scenes.poses import check_pose
 from warpnerf.scenes.scene import Scene
 
@@ -60,7 +61,13 @@ class TransformsFile(PictureKeys, kw_only=True):
     test_filenames: list[str] | None = None
 
 
-def load_transforms(file: Path, *, downscale: int = 1, masks: Path | None = None) -> Scene:
+def load_transforms(
+    file: Path,
+    *,
+    downscale: int = 1,
+    masks: Path | None = None,
+    keeping: Keeping = KEEPING,
+) -> Scene:
     """Load a scene from a transforms.json.
 
     The split is the file's ``{train,val,test}_filenames``, else every 8th image is for testing.
@@ -69,6 +76,7 @@ def load_transforms(file: Path, *, downscale: int = 1, masks: Path | None = None
         file: The file; image paths in it are relative to its folder and stay inside it.
         downscale: Edge of the blocks of pixels that become one.
         masks: Folder of masks for all photographs.
+        keeping: Where the images' pixels are kept.
 
     Raises:
         InputError: Something in the file or its images is wrong; the message names it.
@@ -99,6 +107,7 @@ def load_transforms(file: Path, *, downscale: int = 1, masks: Path | None = None
         warnings=warnings,
         downscale=downscale,
         masks=masks,
+        keeping=keeping,
     )
 
 

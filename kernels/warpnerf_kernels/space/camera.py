@@ -17,9 +17,13 @@ AHEAD = 8
 """Rays from the one that a CPU draws to the one whose pixel it asks for."""
 
 
+MANY_PIXELS = 2**26
+"""Up to so many, 32 random bits draw none more than 1/64 more often than another."""
+
+
 @wp.struct
 class View:
-    """A photograph's camera, and where its pixels are in the pile of all pixels."""
+    """A photograph: its camera, its pixels, and their place among those of all photographs."""
 
     rotation: mat33  # camera to world
     position: vec3  # scene units
@@ -31,7 +35,9 @@ class View:
     k4: real  # of a fisheye lens
     angle_max: real  # of a fisheye lens: up to where the distorted angle rises, radians
     width: int  # pixels
-    first_pixel: int  # how many pixels count in the views before
+    first_pixel: wp.int64  # how many pixels count in the views before
+    channels: int  # bytes of a pixel: 3, or 4 with straight alpha
+    pixels: wp.array(dtype=wp.uint8)  # [H * W * channels]; empty where only rays are asked for
     runs: wp.array(dtype=wp.vec2i)  # of pixels that count: how many before, the first; none: all
 
 
@@ -177,7 +183,7 @@ def camera_rays(
 
 
 @wp.func
-def view_of_pixel(views: wp.array(dtype=View), pixel: int) -> int:
+def view_of_pixel(views: wp.array(dtype=View), pixel: wp.int64) -> int:
     """The last view whose first pixel is not after `pixel`."""
     low = int(0)
     high = int(views.shape[0])
@@ -205,12 +211,24 @@ def counting_pixel(view: View, number: int) -> int:
     return run[1] + number - run[0]
 
 
+@wp.func
+def random_below(state: wp.uint32, n: wp.int64):
+    """A random number from 0 to n - 1, and the state of the generator after it.
+
+    Of many, 32 bits would draw some much more often than others, so it takes 64.
+    """
+    drawn = wp.uint64(wp.randu(state))
+    if n > wp.int64(MANY_PIXELS):
+        drawn = (drawn << wp.uint64(32)) | wp.uint64(wp.randu(state))
+    return wp.int64(drawn % wp.uint64(n)), state
+
+
 @wp.kernel
 def sample_pixels(
     first: int,  # this launch makes rays first, first + 1, ...
     # photographs
     views: wp.array(dtype=View),  # [n_views], by first_pixel
-    pixels: wp.array(dtype=wp.vec4ub),  # those that count, one view after another: rgb, alpha
+    n_pixels: wp.int64,  # that count in all of them
     content_distances: wp.array(dtype=real),  # [n_views] scene units
     # how
     seed: int,  # of the training
@@ -229,12 +247,15 @@ def sample_pixels(
     """A batch of rays through random pixels, all that count equally likely."""
     i = first + wp.tid()
     state = wp.rand_init(seed, int(rays_before + wp.uint32(i)))
-    pixel = wp.randi(state, 0, pixels.shape[0])
+    pixel, state = random_below(state, n_pixels)
     later = wp.rand_init(seed, int(rays_before + wp.uint32(i + wp.static(AHEAD))))
-    prefetch(pixels, wp.randi(later, 0, pixels.shape[0]))
+    later_pixel, later = random_below(later, n_pixels)
+    later_view = views[view_of_pixel(views, later_pixel)]
+    later_local = counting_pixel(later_view, int(later_pixel - later_view.first_pixel))
+    prefetch(later_view.pixels, later_local * later_view.channels)
     v = view_of_pixel(views, pixel)
     view = views[v]
-    local = counting_pixel(view, pixel - view.first_pixel)
+    local = counting_pixel(view, int(pixel - view.first_pixel))
     out_origins[i] = view.position
     out_directions[i] = pixel_direction(
         view, real(local % view.width) + real(0.5), real(local // view.width) + real(0.5)
@@ -245,10 +266,13 @@ def sample_pixels(
     offset = real(0.5)
     if jitter == 1:
         offset = real(wp.randf(state))
-    colour = pixels[pixel]
+    at = local * view.channels
+    opaque = wp.uint8(255)
+    if view.channels == 4:
+        opaque = view.pixels[at + 3]
     unit = real(1.0) / real(255.0)
-    alpha = real(colour[3]) * unit
-    rgb = unit * vec3(real(colour[0]), real(colour[1]), real(colour[2]))
+    alpha = real(opaque) * unit
+    rgb = unit * vec3(real(view.pixels[at]), real(view.pixels[at + 1]), real(view.pixels[at + 2]))
     out_offsets[i] = offset
     out_background[i] = behind
     out_content_distance[i] = content_distances[v]

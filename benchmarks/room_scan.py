@@ -1,0 +1,145 @@
+"""Photographs of the built-in room as someone takes them who turns around in its middle.
+
+All cameras look outward, and a COLMAP text model beside them holds points of the room's surfaces
+with the photographs that show them, as structure from motion would find them: with noise, and with
+a share of outliers far behind the walls and close before the cameras.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from warpnerf.scenes.builtin.room import first_hit, photograph
+from warpnerf.scenes.camera import Camera
+
+NOISE = 0.005
+"""Of a point's distance, standard deviation."""
+OUTLIERS = 0.03
+"""Share of points along their ray anywhere from 0.02 to 5 times as far."""
+
+
+def scan_cameras(n: int, width: int, height: int, seed: int = 0) -> list[Camera]:
+    """Cameras within 0.75 m of the room's middle, 0.8 to 1.9 m high, that look away from it."""
+    rng = np.random.default_rng(seed)
+    focal = 0.5 * width / np.tan(np.radians(65.0) / 2.0)
+    cameras: list[Camera] = []
+    while len(cameras) < n:
+        angle = 2.0 * np.pi * (len(cameras) * 0.381966 + rng.uniform(-0.02, 0.02))
+        out = np.array([np.cos(angle), np.sin(angle), 0.0])
+        eye = np.array([0.25, 0.0, 0.0]) + rng.uniform(0.25, 0.75) * out
+        eye[2] = rng.uniform(0.8, 1.9)
+        turned = angle + rng.uniform(-0.4, 0.4)
+        back = -np.array([np.cos(turned), np.sin(turned), rng.uniform(-0.35, 0.25)])
+        back /= np.linalg.norm(back)
+        right = np.cross((0.0, 0.0, 1.0), back)
+        right /= np.linalg.norm(right)
+        c2w = np.stack([right, np.cross(back, right), back, eye], axis=1)
+        if first_hit(eye[None], -back[None])[0] > 0.3:
+            cameras.append(
+                Camera(
+                    width=width,
+                    height=height,
+                    fx=focal,
+                    fy=focal,
+                    cx=0.5 * width,
+                    cy=0.5 * height,
+                    c2w=c2w,
+                )
+            )
+    return cameras
+
+
+def write_scan(
+    folder: Path, n_views: int = 125, n_points: int = 4000, size: tuple[int, int] = (160, 120)
+) -> float:
+    """Write photographs and model.
+
+    Args:
+        folder: New; receives images/ and sparse/0/.
+        n_views: Photographs.
+        n_points: Of the model.
+        size: Width and height, pixels.
+
+    Returns:
+        The median true distance over all pixels, metres.
+    """
+    (folder / "images").mkdir(parents=True)
+    model = folder / "sparse" / "0"
+    model.mkdir(parents=True)
+    cameras = scan_cameras(n_views, *size)
+    depths = []
+    poses = ["# Images"]
+    for number, camera in enumerate(cameras):
+        rgb, depth = photograph(camera)
+        depths.append(depth)
+        Image.fromarray(rgb).save(folder / f"images/{number:04}.png")
+        rotation = (camera.c2w[:, :3] * [1.0, -1.0, -1.0]).T
+        numbers = [*_quaternion(rotation), *(-rotation @ camera.position)]
+        poses += [f"{number + 1} {' '.join(map(repr, map(float, numbers)))} 1 {number:04}.png", ""]
+    camera = cameras[0]
+    lens = f"{float(camera.fx)} {camera.cx} {camera.cy}"
+    (model / "cameras.txt").write_text(f"1 SIMPLE_PINHOLE {size[0]} {size[1]} {lens}\n")
+    (model / "images.txt").write_text("\n".join(poses) + "\n")
+    lines = [
+        f"{number + 1} {' '.join(map(repr, map(float, point)))} 0 0 0 1.0 "
+        + " ".join(f"{view + 1} 0" for view in views)
+        for number, (point, views) in enumerate(_points(cameras, depths, n_points))
+    ]
+    (model / "points3D.txt").write_text("\n".join(lines) + "\n")
+    return float(np.median(np.stack(depths)))
+
+
+def _points(
+    cameras: list[Camera], depths: list[np.ndarray], n_points: int
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Points at random pixels, and the numbers of the cameras that see them."""
+    rng = np.random.default_rng(1)
+    found = []
+    while len(found) < n_points:
+        k = int(rng.integers(len(cameras)))
+        camera = cameras[k]
+        u, v = rng.integers(camera.width), rng.integers(camera.height)
+        sight = [(u + 0.5 - camera.cx) / camera.fx, (camera.cy - v - 0.5) / camera.fy, -1.0]
+        ray = camera.c2w[:, :3] @ (np.array(sight) / np.linalg.norm(sight))
+        point = camera.position + depths[k][v, u] * ray
+        views = _sees(cameras, point)
+        if len(views) < 2:
+            continue
+        far = depths[k][v, u] * (1.0 + rng.normal(0.0, NOISE))
+        if rng.uniform() < OUTLIERS:
+            far *= np.exp(rng.uniform(np.log(0.02), np.log(5.0)))
+        found.append((camera.position + far * ray, views))
+    return found
+
+
+def _sees(cameras: list[Camera], point: np.ndarray) -> np.ndarray:
+    """The cameras that have a point in their picture, with nothing before it."""
+    origins = np.array([camera.position for camera in cameras])
+    away = np.linalg.norm(point - origins, axis=1)
+    directions = (point - origins) / away[:, None]
+    inside = np.zeros(len(cameras), bool)
+    for k, camera in enumerate(cameras):
+        x, y, z = camera.c2w[:, :3].T @ directions[k]
+        if z < 0.0:
+            inside[k] = abs(camera.fx * x / z) < camera.cx and abs(camera.fy * y / z) < camera.cy
+    candidates = np.flatnonzero(inside)
+    hits = first_hit(origins[candidates], directions[candidates])
+    return candidates[hits >= 0.999 * away[candidates]]
+
+
+def _quaternion(rotation: np.ndarray) -> np.ndarray:
+    """w, x, y, z: the eigenvector of the largest eigenvalue of Bar-Itzhack's matrix (2000)."""
+    r = rotation
+    lower = np.array(
+        [
+            [r[0, 0] - r[1, 1] - r[2, 2], 0.0, 0.0, 0.0],
+            [r[1, 0] + r[0, 1], r[1, 1] - r[0, 0] - r[2, 2], 0.0, 0.0],
+            [r[2, 0] + r[0, 2], r[2, 1] + r[1, 2], r[2, 2] - r[0, 0] - r[1, 1], 0.0],
+            [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], r.trace()],
+        ]
+    )
+    x, y, z, w = np.linalg.eigh(lower)[1][:, -1]
+    return np.array([w, x, y, z])

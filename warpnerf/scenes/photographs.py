@@ -1,0 +1,189 @@
+"""Photographs, and where their pixels are kept: in memory, on disk, or in their own files."""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+import tempfile
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from warpnerf.checks import InputError
+from warpnerf.runtime.memory import available_memory, usable_cores
+from warpnerf.scenes.images import box_filter, read_image
+from warpnerf.scenes.pixel_file import PixelFile
+
+Place = Literal["auto", "memory", "disk", "files"]
+"""memory; disk: read once, into a nameless file that is mapped; files: read anew at each look;
+auto: memory, or disk where they would take more than ``MEMORY_SHARE`` of what is free."""
+
+MEMORY_SHARE = 0.5
+"""Of the memory that is free; grid, optimiser and system need some, too."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Keeping:
+    """Where the pixels of a scene's photographs are kept."""
+
+    place: Place = "auto"
+    """See there."""
+    folder: Path | None = None
+    """Where the nameless file is made; None: in TMPDIR if that is set, else /var/tmp if there is
+    one, for /tmp may lie in memory."""
+
+    @property
+    def disk(self) -> Path:
+        """The folder, decided."""
+        if self.folder is not None:
+            return self.folder
+        lasting = Path("/var/tmp")
+        given = os.environ.get("TMPDIR")
+        return lasting if not given and lasting.is_dir() else Path(tempfile.gettempdir())
+
+
+KEEPING = Keeping()
+"""As the memory that there is suggests."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Photograph:
+    """A photograph in its file."""
+
+    path: Path
+    """The file."""
+    shape: tuple[int, int, int]
+    """H, W, and 3 or 4 channels, reduced."""
+    downscale: int
+    """Edge of the blocks of pixels that become one."""
+    image: np.ndarray | None = None
+    """Its pixels before that, [H, W, 3 or 4] uint8, where they are in memory anyway."""
+
+    @property
+    def n_bytes(self) -> int:
+        """Of its pixels."""
+        return math.prod(self.shape)
+
+    def read(self) -> np.ndarray:
+        """Read it.
+
+        Returns:
+            [H, W, 3 or 4] uint8, straight alpha.
+
+        Raises:
+            InputError: The file is damaged, or no longer what it was.
+        """
+        image = read_image(self.path) if self.image is None else self.image
+        if self.downscale > 1:
+            image = box_filter(image, self.downscale)
+        if image.shape != self.shape:
+            raise InputError(f"{self.path}: has changed while it was read; begin again.")
+        return image
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kept:
+    """Photographs, kept."""
+
+    images: list[np.ndarray | Photograph]
+    """The pixels of each, or where to read them."""
+    see_through: list[bool]
+    """Whether any pixel of it is transparent."""
+    notes: tuple[str, ...] = ()
+    """What should be told."""
+
+
+def keep(
+    photographs: Sequence[Photograph], keeping: Keeping, *, file: Path, downscale: int
+) -> Kept:
+    """Read photographs, unless they stay in their files, and keep their pixels.
+
+    Args:
+        photographs: At least one.
+        keeping: Where.
+        file: The scene file, for messages.
+        downscale: That they are reduced by, for messages.
+
+    Raises:
+        InputError: A photograph is damaged, or they need more room than there is.
+    """
+    needed = sum(photograph.n_bytes for photograph in photographs)
+    available = available_memory()
+    place = keeping.place
+    if place == "files":
+        return Kept(
+            images=list(photographs),
+            see_through=[p.shape[2] == 4 and _transparent(p.read()) for p in photographs],
+        )
+    if place == "auto":
+        fits = available is None or needed <= MEMORY_SHARE * available
+        place = "memory" if fits else "disk"
+    height, width, _ = photographs[0].shape
+    need = (
+        f"{file}: {len(photographs)} photographs (the first of {width}x{height} pixels) need "
+        f"{_gib(needed)}"
+    )
+    if place == "memory":
+        if available is not None and needed > available:
+            raise InputError(
+                f"{need}, but {_gib(available)} of memory are free; keep them on disk (--images "
+                f"disk), or use --downscale {_reduction(downscale, needed, available)}."
+            )
+        images = list(_read_all(photographs))
+        return Kept(images=[*images], see_through=[_transparent(image) for image in images])
+    folder = keeping.disk
+    try:
+        free = shutil.disk_usage(folder).free
+        if needed > free:
+            raise InputError(
+                f"{need}, but {_gib(free)} are free in {folder}; make room there, or use "
+                f"--downscale {_reduction(downscale, needed, free)}."
+            )
+        pixels = PixelFile(folder)
+        see_through = []
+        for image in _read_all(photographs):
+            pixels.add(image)
+            see_through.append(_transparent(image))
+        kept = pixels.close()
+    except OSError as error:
+        raise InputError(
+            f"{need} in {folder}, which cannot be written: {error.strerror or error}; make room or "
+            "give access there, or use a larger --downscale."
+        ) from None
+    note = f"photographs on disk: {_gib(needed)} in {folder}, removed at the end"
+    if keeping.place == "auto" and available is not None:
+        note += f"; {_gib(available)} of memory are free"
+    return Kept(images=[*kept], see_through=see_through, notes=(note,))
+
+
+def _read_all(photographs: Sequence[Photograph]) -> Iterator[np.ndarray]:
+    """Read in order and in parallel, only a few ahead of what is asked for."""
+    cores = usable_cores()
+    waiting: deque[Future[np.ndarray]] = deque()
+    # Decoders release the interpreter lock.
+    with ThreadPoolExecutor(cores) as pool:
+        for photograph in photographs:
+            waiting.append(pool.submit(photograph.read))
+            if len(waiting) > cores:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+
+
+def _transparent(image: np.ndarray) -> bool:
+    return image.shape[2] == 4 and bool((image[:, :, 3] < 255).any())
+
+
+def _reduction(downscale: int, needed: int, room: int) -> int:
+    """The least --downscale by which as many bytes would fit."""
+    return math.ceil(downscale * math.sqrt(needed / max(room, 1)))
+
+
+def _gib(n_bytes: int) -> str:
+    return f"{n_bytes / 2**30:.1f} GiB"
