@@ -41,6 +41,8 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, help="for the scene; there has to be room on disk")
     add_model(parser)
     arguments = parser.parse_args()
+    if arguments.device != "cpu":
+        parser.error("on CUDA photographs are copied to the device, wherever they were")
     with tempfile.TemporaryDirectory(dir=arguments.folder) as temporary:
         folder = Path(temporary)
         write_scene(folder / "scene", arguments.photographs, *arguments.size)

@@ -81,7 +81,8 @@ def ratios(scene: wn.Scene, field: wn.Field, steps: int, threads: int, rounds: i
     workers = Workers("cpu", threads)
     n_rays = wn.TrainConfig().rays_per_step
     views = [scene.views[i] for i in scene.splits["train"]]
-    sampler = PixelSampler(views, scene.content_distance, None, n_rays, True, 0, workers)
+    distances = np.full(len(views), scene.content_distance)
+    sampler = PixelSampler(views, distances, None, n_rays, True, 0, workers)
     ordered, drawn = (
         TrainingPass(
             steps * n_rays,

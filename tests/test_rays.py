@@ -14,7 +14,9 @@ N_RAYS = 64
 
 
 def sampler(device: str, seed: int = 0) -> PixelSampler:
-    return PixelSampler(small_scene().views, 2.0, None, N_RAYS, True, seed, Workers(device, 2))
+    views, workers = small_scene().views, Workers(device, 2)
+    distances = 2.0 + np.arange(len(views))
+    return PixelSampler(views, distances, None, N_RAYS, True, seed, workers)
 
 
 def drawn(batch: RayBatch) -> dict[str, np.ndarray]:
@@ -31,6 +33,15 @@ def test_batches_of_several_steps_are_those_of_each(n_steps: int, device: str) -
         for name, found in drawn(together).items():
             assert np.array_equal(found, np.concatenate([one[name] for one in each]))
     assert np.array_equal(drawn(several.draw(3))["directions"], each[0]["directions"])
+
+
+def test_each_camera_s_rays_have_its_distance(device: str) -> None:
+    batch = drawn(sampler(device).draw(0))
+    centres = np.array([view.camera.position for view in small_scene().views])
+    away = np.linalg.norm(batch["origins"][:, None] - centres, axis=2)
+    assert away.min(axis=1).max() < 1e-6
+    np.testing.assert_array_equal(batch["content_distance"], 2.0 + away.argmin(axis=1))
+    assert len(np.unique(batch["content_distance"])) > 2
 
 
 def test_steps_and_seeds_draw_what_is_their_own(device: str) -> None:

@@ -192,8 +192,9 @@ class TrainConfig:
     scaling: Scaling = "clamped"
     """How a sample's gradient depends on its distance t from the camera: none, quadratic
     (t / D)^2, or clamped min(1, (t / D)^2), the method of "Floaters No More"."""
-    content_distance: float | Literal["auto"] = "auto"
-    """D: where gradients reach full strength, scene units; auto: the scene's estimate."""
+    content_distance: float | Literal["auto", "per-camera"] = "auto"
+    """D: where gradients reach full strength, scene units; auto: the scene's estimate; per-camera:
+    of each camera's rays the distance of what it sees, for scenes that bring points."""
     jacobian: Jacobian = "none"
     """Whether the scaling takes the contraction's change of volume into account."""
     rays_per_step: int = 4096
@@ -244,7 +245,7 @@ class TrainConfig:
         if self.threads is not None:
             require_whole("threads", self.threads, 1)
         if isinstance(self.content_distance, str):
-            require_one_of("content_distance", self.content_distance, ("auto",))
+            require_one_of("content_distance", self.content_distance, ("auto", "per-camera"))
         else:
             require_positive("content_distance", self.content_distance)
         if isinstance(self.background, str):

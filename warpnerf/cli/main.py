@@ -57,7 +57,7 @@ def train_command(
     steps: int | None = None,
     time_limit: float | None = None,
     scaling: Scaling | None = None,
-    content_distance: float | Literal["auto"] | None = None,
+    content_distance: float | Literal["auto", "per-camera"] | None = None,
     voxels: int | None = None,
     near: float | None = None,
     downscale: int | None = None,
@@ -85,7 +85,8 @@ def train_command(
         steps: Batches of rays to train on.
         time_limit: Seconds of training; the schedule is squeezed to fit.
         scaling: How a sample's gradient depends on its distance from the camera.
-        content_distance: Where gradients reach full strength, in the scene's units.
+        content_distance: Where gradients reach full strength, in the scene's units; per-camera: of
+            each camera what it sees, where the scene brings points.
         voxels: Nodes of the final grid, in all; memory goes with their number.
         near: Nothing is sampled nearer to the camera than this, in the scene's units.
         downscale: Average blocks of so many pixels squared; by default 1, as they are.
@@ -341,7 +342,8 @@ def _describe(scene: Scene, content_distance: float, config: TrainConfig) -> Non
         print(f"  warning: {warning}")
     for note in scene.notes:
         print(f"  note: {note}")
-    print(f"  content distance {content_distance:.4g} scene units, scaling {config.scaling}")
+    each = ", of each camera its own" if config.content_distance == "per-camera" else ""
+    print(f"  content distance {content_distance:.4g} scene units{each}, scaling {config.scaling}")
     print(
         f"  box {extent[0]:.4g} x {extent[1]:.4g} x {extent[2]:.4g} scene units, "
         + ("space outside folded in" if scene.unbounded else "nothing outside"),

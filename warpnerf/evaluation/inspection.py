@@ -108,6 +108,10 @@ class Inspection:
             "box_max": scene.box_max.tolist(),
             "unbounded": scene.unbounded,
             "content_distance": self.content_distance,
+            "content_distances": None
+            if scene.content_distances is None
+            else _range(list(scene.content_distances[list(scene.splits["train"])])),
+            "near_content": scene.near_content,
             "how": list(scene.notes),
             "model": to_json(self.model),
             "costs": {preset: asdict(cost) for preset, cost in self.costs.items()},
@@ -148,6 +152,14 @@ class Inspection:
             ),
             ("content distance", f"{self.content_distance:.4g} scene units"),
         ]
+        if facts["content_distances"] is not None:
+            rows.append(
+                (
+                    "points",
+                    f"seen from {_span(facts['content_distances'])} scene units by a training "
+                    f"camera, 1 in 100 from less than {scene.near_content:.4g}",
+                )
+            )
         rows += [("how", note) for note in scene.notes]
         for preset, cost in self.costs.items():
             rows.append(
@@ -247,7 +259,7 @@ def oddities(scene: Scene, found: Survey, content_distance: float, near: float) 
         )
     cameras = scene.training_cameras
     if not found.built_in:  # they look everywhere, and know their true distances
-        odd += _odd_directions(cameras)
+        odd += _odd_directions(cameras, scene.content_distances is not None)
     odd += _odd_places(scene)
     nearest = max(near, _distance_to_box(scene))
     if nearest >= content_distance:
@@ -268,8 +280,8 @@ def _focus(cameras: Sequence[Camera]) -> np.ndarray | None:
     return focus.point
 
 
-def _odd_directions(cameras: Sequence[Camera]) -> list[str]:
-    """Cameras that have nothing in common to look at."""
+def _odd_directions(cameras: Sequence[Camera], known: bool) -> list[str]:
+    """Cameras that have nothing in common to look at, unless points tell what they see."""
     odd = []
     aimed = share_aimed_at(cameras, find_focus(cameras).point)
     turned = [_turned(camera) for camera in cameras]
@@ -278,7 +290,7 @@ def _odd_directions(cameras: Sequence[Camera]) -> list[str]:
             "all cameras look away from the point that they surround: if they should look at it, "
             "the poses are in OpenCV axes (looking along +z); negate their y and z columns"
         )
-    elif _focus(cameras) is None:
+    elif _focus(cameras) is None and not known:
         odd.append(
             f"no common focus: {aimed:.0%} of the training cameras have one point in the middle of "
             "their image, so content distance and box are guesses; give --content-distance"

@@ -20,6 +20,7 @@ _HEADER = 92 * _FINE
 _TRAIN, _TEST = (38, 96, 168), (214, 96, 30)
 _SIGHT, _SIGHT_END = (206, 226, 204), (56, 140, 66)
 _GRID, _BOX = (232, 232, 236), (120, 40, 130)
+_POINT = (150, 150, 158)
 _FRUSTUM = 0.035
 """Length of a camera's pyramid, in widths of a panel."""
 
@@ -27,7 +28,9 @@ Colour = tuple[int, int, int]
 
 
 def plan_picture(inspection: Inspection) -> np.ndarray:
-    """Draw cameras as pyramids, how far their content is, and the box, in the scene's units.
+    """Draw cameras as pyramids, how far their content is, the box, and points if there are some.
+
+    Axes are in the scene's units. Points far outside are left out.
 
     Up in the view from the side is the axis of the scene nearest to what is up for the cameras.
 
@@ -62,6 +65,8 @@ def plan_picture(inspection: Inspection) -> np.ndarray:
         left = _MARGIN + number * (_PANEL + _MARGIN)
         panel = _Panel(draw, (left, _HEADER), axes, signs, middle, extent)
         panel.frame(title)
+        if scene.points is not None:
+            panel.points(scene.points)
         for camera, end in zip(scene.training_cameras, ends, strict=True):
             panel.line([camera.position, end], _SIGHT)
         panel.box(box)
@@ -84,6 +89,8 @@ def _header(draw: ImageDraw.ImageDraw, inspection: Inspection) -> None:
         (f"content distance {inspection.content_distance:.4g} in sight", _SIGHT_END),
         ("box" + (", space outside folded in" if scene.unbounded else ""), _BOX),
     ]
+    if scene.points is not None:
+        legend.append(("points", _POINT))
     if inspection.focus is not None:
         legend.append(("+ what the cameras look at", INK))
     x, y = float(_MARGIN), 52.0 * _FINE
@@ -157,6 +164,14 @@ class _Panel:
     def line(self, points: Sequence[np.ndarray], colour: Colour, width: int = 1) -> None:
         """A line through points [3]."""
         self._draw.line([self._at(point) for point in points], colour, width * _FINE)
+
+    def points(self, points: np.ndarray) -> None:
+        """Small dots at points [n, 3], as far as they lie on the panel."""
+        half = 0.5 * self._extent
+        near = (np.abs(points - self._middle)[:, list(self._axes)] < half).all(axis=1)
+        for point in points[near]:
+            x, y = self._at(point)
+            self._draw.rectangle((x, y, x + _FINE - 1, y + _FINE - 1), fill=_POINT)
 
     def box(self, corners: np.ndarray) -> None:
         """The outline of a box from corners [2, 3]."""

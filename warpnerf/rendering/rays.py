@@ -109,7 +109,7 @@ class PixelSampler:
     def __init__(
         self,
         views: Sequence[View],
-        content_distance: float,
+        content_distances: np.ndarray,
         background: tuple[float, float, float] | None,
         n_rays: int,
         jitter: bool,
@@ -120,7 +120,7 @@ class PixelSampler:
 
         Args:
             views: What to draw from.
-            content_distance: Of every ray, scene units.
+            content_distances: Of the rays of each view, [n_views] scene units.
             background: rgb in [0, 1]; None: a random colour for each ray.
             n_rays: Rays in the batch of one step.
             jitter: Whether samples are shifted by a random part of a step.
@@ -140,9 +140,7 @@ class PixelSampler:
         self._n_pixels = 0
         structs = [self._add(view) for view in views]
         self._views = wp.array(structs, dtype=kernels.View, device=workers.device)
-        self._content_distances = wp.full(
-            len(views), content_distance, dtype=real, device=workers.device
-        )
+        self._content_distances = wp.array(content_distances, dtype=real, device=workers.device)
         self._batch = _room(n_rays, workers)
         self._launches = LaunchCache()
 

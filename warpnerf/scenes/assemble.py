@@ -18,7 +18,8 @@ from warpnerf.scenes.images import image_shape
 from warpnerf.scenes.lens import Lens
 from warpnerf.scenes.masks import Mask, masks_of_folder, read_mask
 from warpnerf.scenes.photographs import Keeping, Photograph, keep
-from warpnerf.scenes.scene import Scene, View, estimate_extent
+from warpnerf.scenes.points import Points, Sight, look
+from warpnerf.scenes.scene import Extent, Scene, View, estimate_extent
 from warpnerf.scenes.undistort import seen_pixels
 
 LITTLE = 0.1
@@ -102,6 +103,7 @@ def assemble(
     downscale: int,
     masks: Path | None,
     keeping: Keeping,
+    points: Points | None = None,
 ) -> Scene:
     """Read the images and make the scene.
 
@@ -115,6 +117,7 @@ def assemble(
         downscale: Edge of the blocks of pixels that become one.
         masks: Folder of masks, which take the place of those that frames have.
         keeping: Where the images' pixels are kept.
+        points: Of the scene's surfaces, where there are some; tracks go by names of frames.
 
     Raises:
         InputError: An image, a mask, the split or the placement of the cameras is of no use.
@@ -155,6 +158,11 @@ def assemble(
         extent = estimate_extent([view.camera for view in training], unbounded=unbounded)
     except InputError as error:
         raise InputError(f"{file}: $.frames[].transform_matrix: {error}") from None
+    sight = None
+    if points is not None:
+        seen = [points.seen_by(view.name, view.camera) for view in views]
+        sight = look([view.camera for view in views], seen, indices["train"])
+        extent = _seen_extent(extent, points, sight, unbounded)
     return Scene(
         name=folder.resolve().name,
         views=views,
@@ -163,9 +171,31 @@ def assemble(
         box_max=extent.box_max,
         unbounded=unbounded,
         content_distance=extent.content_distance,
+        content_distances=None if sight is None else sight.distances,
+        near_content=None if sight is None else sight.near_content,
+        points=None if sight is None or points is None else points.sample,
         notes=(*notes, *kept.notes, *extent.notes),
         warnings=(*warnings, *mask_warnings, *_oddities(views, complete)),
     )
+
+
+def _seen_extent(extent: Extent, points: Points, sight: Sight | None, unbounded: bool) -> Extent:
+    """The extent by what cameras see; the box of an object stays what the cameras look at."""
+    if sight is None:
+        note = f"points of {points.source} are not used: too few of them are seen by the cameras"
+        return replace(extent, notes=(*extent.notes, note))
+    distance = (
+        f"content distance {sight.content_distance:.3g}: median distance of the points of "
+        f"{points.source} that a training camera sees"
+    )
+    extent = replace(
+        extent, content_distance=sight.content_distance, notes=(distance, extent.notes[1])
+    )
+    if not (unbounded or extent.guessed):
+        return extent
+    edges = " x ".join(f"{edge:.3g}" for edge in sight.box_max - sight.box_min)
+    box = f"box of edges {edges}: where these points are, but for outliers and what is far behind"
+    return replace(extent, box_min=sight.box_min, box_max=sight.box_max, notes=(distance, box))
 
 
 def complete_splits(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ import numpy as np
 
 from warpnerf.checks import InputError
 from warpnerf.scenes.assemble import Frame, assemble
+from warpnerf.scenes.colmap_points import read_points
 from warpnerf.scenes.files import (
     exists,
     find_image,
@@ -30,6 +31,7 @@ from warpnerf.scenes.images import image_size
 from warpnerf.scenes.lens import Lens
 from warpnerf.scenes.masks import mask_in
 from warpnerf.scenes.photographs import KEEPING, Keeping
+from warpnerf.scenes.points import Points
 from warpnerf.scenes.poses import check_pose
 from warpnerf.scenes.scene import Scene
 
@@ -60,6 +62,12 @@ MODEL_NAMES = (
 """By their numbers in cameras.bin."""
 
 
+SAME = 0.02
+"""Largest difference of two cameras that are one: in spreads of all, and of unit vectors."""
+MIN_SAME = 0.5
+"""Share of a scene's cameras that must be a model's for the model's points to be the scene's."""
+
+
 @dataclass(frozen=True)
 class _Camera:
     """A lens of a model."""
@@ -74,6 +82,7 @@ class _Camera:
 class _Image:
     """A posed photograph of a model."""
 
+    number: int
     name: str
     camera: int
     rotation: tuple[float, float, float, float]
@@ -122,7 +131,8 @@ def load_colmap(
 ) -> Scene:
     """Load a scene from a sparse model.
 
-    Every 8th photograph is for testing. The model's points are not used.
+    Every 8th photograph is for testing. Box and content distance are those of the model's points,
+    where it has some.
 
     Args:
         model: Folder of cameras.bin and images.bin, or of cameras.txt and images.txt.
@@ -189,7 +199,47 @@ def load_colmap(
         downscale=downscale,
         masks=masks,
         keeping=keeping,
+        points=read_points(model, {image.number: image.name for image in images}, folder),
     )
+
+
+def points_beside(folder: Path, frames: Sequence[Frame]) -> tuple[Points | None, str]:
+    """Points of a model that lies in the folder of a scene with cameras from elsewhere.
+
+    Args:
+        folder: The scene's.
+        frames: Of the scene.
+
+    Returns:
+        The points, with tracks by names of frames, where the model's cameras are the scene's; else
+        None, and why a model that is there is not used.
+    """
+    model = find_model(folder)
+    if model is None:
+        return None, ""
+    place = model.relative_to(folder).as_posix()
+    try:
+        kind = model_kind(model)
+        images = (_images_of_bytes if kind == "bin" else _images_of_text)(model / f"images.{kind}")
+        by_name = {image.name.replace("\\", "/").rpartition("/")[2]: image for image in images}
+        pairs = [(f, by_name[f.path.name]) for f in frames if f.path.name in by_name]
+        poses = np.array([_pose(image, f"{model}: {image.name}") for _, image in pairs])
+        if len(pairs) < MIN_SAME * len(frames) or not _same_cameras(
+            np.array([frame.c2w for frame, _ in pairs]), poses
+        ):
+            return None, f"the points of {place} are not used: its cameras are others"
+        names = {image.number: frame.name for frame, image in pairs}
+        return read_points(model, names, folder), ""
+    except InputError as error:
+        return None, f"the points of {place} are not used: {error}"
+
+
+def _same_cameras(ours: np.ndarray, theirs: np.ndarray) -> bool:
+    """Whether poses [n, 3, 4] are the same, but for rounding and a few."""
+    spread = np.linalg.norm(ours[:, :, 3] - ours[:, :, 3].mean(axis=0), axis=1).mean()
+    apart = np.linalg.norm(ours[:, :, 3] - theirs[:, :, 3], axis=1)
+    turned = np.abs(ours[:, :, :3] - theirs[:, :, :3]).max(axis=(1, 2))
+    return bool(np.mean((apart < SAME * spread) & (turned < SAME)) > MIN_SAME)
 
 
 def _pose(image: _Image, field: str) -> np.ndarray:
@@ -327,12 +377,12 @@ def _images_of_bytes(file: Path) -> list[_Image]:
     data = _Bytes(file)
     images = []
     for _ in range(data.count(4 + 7 * 8 + 4 + 1 + 8, "images")):
-        data.take("I")
+        (number,) = data.take("I")
         values = data.take("7d")
         (camera,) = data.take("I")
         name = data.text()
         data.skip(24 * data.count(24, "points of an image"))
-        images.append(_Image(name, camera, values[:4], values[4:]))
+        images.append(_Image(number, name, camera, values[:4], values[4:]))
     return images
 
 
@@ -380,7 +430,7 @@ def _images_of_text(file: Path) -> list[_Image]:
         def parse(words: list[str] = words) -> _Image:
             w, x, y, z, *translation = map(float, words[1:8])
             a, b, c = translation
-            return _Image(words[9], int(words[8]), (w, x, y, z), (a, b, c))
+            return _Image(int(words[0]), words[9], int(words[8]), (w, x, y, z), (a, b, c))
 
         images.append(_parsed(file, number, "image", parse))
     return images

@@ -63,7 +63,7 @@ def _tracked(
     kept = usable(positions)
     if not lengths.any():  # some programs write points without tracks
         return Points(positions=positions[kept], tracks=None, source=source)
-    index = np.repeat(np.where(kept, np.cumsum(kept) - 1, -1), lengths)
+    index = np.repeat(np.where(kept, np.cumsum(kept) - 1, -1).astype(np.int32), lengths)
     numbers, index = numbers[index >= 0], index[index >= 0]
     order = np.argsort(numbers, kind="stable")
     numbers, index = numbers[order], index[order]
@@ -97,12 +97,12 @@ def _of_bytes(file: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         lengths[point] = length
         at = end
     where = np.frombuffer(positions, "<f8").astype(np.float64).reshape(-1, 3)
-    return where, np.frombuffer(tracks, "<u4")[::2].astype(np.int64), lengths
+    return where, np.frombuffer(tracks, "<u4")[::2], lengths
 
 
 def _of_text(file: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """As ``_of_bytes``, from lines of id, position, colour, error, and the track."""
-    positions, numbers, lengths = array("d"), array("q"), array("q")
+    positions, numbers, lengths = array("d"), array("I"), array("q")
     with file.open(encoding="utf-8", errors="replace") as lines:
         for number, line in enumerate(iter(lambda: lines.readline(MAX_LINE), ""), 1):
             words = line.split()
@@ -118,7 +118,7 @@ def _of_text(file: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
                 raise _damaged(file, f"has no point as COLMAP writes it in line {number}") from None
             lengths.append(len(words) // 2 - 4)
     where = np.array(positions, np.float64).reshape(-1, 3)
-    return where, np.array(numbers, np.int64), np.array(lengths, np.int64)
+    return where, np.array(numbers, np.uint32), np.array(lengths, np.int64)
 
 
 def _damaged(file: Path, how: str) -> InputError:

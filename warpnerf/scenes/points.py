@@ -1,8 +1,8 @@
-"""Points of a scene's surfaces, as structure from motion finds them, and who sees which."""
+"""Points of a scene's surfaces, as structure from motion finds them, and the extent they give."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,8 +10,33 @@ import numpy as np
 from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.poses import MAX_COORDINATE
 
-MAX_PROJECTED = 20_000
+MAX_PROJECTED = 5000
 """Points without tracks that are looked for in each photograph; of more every n-th is taken."""
+
+MAX_SEEN = 2000
+"""Points that count of those matched in a photograph; of more every n-th is taken."""
+
+FEW = 10
+"""A camera that sees fewer points has no distance of its own."""
+
+MIN_SHARE = 0.5
+"""Share of the training cameras that must see enough points for these to be used."""
+
+OUTSIDE = 0.02
+"""Share of what cameras see that may lie outside the box at each of its faces, and is left out as
+noise, or as background far behind."""
+
+BACKGROUND = 4.0
+"""Points farther than so many times the median of their camera are behind what the box is for."""
+
+MARGIN = 0.05
+"""Of the box, on each side, in its edges."""
+
+MIN_EDGE = 0.2
+"""Least edge of the box, in longest edges."""
+
+NEAREST = 0.01
+"""Share of the points seen that are nearer than the near content: floaters of the matching."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -39,14 +64,103 @@ class Points:
             [n, 3] scene units, all in front of the camera.
         """
         if self.tracks is not None:
-            points = self.positions[self.tracks.get(name, np.empty(0, np.int64))]
+            indices = self.tracks.get(name, np.empty(0, np.int64))
+            points = self.positions[_spread(indices, MAX_SEEN)]
             return points[(points - camera.position) @ camera.forward > 0.0]
-        points = self.positions[:: -(-len(self.positions) // MAX_PROJECTED) or 1]
+        points = _spread(self.positions, MAX_PROJECTED)
         x, y, z = ((points - camera.position) @ camera.c2w[:, :3]).T
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u, v = camera.cx - camera.fx * x / z, camera.cy + camera.fy * y / z
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            if camera.fisheye:  # as far from the middle as the angle to the axis is large
+                aside = np.hypot(x, y)
+                scale = np.where(aside > 0.0, np.arctan2(aside, -z) / aside, 0.0)
+            else:
+                scale = -1.0 / z
+            u, v = camera.cx + camera.fx * x * scale, camera.cy - camera.fy * y * scale
         inside = (u >= 0.0) & (u < camera.width) & (v >= 0.0) & (v < camera.height)
         return points[inside & (z < 0.0)]
+
+    @property
+    def sample(self) -> np.ndarray:
+        """Some of the positions, to show, [n, 3]."""
+        return _spread(self.positions, MAX_PROJECTED)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Sight:
+    """What cameras see of a scene, as its points tell."""
+
+    distances: np.ndarray
+    """[n_views] median distance of the points that each camera sees, scene units; the content
+    distance where it sees few."""
+    content_distance: float
+    """Median of the training cameras' own, scene units."""
+    near_content: float
+    """Nearest distance that is seen, but for one point in a hundred, scene units."""
+    middle: np.ndarray
+    """[3] median of the points seen, scene units."""
+    box_min: np.ndarray
+    """[3] lower corner of the box around them, but for outliers, scene units."""
+    box_max: np.ndarray
+    """[3] upper corner."""
+
+
+def look(
+    cameras: Sequence[Camera], seen: Sequence[np.ndarray], training: Sequence[int]
+) -> Sight | None:
+    """Find how far from the cameras content is, and where.
+
+    All training cameras count as much, however many points they see. All figures are medians and
+    quantiles, so that a few wrong points, near cameras or far behind, change little.
+
+    Args:
+        cameras: Of all views.
+        seen: For each, the points that it sees, [n, 3] scene units.
+        training: Indices of the training cameras, which alone decide but for distances of others.
+
+    Returns:
+        What they see; None where too few training cameras see points enough to tell.
+    """
+    away = [
+        np.linalg.norm(points - camera.position, axis=1)
+        for camera, points in zip(cameras, seen, strict=True)
+    ]
+    own = np.array([np.median(a) if len(a) >= FEW else np.nan for a in away])
+    if np.isfinite(own[list(training)]).mean() < MIN_SHARE:
+        return None
+    content_distance = float(np.nanmedian(own[list(training)]))
+    distances = np.where(np.isfinite(own), own, content_distance)
+
+    distance = np.concatenate([away[i] for i in training])
+    near = np.concatenate([away[i] <= BACKGROUND * distances[i] for i in training])
+    weight = np.concatenate(
+        [np.full(len(a), 1.0 / max(len(a), FEW)) for a in (away[i] for i in training)]
+    )
+    points = np.concatenate([seen[i] for i in training])[near]
+    shares = (OUTSIDE, 0.5, 1.0 - OUTSIDE)
+    low, middle, high = np.stack([_quantiles(axis, weight[near], shares) for axis in points.T], 1)
+    # A facade is flat, its box is not.
+    margin = np.maximum(MARGIN * (high - low), 0.5 * (MIN_EDGE * (high - low).max() - (high - low)))
+    return Sight(
+        distances=distances,
+        content_distance=content_distance,
+        near_content=float(_quantiles(distance, weight, (NEAREST,))[0]),
+        middle=middle,
+        box_min=low - margin,
+        box_max=high + margin,
+    )
+
+
+def _quantiles(values: np.ndarray, weights: np.ndarray, shares: Sequence[float]) -> np.ndarray:
+    """Values [n] below which such shares of the weight [n] lie."""
+    order = np.argsort(values)
+    total = np.cumsum(weights[order])
+    at = np.searchsorted(total, np.array(shares) * total[-1])
+    return values[order[np.minimum(at, len(values) - 1)]]
+
+
+def _spread(values: np.ndarray, most: int) -> np.ndarray:
+    """At most so many of the values [n, ...], spread evenly over their order."""
+    return values[:: max(1, -(-len(values) // most))]
 
 
 def usable(positions: np.ndarray) -> np.ndarray:

@@ -130,7 +130,14 @@ class Scene:
     unbounded: bool
     """Whether content goes on outside the box (photographs), or not (objects with alpha, rooms)."""
     content_distance: float
-    """Median distance from a camera to what all cameras look at, scene units."""
+    """Median distance from a camera to what it sees, or to what all look at, scene units."""
+    content_distances: np.ndarray | None = None
+    """[n_views] float64, median distance of the points that each camera sees, scene units; None
+    where the capture brings no points."""
+    near_content: float | None = None
+    """Distance from the cameras within which 1 in 100 of these points lies, scene units."""
+    points: np.ndarray | None = None
+    """[n, 3] float64, some of these points, scene units."""
     notes: tuple[str, ...] = field(default=())
     """How the scene was understood: its split, what was estimated; a line each."""
     warnings: tuple[str, ...] = field(default=())
@@ -152,6 +159,14 @@ class Scene:
                 f"{self.box_min} and {self.box_max}."
             )
         require_positive(f"{self.name}: content_distance", self.content_distance)
+        distances = self.content_distances
+        if distances is not None and (
+            distances.shape != (len(self.views),) or not (distances > 0.0).all()
+        ):
+            raise InputError(
+                f"{self.name}: content_distances must be one above 0 for each of "
+                f"{len(self.views)} views."
+            )
         if len({view.name for view in self.views}) < len(self.views):
             raise InputError(f"{self.name}: two views have one name; give each its own.")
         for split, indices in self.splits.items():
@@ -211,6 +226,8 @@ class Extent:
     """Scene units."""
     notes: tuple[str, ...]
     """How each was found, one sentence each."""
+    guessed: bool = False
+    """As of ``Focus``."""
 
 
 def focus_point(cameras: Sequence[Camera]) -> np.ndarray:
@@ -358,6 +375,7 @@ def estimate_extent(cameras: Sequence[Camera], *, unbounded: bool) -> Extent:
             f"content distance {focus.distance:.3g}: {focus.how}",
             f"box of edge {2.0 * half:.3g}: {how}",
         ),
+        guessed=focus.guessed,
     )
 
 

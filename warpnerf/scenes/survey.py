@@ -22,7 +22,7 @@ SINGLE_PRECISION = 1e-5
 
 WITHOUT_EFFECT = {
     *("aabb_scale", "scale", "offset", "up", "n_frames", "sharpness", "colmap_im_id", "rotation"),
-    *("applied_transform", "ply_file_path", "orientation_override", "time"),
+    *("applied_transform", "orientation_override", "time"),
     *("camera_id", "image_id"),
 }
 """Keys that are not read and do not change the picture."""

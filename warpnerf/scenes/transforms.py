@@ -14,11 +14,14 @@ from pathlib import Path
 
 from warpnerf.checks import InputError
 from warpnerf.scenes.assemble import Frame, assemble, find_images
+from warpnerf.scenes.colmap import points_beside
 from warpnerf.scenes.depths import DEFAULT_UNIT, DepthFile
-from warpnerf.scenes.files import find_image, read_json
+from warpnerf.scenes.files import exists, find_image, printable, read_json, resolve_inside
 from warpnerf.scenes.lens import LensFields, read_lens
 from warpnerf.scenes.masks import Mask, mask_beside
 from warpnerf.scenes.photographs import KEEPING, Keeping
+from warpnerf.scenes.ply import read_ply
+from warpnerf.scenes.points import Points, usable
 from warpnerf.scenes.poses import check_pose
 from warpnerf.scenes.scene import Scene
 
@@ -53,6 +56,7 @@ class TransformsFile(PictureKeys, kw_only=True):
     """The whole file; other keys are allowed and not read."""
 
     frames: list[FrameEntry]
+    ply_file_path: str | None = None
     mask_path: str | None = None
     depth_unit_scale_factor: float = DEFAULT_UNIT
     applied_scale: float = 1.0
@@ -70,7 +74,9 @@ def load_transforms(
 ) -> Scene:
     """Load a scene from a transforms.json.
 
-    The split is the file's ``{train,val,test}_filenames``, else every 8th image is for testing.
+    The split is the file's ``{train,val,test}_filenames``, else every 8th image is for testing. Box
+    and content distance are those of the points that ``ply_file_path`` names, or of a COLMAP model
+    in the folder whose cameras are the same, where there are such.
 
     Args:
         file: The file; image paths in it are relative to its folder and stay inside it.
@@ -99,6 +105,9 @@ def load_transforms(
                 f"{split}_filenames (first: {absent[0]})"
             )
         splits[split] = members
+    points, why_not = _points(file, data.ply_file_path, frames)
+    if why_not:
+        warnings.append(why_not)
     return assemble(
         folder=folder,
         file=file,
@@ -108,7 +117,26 @@ def load_transforms(
         downscale=downscale,
         masks=masks,
         keeping=keeping,
+        points=points,
     )
+
+
+def _points(
+    file: Path, ply_file_path: str | None, frames: Sequence[Frame]
+) -> tuple[Points | None, str]:
+    """The points that the file names, else those of a COLMAP model with the same cameras.
+
+    Returns:
+        The points, or None; and a warning if there are some that are not used.
+    """
+    if ply_file_path is None:
+        return points_beside(file.parent, frames)
+    path = resolve_inside(file.parent, ply_file_path, field=f"{file}: $.ply_file_path")
+    if not exists(path):
+        return None, f"{file.name}: ply_file_path {printable(ply_file_path)} is not there"
+    positions = read_ply(path)
+    positions = positions[usable(positions)]
+    return Points(positions=positions, tracks=None, source=ply_file_path), ""
 
 
 def read_frames(file: Path) -> tuple[TransformsFile, list[Frame], list[str]]:

@@ -73,6 +73,7 @@ def save_checkpoint(path: str | Path, state: TrainingState) -> None:
         "config": config_to_json(state.config),
         "scene_digest": state.scene_digest,
         "content_distance": state.content_distance,
+        "content_distances": state.content_distances,
         "reach": state.reach,
         "grown": state.grown,
         "updates": state.updates,
@@ -124,6 +125,8 @@ def load_checkpoint(path: str | Path) -> TrainingState:
         _refuse(path, f"a grid cannot have grown {training.grown} times")
     if not 0 <= training.updates <= training.progress.step:
         _refuse(path, f"{training.updates} updates do not fit {training.progress.step} steps")
+    if (training.config.content_distance == "per-camera") != bool(training.content_distances):
+        _refuse(path, "content distances of cameras are not as its configuration says")
     workers = Workers("cpu")
     field = _field(header, tensors, path, workers)
     if training.config.model != field.model:
@@ -132,6 +135,7 @@ def load_checkpoint(path: str | Path) -> TrainingState:
         config=training.config,
         scene_digest=training.scene_digest,
         content_distance=training.content_distance,
+        content_distances=training.content_distances,
         reach=training.reach,
         grown=training.grown,
         updates=training.updates,
@@ -151,6 +155,7 @@ class _Training(msgspec.Struct, frozen=True):
     grown: int
     updates: int
     progress: Progress
+    content_distances: list[float] | None = None
 
 
 class _Header(msgspec.Struct, frozen=True):

@@ -53,6 +53,8 @@ class TrainingState:
     """``scene_digest`` of what it trains on."""
     content_distance: float
     """The one in use, scene units."""
+    content_distances: list[float] | None = None
+    """Those of the training views where each has its own, scene units; else None."""
     reach: float
     """From the outermost camera to the farthest corner of the first box, scene units."""
     grown: int

@@ -107,15 +107,18 @@ class Trainer:
         self.config = config
         self.workers = Workers(config.device, config.threads)
         self.steps_done = 0
-        self.content_distance = (
-            scene.content_distance
-            if config.content_distance == "auto"
-            else float(config.content_distance)
-        )
+        self.content_distance, distances = _content_distances(scene, config)
         _require_samples(scene, config)
         self._reach = _reach(scene)
         if resume is not None:  # estimates anew may be rounded otherwise
             self.content_distance, self._reach = resume.content_distance, resume.reach
+            distances = resume.content_distances or [resume.content_distance] * len(distances)
+            if len(distances) != len(scene.splits["train"]):
+                raise InputError(
+                    f"the training to be resumed has {len(distances)} content distances, but "
+                    f"{scene.name} {len(scene.splits['train'])} training views; train anew."
+                )
+        self._content_distances = distances
         self._scene_digest = scene_digest(scene)
         views = [scene.views[i] for i in scene.splits["train"]]
         behind = config.background
@@ -124,7 +127,7 @@ class Trainer:
         self._background = _COLOURS[behind] if isinstance(behind, str) else behind
         self._sampler = PixelSampler(
             views,
-            self.content_distance,
+            np.array(distances),
             None if behind == "random" else self._background,
             config.rays_per_step,
             config.march.jitter,
@@ -272,6 +275,9 @@ class Trainer:
             config=replace(self.config, threads=threads),
             scene_digest=self._scene_digest,
             content_distance=self.content_distance,
+            content_distances=(
+                self._content_distances if self.config.content_distance == "per-camera" else None
+            ),
             reach=self._reach,
             grown=self._grown,
             updates=self._updates,
@@ -443,6 +449,20 @@ def _contraction(scene: Scene, config: TrainConfig) -> Contraction:
     if config.grid.contraction == "auto":
         return "linf" if scene.unbounded else "none"
     return config.grid.contraction
+
+
+def _content_distances(scene: Scene, config: TrainConfig) -> tuple[float, list[float]]:
+    """The content distance of the scene, and those of its training views."""
+    chosen, train = config.content_distance, scene.splits["train"]
+    if chosen == "per-camera":
+        if scene.content_distances is None:
+            raise InputError(
+                f"content_distance is per-camera, but {scene.name} has no points that tell what "
+                "each camera sees; use auto, or a number."
+            )
+        return scene.content_distance, [float(scene.content_distances[i]) for i in train]
+    one = scene.content_distance if chosen == "auto" else float(chosen)
+    return one, [one] * len(train)
 
 
 def _require_samples(scene: Scene, config: TrainConfig) -> None:
