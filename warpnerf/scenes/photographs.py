@@ -137,7 +137,7 @@ def keep(
             )
         images = list(_read_all(photographs))
         return Kept(images=[*images], see_through=[_transparent(image) for image in images])
-    folder = keeping.disk
+    folder = keeping.disk.resolve()
     try:
         free = shutil.disk_usage(folder).free
         if needed > free:

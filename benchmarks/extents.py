@@ -1,0 +1,119 @@
+"""What it brings that box and content distance come from points, against from the cameras alone.
+
+    python benchmarks/extents.py room-scan path/to/scene --steps 1200 --seeds 0 1
+
+Scenes are folders that bring points, and room-scan: the built-in room seen outward only, written as
+photographs and a COLMAP model by room_scan.py. Each is trained with both extents, and with that of
+the points and a content distance for each camera, for as many steps, whatever the time. Prints PSNR
+and SSIM of the test views, optical depth within a tenth of the points' content distance of the
+training cameras, and seconds; writes benchmarks/results/extents_<device>.json.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from measuring import machine, options, write_record
+from room_scan import write_scan
+from training import path_of
+
+import warpnerf as wn
+from warpnerf.model.models import MODELS
+from warpnerf.runtime.parallel import Workers
+from warpnerf.scenes.scene import estimate_extent
+
+ROOM_SCAN = "room-scan"
+
+
+def main() -> None:
+    parser = options(__doc__)
+    parser.add_argument("scenes", nargs="*", default=[ROOM_SCAN], help="folders, room-scan")
+    parser.add_argument("--steps", type=int, default=1200)
+    parser.add_argument("--voxels", type=int, default=112**3)
+    parser.add_argument("--threads", type=int, help="by default one per usable core")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--views", type=int, default=125, help="photographs of room-scan")
+    parser.add_argument("--model", default="rgb", choices=list(MODELS))
+    arguments = parser.parse_args()
+    config = wn.TrainConfig(
+        model=arguments.model,
+        steps=arguments.steps,
+        grid=wn.GridConfig(voxels=arguments.voxels),
+        device=arguments.device,
+        threads=arguments.threads,
+    )
+    rows: list[dict[str, Any]] = []
+    print(
+        "scene         seed  extent      distance  longest edge   PSNR   SSIM  near_mass  seconds"
+    )
+    with tempfile.TemporaryDirectory() as temporary:
+        for name in arguments.scenes:
+            for seed in arguments.seeds:
+                scene = load(name, Path(temporary) / ROOM_SCAN, arguments.views)
+                for extent, (scene_of, chosen) in variants(scene).items():
+                    found = measure(scene, scene_of, replace(config, seed=seed, **chosen))
+                    row = {"scene": name, "seed": seed, "extent": extent, **found}
+                    rows.append(row)
+                    print(
+                        f"{name:12}  {seed:4}  {extent:10}  {row['content_distance']:8.3f}  "
+                        f"{row['longest_edge']:12.3f}  {row['psnr']:5.2f}  {row['ssim']:.3f}  "
+                        f"{row['near_mass']:9.4f}  {row['seconds']:7.1f}",
+                        flush=True,
+                    )
+    record = {
+        "machine": machine(arguments.device, Workers(arguments.device, arguments.threads).count),
+        "model": arguments.model,
+        "steps": arguments.steps,
+        "voxels": arguments.voxels,
+        "rows": rows,
+    }
+    print(f"wrote {write_record(record, arguments.output, 'extents', arguments.device)}")
+
+
+def load(name: str, folder: Path, views: int) -> wn.Scene:
+    """A scene that brings points."""
+    if name != ROOM_SCAN:
+        return wn.load_scene(path_of(name))
+    if not folder.exists():
+        write_scan(folder, views, n_points=32 * views)
+    return wn.load_scene(folder)
+
+
+def variants(scene: wn.Scene) -> dict[str, tuple[wn.Scene, dict[str, Any]]]:
+    """The scene with each extent, and what the configuration says."""
+    if scene.content_distances is None:
+        raise SystemExit(f"{scene.name} brings no points")
+    alone = estimate_extent(scene.training_cameras, unbounded=scene.unbounded)
+    without = replace(
+        scene,
+        box_min=alone.box_min,
+        box_max=alone.box_max,
+        content_distance=alone.content_distance,
+        content_distances=None,
+    )
+    return {
+        "cameras": (without, {}),
+        "points": (scene, {}),
+        "per camera": (scene, {"content_distance": "per-camera"}),
+    }
+
+
+def measure(scene: wn.Scene, trained: wn.Scene, config: wn.TrainConfig) -> dict[str, float]:
+    """Train, and look at the test views and at the space before the training cameras."""
+    result = wn.train(trained, config)
+    found = wn.evaluate(result.field, scene)
+    return {
+        "content_distance": trained.content_distance,
+        "longest_edge": float((trained.box_max - trained.box_min).max()),
+        "psnr": found.mean["psnr"],
+        "ssim": found.mean["ssim"],
+        "near_mass": found.near_field.near_mass,
+        "seconds": result.progress.seconds,
+    }
+
+
+if __name__ == "__main__":
+    main()
