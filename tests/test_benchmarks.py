@@ -285,6 +285,34 @@ def test_footprint(tmp_path):
 
 
 @pytest.mark.slow
+def test_photos_on_disk(tmp_path):
+    options = ("--photographs", "12", "--size", "200", "150", "--steps", "30", "--model", "rgb")
+    record, printed = run(
+        "photos_on_disk.py", tmp_path / "record.json", *options, "--rounds", "3", "--updates", "2"
+    )
+    assert record["decoded_bytes"] == 12 * 200 * 150 * 3
+    assert is_interval(record["disk_over_memory"])
+    if record["most_anonymous_bytes"] is not None:
+        assert 0 < record["most_anonymous_bytes"] < record["most_resident_bytes"]
+        assert f"{record['most_anonymous_bytes'] / 2**30:6.2f} GiB" in printed
+
+
+@pytest.mark.slow
+def test_extents(tmp_path):
+    options = ("room-scan", "--views", "9", "--steps", "20", "--voxels", "8000", "--threads", "1")
+    record, printed = run("extents.py", tmp_path / "record.json", *options)
+    rows = {row["extent"]: row for row in record["rows"]}
+    assert list(rows) == ["cameras", "points", "per camera"]
+    assert rows["cameras"]["longest_edge"] < 1.5  # a guess
+    for extent in ("points", "per camera"):
+        assert 5.0 < rows[extent]["longest_edge"] < 6.0  # the room's
+        assert 1.5 < rows[extent]["content_distance"] < 2.5
+    for row in rows.values():
+        assert row["psnr"] > 5 and row["near_mass"] >= 0 and row["seconds"] > 0
+        assert f"{row['psnr']:5.2f}" in printed
+
+
+@pytest.mark.slow
 def test_schedules(tmp_path):
     scene = ("builtin:room-sparse", "--downscale", "8")
     options = (*scene, "--seeds", "1", "2", "--time-limit", "1.5")

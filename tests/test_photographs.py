@@ -15,6 +15,7 @@ from PIL import Image
 from tiny_scenes import picture, ring, write_blender, write_transforms
 
 from warpnerf.checks import InputError
+from warpnerf.cli.main import main
 from warpnerf.config import GridConfig, TrainConfig
 from warpnerf.evaluation.evaluate import evaluate
 from warpnerf.scenes import photographs
@@ -130,6 +131,26 @@ def test_a_disk_that_is_full_later_is_told(tmp_path: Path, monkeypatch: pytest.M
         load_scene(tmp_path, images="disk")
     with pytest.raises(InputError, match="cannot be written: No such file"):
         load_scene(tmp_path, images="disk", image_folder=tmp_path / "nowhere")
+
+
+def test_the_command_says_where_they_are_and_goes_on_anywhere(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_transforms(tmp_path / "scene", 8, scale=3)
+    run = tmp_path / "runs" / "a"
+    begin = ["train", str(tmp_path / "scene"), "--output", str(run), "--model", "rgb"]
+    begin += ["--steps", "8", "--voxels", "512", "--threads", "1"]
+    monkeypatch.setattr(photographs, "TELL_EVERY", -1.0)
+    assert main([*begin, "--images", "disk"]) == 0
+    said = capsys.readouterr().out
+    assert f"photographs on disk: 0.0 GiB in {tmp_path}, removed at the end" in said
+    assert "read 7 of 8 photographs" in said
+    field = (run / "field.safetensors").read_bytes()
+    assert main(["train", "--resume", str(run), "--images", "disk"]) == 0
+    assert main([*begin, "--overwrite"]) == 0
+    assert "on disk" not in capsys.readouterr().out.rpartition("reading ")[2]
+    assert (run / "field.safetensors").read_bytes() == field
+    assert main(["eval", str(run), "--threads", "1"]) == 0
 
 
 def test_photographs_that_change_are_told(tmp_path: Path) -> None:

@@ -152,7 +152,7 @@ class Inspection:
             ),
             ("content distance", f"{self.content_distance:.4g} scene units"),
         ]
-        if facts["content_distances"] is not None:
+        if scene.near_content is not None:
             rows.append(
                 (
                     "points",

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 import shutil
 import tempfile
+import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import compress
 from pathlib import Path
 from typing import Literal
 
@@ -26,6 +29,12 @@ auto: memory, or disk where they would take more than ``MEMORY_SHARE`` of what i
 
 MEMORY_SHARE = 0.5
 """Of the memory that is free; grid, optimiser and system need some, too."""
+
+
+TELL_EVERY = 5.0
+"""Seconds from one word on how far reading has come to the next."""
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,10 +126,10 @@ def keep(
     available = available_memory()
     place = keeping.place
     if place == "files":
-        return Kept(
-            images=list(photographs),
-            see_through=[p.shape[2] == 4 and _transparent(p.read()) for p in photographs],
-        )
+        with_alpha = [photograph.shape[2] == 4 for photograph in photographs]
+        seen = map(_transparent, _read_all(list(compress(photographs, with_alpha))))
+        see_through = [alpha and next(seen) for alpha in with_alpha]
+        return Kept(images=list(photographs), see_through=see_through)
     if place == "auto":
         fits = available is None or needed <= MEMORY_SHARE * available
         place = "memory" if fits else "disk"
@@ -164,11 +173,14 @@ def keep(
 
 def _read_all(photographs: Sequence[Photograph]) -> Iterator[np.ndarray]:
     """Read in order and in parallel, only a few ahead of what is asked for."""
-    cores = usable_cores()
+    cores, told = usable_cores(), time.monotonic()
     waiting: deque[Future[np.ndarray]] = deque()
     # Decoders release the interpreter lock.
     with ThreadPoolExecutor(cores) as pool:
-        for photograph in photographs:
+        for number, photograph in enumerate(photographs):
+            if time.monotonic() - told > TELL_EVERY:
+                told = time.monotonic()
+                _log.info("read %d of %d photographs", number, len(photographs))
             waiting.append(pool.submit(photograph.read))
             if len(waiting) > cores:
                 yield waiting.popleft().result()
