@@ -74,7 +74,8 @@ def test_masked_pixels_are_never_drawn_and_all_others_alike(device: str) -> None
     counting = [np.ones(v.image.shape[:2], bool) if v.mask is None else v.mask for v in views]
     n_counting = sum(int(mask.sum()) for mask in counting)
     n_rays = 400 * n_counting
-    sampler = PixelSampler(views, 2.0, (0.0, 0.0, 0.0), n_rays, False, 3, Workers(device, 2))
+    away = np.full(len(views), 2.0)
+    sampler = PixelSampler(views, away, (0.0, 0.0, 0.0), n_rays, False, 3, Workers(device, 2))
     batch = drawn(sampler.draw(0))
     row, column, number = np.round(255.0 * batch["target_rgb"]).astype(int).T
     counts = np.zeros((len(views), *counting[0].shape), int)
@@ -92,7 +93,7 @@ def test_masked_pixels_are_never_drawn_and_all_others_alike(device: str) -> None
 def test_a_mask_of_all_pixels_changes_no_bit(device: str) -> None:
     views = small_scene().views
     whole = [replace(v, mask=np.ones(v.image.shape[:2], bool)) for v in views]
-    options = (2.0, None, N_RAYS, True, 0, Workers(device, 2))
+    options = (np.full(len(views), 2.0), None, N_RAYS, True, 0, Workers(device, 2))
     one, other = (drawn(PixelSampler(v, *options).draw(5)) for v in (views, whole))
     for name, found in one.items():
         assert np.array_equal(found, other[name])
