@@ -1,10 +1,12 @@
-"""What it brings that box and content distance come from points, against from the cameras alone.
+"""What it brings that box and content distance come from points, or from a short training.
 
     python benchmarks/extents.py room-scan path/to/scene --steps 1200 --seeds 0 1
 
 Scenes are folders that bring points, and room-scan: the built-in room seen outward only, written as
-photographs and a COLMAP model by room_scan.py. Each is trained with both extents, and with that of
-the points and a content distance for each camera, for as many steps, whatever the time. Prints PSNR
+photographs and a COLMAP model by room_scan.py. Each is trained with the extent that the cameras
+give alone, with the one that two short trainings find, where the cameras look at no common point,
+with that of the points, and with that and a content distance for each camera, for as many steps,
+whatever the time. Prints PSNR
 and SSIM of the test views, optical depth within a tenth of the points' content distance of the
 training cameras, and seconds; writes benchmarks/results/extents_<device>.json.
 """
@@ -24,6 +26,7 @@ import warpnerf as wn
 from warpnerf.model.models import MODELS
 from warpnerf.runtime.parallel import Workers
 from warpnerf.scenes.scene import estimate_extent
+from warpnerf.training.coarse import begin
 
 ROOM_SCAN = "room-scan"
 
@@ -93,9 +96,12 @@ def variants(scene: wn.Scene) -> dict[str, tuple[wn.Scene, dict[str, Any]]]:
         box_max=alone.box_max,
         content_distance=alone.content_distance,
         content_distances=None,
+        guessed=alone.guessed,
     )
-    return {
-        "cameras": (without, {}),
+    found = {"cameras": (without, {"coarse_steps": 0})}
+    if alone.guessed:
+        found["coarse"] = (without, {})
+    return found | {
         "points": (scene, {}),
         "per camera": (scene, {"content_distance": "per-camera"}),
     }
@@ -103,15 +109,16 @@ def variants(scene: wn.Scene) -> dict[str, tuple[wn.Scene, dict[str, Any]]]:
 
 def measure(scene: wn.Scene, trained: wn.Scene, config: wn.TrainConfig) -> dict[str, float]:
     """Train, and look at the test views and at the space before the training cameras."""
-    result = wn.train(trained, config)
-    found = wn.evaluate(result.field, scene)
+    trainer = begin(trained, config)
+    progress = trainer.run()
+    found = wn.evaluate(trainer.field(), scene)
     return {
-        "content_distance": trained.content_distance,
-        "longest_edge": float((trained.box_max - trained.box_min).max()),
+        "content_distance": trainer.content_distance,
+        "longest_edge": float((trainer.scene.box_max - trainer.scene.box_min).max()),
         "psnr": found.mean["psnr"],
         "ssim": found.mean["ssim"],
         "near_mass": found.near_field.near_mass,
-        "seconds": result.progress.seconds,
+        "seconds": progress.seconds,
     }
 
 

@@ -13,7 +13,7 @@ import pytest
 from warpnerf.config import GridConfig, TrainConfig
 from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.scene import Scene, View
-from warpnerf.training.trainer import train
+from warpnerf.training.train import train
 
 N_RUNS = 20
 

@@ -24,7 +24,7 @@ from warpnerf.scenes.photographs import Keeping
 from warpnerf.scenes.pixel_file import PixelFile, expect_random_reads
 from warpnerf.scenes.scene import Scene
 from warpnerf.training.state import scene_digest
-from warpnerf.training.trainer import train
+from warpnerf.training.train import train
 
 PLACES = ("memory", "disk", "files")
 

@@ -25,7 +25,8 @@ from warpnerf.media.scene_plan import plan_picture
 from warpnerf.scenes.load import load_scene
 from warpnerf.scenes.points import Points, look
 from warpnerf.scenes.scene import Scene
-from warpnerf.training.trainer import Trainer, train
+from warpnerf.training.train import train
+from warpnerf.training.trainer import Trainer
 
 
 def ball(n: int = 400, radius: float = 0.5, seed: int = 0) -> np.ndarray:

@@ -21,7 +21,7 @@ from warpnerf.model.models import model_of
 from warpnerf.runtime.parallel import Workers
 from warpnerf.scenes.scene import Scene
 from warpnerf.training import trainer
-from warpnerf.training.trainer import train
+from warpnerf.training.train import train
 
 EDGES = tuple(np.concatenate([np.linspace(0.05, 1.5, 13), 1.5 * 1.07 ** np.arange(1, 12)]).tolist())
 MODELS: dict[str, Model] = {

@@ -21,7 +21,8 @@ from warpnerf.scenes.scene import Scene
 from warpnerf.training import trainer as training
 from warpnerf.training.checkpoint import load_checkpoint, save_checkpoint
 from warpnerf.training.state import TrainingState
-from warpnerf.training.trainer import Trainer, train
+from warpnerf.training.train import train
+from warpnerf.training.trainer import Trainer
 
 STEPS = 20
 GROWING = (7, 13)

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
         save_field,
     )
     from warpnerf.training.state import Progress, TrainingState
-    from warpnerf.training.trainer import TrainResult, train
+    from warpnerf.training.train import TrainResult, train
 
 __version__ = "0.1.0"
 
@@ -72,8 +72,8 @@ _HOMES = {
     "View": "scenes.scene",
     "Progress": "training.state",
     "TrainingState": "training.state",
-    "TrainResult": "training.trainer",
-    "train": "training.trainer",
+    "TrainResult": "training.train",
+    "train": "training.train",
 }
 
 __all__ = [  # noqa: RUF022 (grouped by home, as above)

@@ -194,7 +194,12 @@ class TrainConfig:
     (t / D)^2, or clamped min(1, (t / D)^2), the method of "Floaters No More"."""
     content_distance: float | Literal["auto", "per-camera"] = "auto"
     """D: where gradients reach full strength, scene units; auto: the scene's estimate; per-camera:
-    of each camera's rays the distance of what it sees, for scenes that bring points."""
+    of each camera's rays the distance of what it sees, for scenes that bring points, and where it
+    is looked for by ``coarse_steps``."""
+    coarse_steps: int = 200
+    """Steps, at most, of each of two short trainings on a small grid that find box and content
+    distance where cameras look at no common point and bring no points; 0: none, and these two stay
+    guesses."""
     jacobian: Jacobian = "none"
     """Whether the scaling takes the contraction's change of volume into account."""
     rays_per_step: int = 4096
@@ -231,6 +236,7 @@ class TrainConfig:
         if not isinstance(self.model, Model):
             raise InputError(f"model must be a name or a model, not {self.model!r}.")
         require_whole("steps", self.steps, 1)
+        require_whole("coarse_steps", self.coarse_steps, 0)
         require_whole("rays_per_step", self.rays_per_step, 1)
         require_whole("occupancy_every", self.occupancy_every, 1)
         require_at_least("alpha_min", self.alpha_min, 0.0)

@@ -19,6 +19,7 @@ from warpnerf.config import PRESETS, TrainConfig
 from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.scene import Scene, View, estimate_extent
 from warpnerf.training.checkpoint import load_checkpoint, save_checkpoint
+from warpnerf.training.coarse import begin
 from warpnerf.training.state import TrainingState
 from warpnerf.training.trainer import Trainer
 
@@ -77,7 +78,7 @@ class WarpnerfMethod:
             config = (
                 configured(config_overrides or {}, background) if state is None else state.config
             )
-            self._trainer = Trainer(scene_of(train_dataset), config, state)
+            self._trainer = begin(scene_of(train_dataset), config, state)
             self._config = config
         elif state is not None:
             self._config = state.config
@@ -246,6 +247,7 @@ def scene_of(dataset: Any) -> Scene:
         box_max=extent.box_max,
         unbounded=unbounded,
         content_distance=extent.content_distance,
+        guessed=extent.guessed,
         notes=extent.notes,
     )
 

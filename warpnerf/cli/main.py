@@ -213,19 +213,22 @@ def _begin(
     # Not before: these load Warp, and bad input is refused at once.
     from warpnerf.evaluation.inspection import oddities
     from warpnerf.scenes.survey import survey
+    from warpnerf.training.coarse import begin, is_needed
     from warpnerf.training.run import Run
-    from warpnerf.training.trainer import Trainer
 
-    trainer = Trainer(scene, config)
-    _describe(scene, trainer.content_distance, config)
-    for oddity in oddities(scene, survey(source), trainer.content_distance, config.march.near):
+    if is_needed(scene, config):
+        print("no common focus: looking for how far the cameras see", flush=True)
+    trainer = begin(scene, config)
+    trained = trainer.scene  # in which box and distance may be other ones
+    _describe(trained, trainer.content_distance, config)
+    for oddity in oddities(trained, survey(source), trainer.content_distance, config.march.near):
         print(f"  odd: {oddity}", flush=True)
     run = Run(output)
     with run.only_writer():
         Run.require_free(output, overwrite)  # once more, now that nobody else begins there
         folder = None if masks is None else str(masks.resolve())
         distance = trainer.content_distance
-        run.create(scene, _absolute(source), downscale, distance, config, folder)
+        run.create(trained, _absolute(source), downscale, distance, config, folder)
         return _train(run, scene, trainer)
 
 

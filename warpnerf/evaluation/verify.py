@@ -34,7 +34,7 @@ from warpnerf.rendering.render import Steps
 from warpnerf.runtime.parallel import Workers
 from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.scene import Scene, View
-from warpnerf.training.trainer import train
+from warpnerf.training.train import train
 
 SEEDS = range(3)
 SCALINGS: tuple[Scaling, ...] = ("quadratic", "clamped")

@@ -28,7 +28,7 @@ from warpnerf.scenes.load import load_scene
 from warpnerf.scenes.scene import Scene
 from warpnerf.training.checkpoint import write_atomically
 from warpnerf.training.state import Progress
-from warpnerf.training.trainer import train
+from warpnerf.training.train import train
 
 SCALINGS: dict[Scaling, str] = {"none": "without scaling", "clamped": "with scaling"}
 """What is compared, and what it is called."""

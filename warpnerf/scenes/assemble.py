@@ -172,6 +172,7 @@ def assemble(
         unbounded=unbounded,
         content_distance=extent.content_distance,
         content_distances=None if sight is None else sight.distances,
+        guessed=extent.guessed and sight is None,
         near_content=None if sight is None else sight.near_content,
         points=None if sight is None or points is None else points.sample,
         notes=(*notes, *kept.notes, *extent.notes),

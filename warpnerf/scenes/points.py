@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.poses import MAX_COORDINATE
+from warpnerf.scenes.scene import Scene
 
 MAX_PROJECTED = 5000
 """Points without tracks that are looked for in each photograph; of more every n-th is taken."""
@@ -105,7 +106,10 @@ class Sight:
 
 
 def look(
-    cameras: Sequence[Camera], seen: Sequence[np.ndarray], training: Sequence[int]
+    cameras: Sequence[Camera],
+    seen: Sequence[np.ndarray],
+    training: Sequence[int],
+    outside: float = OUTSIDE,
 ) -> Sight | None:
     """Find how far from the cameras content is, and where.
 
@@ -116,6 +120,7 @@ def look(
         cameras: Of all views.
         seen: For each, the points that it sees, [n, 3] scene units.
         training: Indices of the training cameras, which alone decide but for distances of others.
+        outside: Share of what cameras see that may lie outside the box at each of its faces.
 
     Returns:
         What they see; None where too few training cameras see points enough to tell.
@@ -136,7 +141,7 @@ def look(
         [np.full(len(a), 1.0 / max(len(a), FEW)) for a in (away[i] for i in training)]
     )
     points = np.concatenate([seen[i] for i in training])[near]
-    shares = (OUTSIDE, 0.5, 1.0 - OUTSIDE)
+    shares = (outside, 0.5, 1.0 - outside)
     low, middle, high = np.stack([_quantiles(axis, weight[near], shares) for axis in points.T], 1)
     # A facade is flat, its box is not.
     margin = np.maximum(MARGIN * (high - low), 0.5 * (MIN_EDGE * (high - low).max() - (high - low)))
@@ -147,6 +152,25 @@ def look(
         middle=middle,
         box_min=low - margin,
         box_max=high + margin,
+    )
+
+
+def seen_scene(scene: Scene, sight: Sight) -> Scene:
+    """The scene with the extent of what its cameras see, found by training."""
+    edges = " x ".join(f"{edge:.3g}" for edge in sight.box_max - sight.box_min)
+    return replace(
+        scene,
+        box_min=sight.box_min,
+        box_max=sight.box_max,
+        content_distance=sight.content_distance,
+        content_distances=sight.distances,
+        near_content=sight.near_content,
+        guessed=False,
+        notes=(
+            *scene.notes,
+            f"content distance {sight.content_distance:.3g} and box of edges {edges} instead: what "
+            "the cameras see, found by two short trainings",
+        ),
     )
 
 

@@ -134,6 +134,9 @@ class Scene:
     content_distances: np.ndarray | None = None
     """[n_views] float64, median distance of the points that each camera sees, scene units; None
     where the capture brings no points."""
+    guessed: bool = False
+    """Whether box and content distance are guesses, because the cameras look at no common point;
+    training then looks for better ones first."""
     near_content: float | None = None
     """Distance from the cameras within which 1 in 100 of these points lies, scene units."""
     points: np.ndarray | None = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import warp as wp
@@ -21,6 +21,7 @@ from warpnerf.rendering.rays import PixelSampler
 from warpnerf.rendering.render import Steps, TrainingPass, march_struct
 from warpnerf.runtime.memory import give_back
 from warpnerf.runtime.parallel import Workers
+from warpnerf.scenes.points import Sight, seen_scene
 from warpnerf.scenes.scene import Scene
 from warpnerf.training.optim import RULES, adam_step, add_total_variation, first_states
 from warpnerf.training.state import Progress, TrainingState, scene_digest
@@ -37,66 +38,26 @@ FIRST_LOOK = 200
 so densities must have had time to show."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class TrainResult:
-    """What training leaves."""
-
-    field: Field
-    """The trained scene."""
-    content_distance: float
-    """The one that was used, scene units."""
-    progress: Progress
-    """The last report."""
-
-
-def train(
-    scene: Scene,
-    config: TrainConfig | None = None,
-    *,
-    on_progress: Callable[[Progress], None] | None = None,
-    on_checkpoint: Callable[[TrainingState], None] | None = None,
-    resume: TrainingState | None = None,
-) -> TrainResult:
-    """Train a voxel grid on a scene's training views.
-
-    Each step draws random pixels, marches their rays, and runs one hand-written adjoint back into
-    the grid that scales each sample's gradient by its distance from the camera
-    (Philip & Deschaintre 2023). kernels/README.md derives it.
-
-    Args:
-        scene: From ``load_scene``.
-        config: How to train; None: as the training to be resumed, or else the defaults, which are
-            the preset "fast".
-        on_progress: Called every ``REPORT_EVERY`` steps and at the end.
-        on_checkpoint: Called every ``config.checkpoint_every`` seconds and at the end with what
-            ``save_checkpoint`` takes, whose arrays the next update changes.
-        resume: Where to go on, from ``load_checkpoint``. On the CPU and with the same number of
-            threads, the result is that of a training that was never interrupted, bit for bit.
-
-    Returns:
-        The field, and how training ended.
-
-    Raises:
-        InputError: The device is missing, the grid would not fit the memory, or scene or
-            configuration are not those of the training to be resumed.
-        FloatingPointError: The loss, or a value in the grid, is no longer a finite number.
-    """
-    if config is None:
-        config = TrainConfig() if resume is None else resume.config
-    trainer = Trainer(scene, config, resume)
-    progress = trainer.run(on_progress, on_checkpoint)
-    return TrainResult(
-        field=trainer.field(), content_distance=trainer.content_distance, progress=progress
-    )
-
-
 class Trainer:
     """A training run between two updates: the grid, its optimiser, and what comes next."""
 
     def __init__(
-        self, scene: Scene, config: TrainConfig, resume: TrainingState | None = None
+        self,
+        scene: Scene,
+        config: TrainConfig,
+        resume: TrainingState | None = None,
+        *,
+        sight: Sight | None = None,
+        seconds: float = 0.0,
     ) -> None:
         """Set up the first update, or the next one of a training to be resumed.
+
+        Args:
+            scene: What is trained on.
+            config: How.
+            resume: Where to go on.
+            sight: Gives box and content distances in place of the scene's, for a new training.
+            seconds: Spent on it so far.
 
         Raises:
             InputError: The device is missing, the grid would not fit the memory, or scene or
@@ -107,19 +68,25 @@ class Trainer:
         self.config = config
         self.workers = Workers(config.device, config.threads)
         self.steps_done = 0
-        self.content_distance, distances = _content_distances(scene, config)
+        self._scene_digest = scene_digest(scene)
+        if sight is not None:
+            scene = seen_scene(scene, sight)
+        self.scene = scene
+        """What it trains on, with the extent that a new training begins with."""
         _require_samples(scene, config)
-        self._reach = _reach(scene)
-        if resume is not None:  # estimates anew may be rounded otherwise
+        if resume is None:
+            self.content_distance, distances = _content_distances(scene, config)
+            self._reach = _reach(scene)
+        else:  # estimates anew may be rounded otherwise
             self.content_distance, self._reach = resume.content_distance, resume.reach
-            distances = resume.content_distances or [resume.content_distance] * len(distances)
-            if len(distances) != len(scene.splits["train"]):
+            n_views = len(scene.splits["train"])
+            distances = resume.content_distances or [resume.content_distance] * n_views
+            if len(distances) != n_views:
                 raise InputError(
                     f"the training to be resumed has {len(distances)} content distances, but "
-                    f"{scene.name} {len(scene.splits['train'])} training views; train anew."
+                    f"{scene.name} {n_views} training views; train anew."
                 )
         self._content_distances = distances
-        self._scene_digest = scene_digest(scene)
         views = [scene.views[i] for i in scene.splits["train"]]
         behind = config.background
         if behind == "auto":
@@ -145,7 +112,7 @@ class Trainer:
         self.free = FreeCells.none(self.workers)
         self._report_due = False
         self._started: float | None = None
-        self._seconds = 0.0
+        self._seconds = seconds
         self._progress: Progress | None = None
         if resume is not None:
             self._restore(resume)

@@ -1,0 +1,65 @@
+"""A whole training, by one call. No files, no terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from warpnerf.config import TrainConfig
+from warpnerf.rendering.field import Field
+from warpnerf.scenes.scene import Scene
+from warpnerf.training.coarse import begin
+from warpnerf.training.state import Progress, TrainingState
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrainResult:
+    """What training leaves."""
+
+    field: Field
+    """The trained scene."""
+    content_distance: float
+    """The one that was used, scene units."""
+    progress: Progress
+    """The last report."""
+
+
+def train(
+    scene: Scene,
+    config: TrainConfig | None = None,
+    *,
+    on_progress: Callable[[Progress], None] | None = None,
+    on_checkpoint: Callable[[TrainingState], None] | None = None,
+    resume: TrainingState | None = None,
+) -> TrainResult:
+    """Train a voxel grid on a scene's training views.
+
+    Each step draws random pixels, marches their rays, and runs one hand-written adjoint back into
+    the grid that scales each sample's gradient by its distance from the camera
+    (Philip & Deschaintre 2023). kernels/README.md derives it.
+
+    Args:
+        scene: From ``load_scene``.
+        config: How to train; None: as the training to be resumed, or else the defaults, which are
+            the preset "fast".
+        on_progress: Called every ``trainer.REPORT_EVERY`` steps and at the end.
+        on_checkpoint: Called every ``config.checkpoint_every`` seconds and at the end with what
+            ``save_checkpoint`` takes, whose arrays the next update changes.
+        resume: Where to go on, from ``load_checkpoint``. On the CPU and with the same number of
+            threads, the result is that of a training that was never interrupted, bit for bit.
+
+    Returns:
+        The field, and how training ended.
+
+    Raises:
+        InputError: The device is missing, the grid would not fit the memory, or scene or
+            configuration are not those of the training to be resumed.
+        FloatingPointError: The loss, or a value in the grid, is no longer a finite number.
+    """
+    if config is None:
+        config = TrainConfig() if resume is None else resume.config
+    trainer = begin(scene, config, resume)
+    progress = trainer.run(on_progress, on_checkpoint)
+    return TrainResult(
+        field=trainer.field(), content_distance=trainer.content_distance, progress=progress
+    )
