@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import json
+import os
 import pickle
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,8 +19,9 @@ from safetensors.numpy import load_file, save_file
 from test_determinism import small_scene
 from tiny_fields import tiny_state
 
+from warpnerf.checks import InputError
 from warpnerf.config import TrainConfig
-from warpnerf.training.checkpoint import load_checkpoint
+from warpnerf.training.checkpoint import DamagedFileError, load_checkpoint, load_field
 from warpnerf.training.run import Run
 
 COMMANDS = {"eval": ("eval",), "resume": ("train", "--resume")}
@@ -125,6 +129,22 @@ from warpnerf.cli.main import main
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000_000, 20_000_000))
 sys.exit(main(sys.argv[1:]))
 """
+
+
+def test_a_file_that_may_not_be_read_is_not_called_damaged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def denied(*_: Any) -> None:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+    path = tmp_path / "field.safetensors"
+    path.touch()
+    monkeypatch.setattr(Path, "open", denied)
+    with pytest.raises(
+        InputError, match=r"cannot be read: Permission denied; give access"
+    ) as error:
+        load_field(path)
+    assert not isinstance(error.value, DamagedFileError)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no limits of a process there")

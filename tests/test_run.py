@@ -358,10 +358,34 @@ def test_reports_of_steps_to_be_done_again_are_dropped(tmp_path: Path) -> None:
 
 
 def test_a_taken_folder_names_both_ways_out(tmp_path: Path) -> None:
-    new_run(tmp_path)
+    run_with(tmp_path, 1)
     with pytest.raises(InputError, match=r"--resume .*--overwrite"):
         Run.require_free(tmp_path, overwrite=False)
     Run.require_free(tmp_path, overwrite=True)
+    new_run(tmp_path)  # the one before is kept in previous/, and cannot be gone on with
+    with pytest.raises(InputError, match=r"holds a run already; replace it by --overwrite"):
+        Run.require_free(tmp_path, overwrite=False)
+
+
+def test_a_run_that_saved_nothing_is_begun_anew(tmp_path: Path) -> None:
+    run = new_run(tmp_path)
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(InputError) as error:
+        Faults(patch, disk_full).at = 2
+        run.save_checkpoint(state_of(1))
+    assert "No space left on device; make room or give access, and begin anew" in str(error.value)
+    assert str(error.value).endswith("nothing was saved yet.")
+    Run.require_free(tmp_path, overwrite=False)
+    new_run(tmp_path)
+
+
+def test_a_full_disk_at_the_start_leaves_what_was_there(tmp_path: Path) -> None:
+    for folder in (tmp_path / "new", tmp_path):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(os, "write", lambda *_: disk_full("write"))
+            says = r"cannot be written: No space left .*; make room there, or name another place"
+            with pytest.raises(InputError, match=says), Run(folder).only_writer():
+                pass
+        assert not any(tmp_path.iterdir())
 
 
 def test_the_command_to_resume_is_quoted() -> None:

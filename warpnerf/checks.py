@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import math
 from collections.abc import Iterable
 
@@ -13,6 +14,25 @@ class InputError(ValueError):
 
     The command prints the sentence and exits with 2; Python users can catch it as a ValueError.
     """
+
+
+def cannot_write(what: str, error: OSError) -> InputError:
+    """The error of a file or folder that cannot be written: why, and the way out.
+
+    Args:
+        what: The option and the path, as the user gave them.
+        error: The system's.
+    """
+    return InputError(f"{what} cannot be written: {error.strerror or error}; {way_out(error)}.")
+
+
+def way_out(error: OSError) -> str:
+    """What helps against an error of the system, half a sentence."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        return "make room there, or name another place"
+    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        return "give access to it, or name another place"
+    return "check that it exists and may be used"
 
 
 def require_positive(field: str, value: float) -> None:

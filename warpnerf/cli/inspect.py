@@ -6,7 +6,7 @@ from pathlib import Path
 
 import tyro
 
-from warpnerf.checks import InputError, require_at_least
+from warpnerf.checks import InputError, cannot_write, require_at_least
 from warpnerf.cli.machine import require_writable, write_json
 from warpnerf.cli.model_options import chosen_model
 from warpnerf.config import PRESETS
@@ -70,6 +70,6 @@ def inspect_command(
         try:
             write_png(output, plan_picture(found))
         except OSError as error:
-            raise InputError(f"--output {output} cannot be written: {error.strerror}.") from error
+            raise cannot_write(f"--output {output}", error) from error
         print(f"wrote {output}")
     return 0

@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from warpnerf.checks import InputError
+from warpnerf.checks import InputError, cannot_write
 from warpnerf.cli.model_options import chosen_model
 from warpnerf.config import PRESETS
 
@@ -100,4 +100,4 @@ def write_json(path: Path, text: str) -> None:
     try:
         write_atomically(path, text.encode())
     except OSError as error:
-        raise InputError(f"--json {path} cannot be written: {error.strerror}.") from error
+        raise cannot_write(f"--json {path}", error) from error

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from warpnerf import __version__
-from warpnerf.checks import InputError
+from warpnerf.checks import InputError, way_out
 from warpnerf.cli.demo import demo_command
 from warpnerf.cli.inspect import inspect_command
 from warpnerf.cli.machine import (
@@ -393,8 +393,10 @@ def _meant(option: str, word: str) -> str:
 
 def _said(error: Exception) -> str:
     """An error of the system as a sentence."""
-    if isinstance(error, OSError) and error.filename is not None:
-        return f"{error.filename}: {error.strerror}; check that it exists and may be used."
+    if isinstance(error, OSError) and error.strerror:
+        # Files that we write are named where they are opened: what has no name is a stream.
+        place = "standard output" if error.filename is None else error.filename
+        return f"{place}: {error.strerror}; {way_out(error)}."
     return str(error)
 
 

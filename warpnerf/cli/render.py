@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from warpnerf.checks import InputError, require_positive
+from warpnerf.checks import InputError, cannot_write, require_positive
 from warpnerf.cli.progress import ProgressBar
 
 if TYPE_CHECKING:
@@ -109,10 +109,7 @@ def render_command(
             else:
                 render_stills(field, named, target, depths=shown, on_frame=on_frame)
         except OSError as error:
-            raise InputError(
-                f"--output {target} cannot be written: {error.strerror or error}; name another "
-                "place, or make room."
-            ) from error
+            raise cannot_write(f"--output {target}", error) from error
     print(f"wrote {target}")
     return 0
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
-from warpnerf.checks import InputError, require_whole
+from warpnerf.checks import InputError, cannot_write, require_whole
 from warpnerf.config import Scaling, TrainConfig
 from warpnerf.evaluation.evaluate import evaluate
 from warpnerf.evaluation.floater_metrics import near_density
@@ -120,9 +120,7 @@ def demo(
         folder.mkdir(parents=True, exist_ok=True)
         others = sorted({path.name for path in folder.iterdir()} - OWN_FILES)
     except OSError as error:
-        raise InputError(
-            f"--output {folder} cannot be written: {error.strerror}; name a folder."
-        ) from error
+        raise cannot_write(f"--output {folder}", error) from error
     if others:
         raise InputError(f"--output {folder} holds other files ({others[0]}); name a new folder.")
     video, _ = video_file(folder / "floaters.mp4", FPS)

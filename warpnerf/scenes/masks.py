@@ -64,6 +64,8 @@ def masks_of_folder(folder: Path, names: Sequence[str]) -> list[Mask | None]:
     """
     if not folder.is_dir():
         raise InputError(f"--masks {folder}: is no folder; name the folder of the masks.")
+    if not os.access(folder, os.R_OK | os.X_OK):
+        raise InputError(f"--masks {folder}: cannot be read; give access to it.")
     parents = {PurePosixPath(name).parent.as_posix() for name in names}
     common = os.path.commonpath(parents).replace(os.sep, "/")
     found = []

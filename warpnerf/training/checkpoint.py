@@ -20,7 +20,7 @@ import numpy as np
 import warp as wp
 from warpnerf_kernels.base.types import vector
 
-from warpnerf.checks import InputError
+from warpnerf.checks import InputError, way_out
 from warpnerf.config import Contraction, TrainConfig, config_from_json, config_to_json
 from warpnerf.model.grid import FreeCells, VoxelGrid
 from warpnerf.model.interface import Model, n_weights
@@ -326,6 +326,10 @@ def _read(path: Path) -> tuple[_Header, dict[str, np.ndarray]]:
         raise InputError(f"{path} does not exist; train first, or name another file.")
     if not path.is_file():  # reading from a pipe would never end
         raise InputError(f"{path} is not a file; name a field or a checkpoint.")
+    try:
+        path.open("rb").close()
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}; {way_out(error)}.") from None
     try:
         with safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from warpnerf.checks import InputError
+from warpnerf.checks import InputError, cannot_write
 
 try:
     import fcntl
@@ -32,11 +32,15 @@ def only_writer(folder: Path) -> Iterator[None]:
         yield
         return
     path = folder / NAME
+    there = folder.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         file = _locked(path)
     except OSError as error:
-        raise InputError(f"{folder} cannot be written: {error.strerror}.") from error
+        if not there:
+            with suppress(OSError):
+                folder.rmdir()
+        raise cannot_write(str(folder), error) from error
     try:
         yield
     finally:
@@ -57,7 +61,12 @@ def _locked(path: Path) -> int:
                 "it, or name another folder."
             ) from None
         if path.exists() and os.path.samestat(os.fstat(file), path.stat()):
-            os.ftruncate(file, 0)
-            os.write(file, f"{os.getpid()}\n".encode())
+            try:
+                os.ftruncate(file, 0)
+                os.write(file, f"{os.getpid()}\n".encode())
+            except OSError:
+                path.unlink()
+                os.close(file)
+                raise
             return file
         os.close(file)  # who had it has just removed it

@@ -25,7 +25,7 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
-from warpnerf.checks import InputError
+from warpnerf.checks import InputError, cannot_write
 from warpnerf.config import TrainConfig, config_from_json, config_to_json
 from warpnerf.evaluation.evaluate import Evaluation, evaluate
 from warpnerf.media.contact_sheet import SheetRow, contact_sheet, spread
@@ -115,14 +115,17 @@ class Run:
             raise InputError(f"--output {path} is a file; name a folder.")
         if not path.exists() or not any(map(_counts, path.iterdir())):
             return
+        run = Run(path)
         try:
-            Run(path).read_config()
+            run.read_config()
         except InputError:
             raise InputError(f"--output {path} holds other files; name a new folder.") from None
-        if not overwrite:
+        # One that ended before it saved anything is begun anew.
+        if not overwrite and (run.results or (path / "previous").exists()):
+            ways = f"go on with it by --resume {path}, " if run.checkpoints else ""
             raise InputError(
-                f"--output {path} holds a run already; go on with it by --resume {path}, replace "
-                "it by --overwrite, or name another folder."
+                f"--output {path} holds a run already; {ways}replace it by --overwrite, or name "
+                "another folder."
             )
 
     def only_writer(self) -> AbstractContextManager[None]:
@@ -164,9 +167,7 @@ class Run:
             text = json.dumps(content, indent=2) + "\n"
             write_atomically(self.folder / "config.json", text.encode())
         except OSError as error:
-            raise InputError(
-                f"--output {self.folder} cannot be written: {error.strerror}."
-            ) from error
+            raise cannot_write(f"--output {self.folder}", error) from error
 
     def read_config(self) -> RunConfig:
         """What ``create`` wrote.
@@ -338,10 +339,10 @@ class Run:
         try:
             yield
         except OSError as error:
-            raise InputError(
-                f"{self.folder} cannot be written: {error.strerror or error}; make room or give "
-                f"access, then {self.way_on()}"
-            ) from error
+            said = f"{self.folder} cannot be written: {error.strerror or error}; make room or give "
+            if self.last_step is None:
+                raise InputError(f"{said}access, and begin anew: {self.way_on()}.") from error
+            raise InputError(f"{said}access, then {self.way_on()}") from error
 
     def _sweep(self) -> None:
         """Remove what processes left behind that were killed while saving."""
