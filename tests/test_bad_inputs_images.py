@@ -206,7 +206,7 @@ def test_read_as_what_it_shows(tmp_path: Path, edit: Callable[[Path], np.ndarray
 
     scene = edited(tmp_path, lambda path: shown.append(edit(path)), white_behind)
     outcome = train(scene, folder=tmp_path)
-    assert_trained(outcome)
+    assert_trained(outcome, "transparent pixels in only")
     (written,) = (outcome.run / "test").iterdir()
     expected = shown[0] if shown[0].ndim == 3 else np.repeat(shown[0][:, :, None], 3, axis=2)
     # Left, with the legend below.

@@ -85,13 +85,33 @@ def test_another_picture_scores_worse() -> None:
     assert result.mean["psnr"] < 20.0
 
 
+def test_a_view_that_is_fog_is_told() -> None:
+    field = tiny_field()
+    scene = replace(scene_of(field, depth=False), content_distance=30.0)  # all of it is near
+    views = list(scene.views)
+    views[3] = replace(views[3], image=255 - views[3].image)
+    found = evaluate(field, replace(scene, views=views), split="all")
+    shares = [image.near_rays for image in found.images]
+    assert all(share is not None and share > 0.5 for share in shares)
+    (line,) = [line for line in str(found).splitlines() if line.startswith("fog: ")]
+    assert (
+        f"1 of 4 views look into matter within 3 scene units (first: images/3.png, {shares[3]:.0%}"
+        in line
+    )
+    assert json.loads(found.to_json())["images"][3]["near_rays"] == shares[3]
+    close = evaluate(field, replace(scene, views=views, content_distance=0.1), split="all")
+    assert "fog" not in str(close) and close.images[3].near_rays == 0.0
+
+
 def test_json_has_the_promised_form() -> None:
     field = tiny_field()
     without = json.loads(evaluate(field, scene_of(field, depth=False)).to_json())
     assert list(without) == ["mean", "floaters", "images"]
     assert list(without["mean"]) == ["psnr", "ssim", "flip"]
     assert list(without["floaters"]) == ["within", "near_mass", "near_rays"]
-    assert [list(image) for image in without["images"]] == [["name", "psnr", "ssim", "flip"]]
+    assert [list(image) for image in without["images"]] == [
+        ["name", "psnr", "ssim", "flip", "near_rays"]
+    ]
     assert without["mean"]["psnr"] == without["images"][0]["psnr"]
     known = json.loads(evaluate(field, scene_of(field, depth=True)).to_json())
     assert list(known["mean"]) == ["psnr", "ssim", "flip", "depth_error"]

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from tiny_scenes import look_at, ring, save, write_blender, write_transforms
 
 from warpnerf.checks import InputError
@@ -59,6 +60,44 @@ def test_what_loading_warns_of_is_odd(tmp_path: Path) -> None:
     found = odd(inspect(folder))
     for words in ("gone.png", "naming an image again", "not read: exposure"):
         assert words in found
+
+
+def test_alpha_in_only_some_images_is_said(tmp_path: Path) -> None:
+    folder = scene_with(tmp_path, ring(9))
+    for number in (2, 5):
+        path = folder / "images" / f"{number:03}.png"
+        rgba = Image.open(path).convert("RGBA")
+        rgba.putpixel((3, 2), (10, 20, 30, 100 if number == 5 else 255))
+        rgba.save(path)
+    (oddity,) = inspect(folder).oddities
+    assert oddity.startswith("transparent pixels in only 1 of 9 images (first: images/005.png)")
+    assert oddity.endswith("give masks, by --masks")
+
+
+@pytest.mark.parametrize(
+    ("orientation", "stated", "said"),
+    [(1, True, False), (6, False, True), (6, True, False), (3, True, True)],
+)
+def test_an_exif_rotation_is_said_where_sizes_do_not_settle_it(
+    tmp_path: Path, orientation: int, stated: bool, said: bool
+) -> None:
+    folder = scene_with(tmp_path, ring(9))
+    content = json.loads((folder / "transforms.json").read_text())
+    for frame in content["frames"]:
+        path = folder / frame["file_path"]
+        frame["file_path"] = frame["file_path"].replace("png", "jpg")
+        exif = Image.Exif()
+        exif[274] = orientation
+        Image.open(path).save(folder / frame["file_path"], exif=exif)
+    if not stated:
+        del content["w"], content["h"]
+    save(folder / "transforms.json", content)
+    told = [line for line in inspect(folder).oddities if "EXIF" in line]
+    assert len(told) == said
+    if said:
+        assert told[0].startswith(
+            "stored turned, with an EXIF rotation that is not applied: 9 images"
+        )
 
 
 def test_poses_in_opencv_axes_are_recognised(tmp_path: Path) -> None:

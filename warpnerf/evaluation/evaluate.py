@@ -19,7 +19,12 @@ from warpnerf.evaluation.metrics import (
     psnr,
     ssim,
 )
-from warpnerf.evaluation.near_field import NearField, measure_near_field
+from warpnerf.evaluation.near_field import (
+    NEAR_SHARE,
+    NearField,
+    ends_within,
+    measure_near_field,
+)
 from warpnerf.runtime.terminal import table_text
 from warpnerf.scenes.scene import Scene, View, require_split
 
@@ -40,6 +45,10 @@ HEADINGS = {
 """Heading and format of each figure in a table."""
 
 
+FOG_PSNR = 20.0
+"""dB, below which a view whose rays end close to its camera counts as fog, not as a close-up."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class ImageMetrics:
     """One view's figures, over the pixels that its mask keeps."""
@@ -57,6 +66,8 @@ class ImageMetrics:
     count are taken to be alike."""
     depth_error: float | None = None
     """Mean |depth - true depth|, scene units, over the pixels whose true depth is known."""
+    near_rays: float | None = None
+    """Share of all its rays that end close to the camera, as of ``NearField``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,7 +110,19 @@ class Evaluation:
         rows = [cells(image.name, partial(getattr, image)) for image in self.images]
         rows.append(cells("mean", mean.get))
         table = table_text(["image", *(HEADINGS[key][0] for key in mean)], rows)
-        return f"{table}\n{self.near_field}"
+        return "\n".join([table, str(self.near_field), *self._fog()])
+
+    def _fog(self) -> list[str]:
+        """That views are fog: what the field has close to their cameras hides what they show."""
+        fog = [i for i in self.images if (i.near_rays or 0.0) >= 0.5 and i.psnr < FOG_PSNR]
+        if not fog:
+            return []
+        return [
+            f"fog: {len(fog)} of {len(self.images)} views look into matter within "
+            f"{self.near_field.within:.3g} scene units (first: {fog[0].name}, "
+            f"{fog[0].near_rays:.0%} of its rays), where no training camera shows that space is "
+            "free; add photographs from there, train with a larger --near, or leave the views out"
+        ]
 
 
 def evaluate(
@@ -126,6 +149,7 @@ def evaluate(
         InputError: The scene has no such split.
     """
     images = []
+    within = NEAR_SHARE * scene.content_distance
     for index in require_split(scene, split):
         view = scene.views[index]
         rendering = field.render(view.camera)
@@ -146,6 +170,7 @@ def evaluate(
                 flip=flip(rgb, target, mask) if has_flip() else None,
                 lpips=None if lpips is None else lpips(alike, target),
                 depth_error=depth_error,
+                near_rays=float(np.mean(ends_within(rendering, within))),
             )
         )
         if on_image is not None:

@@ -18,7 +18,7 @@ from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.scene import Scene
 
 if TYPE_CHECKING:
-    from warpnerf.rendering.field import Field
+    from warpnerf.rendering.field import Field, Rendering
 
 NEAR_SHARE = 0.1
 """What counts as near, in content distances of the scene."""
@@ -93,7 +93,7 @@ def measure_near_field(field: Field, scene: Scene) -> NearField:
         transmittance = 1.0 - close_by.render(camera).opacity
         mass -= float(np.log(np.maximum(transmittance, MIN_TRANSMITTANCE)).sum(dtype=np.float64))
         seen = field.render(camera)
-        near += int(((seen.opacity >= 0.5) & (seen.depth < within * seen.opacity)).sum())
+        near += int(ends_within(seen, within).sum())
         n_rays += transmittance.size
     pulled = pulled_psnr(field, scene)
     return NearField(
@@ -104,6 +104,13 @@ def measure_near_field(field: Field, scene: Scene) -> NearField:
         pulled_psnr=float(np.mean(pulled)) if pulled else None,
         pulled_views=len(pulled) or None,
     )
+
+
+def ends_within(seen: Rendering, distance: float) -> np.ndarray:
+    """Which rays of a rendering end within a distance, scene units: half opaque or more, and
+    (sum_i w_i t_i) / opacity below it; bool, of the rendering's shape.
+    """
+    return np.asarray((seen.opacity >= 0.5) & (seen.depth < distance * seen.opacity))
 
 
 def coarse(camera: Camera) -> Camera:

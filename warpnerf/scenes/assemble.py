@@ -14,7 +14,7 @@ from warpnerf.runtime.memory import usable_cores
 from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.depths import DepthFile, read_depth
 from warpnerf.scenes.files import find_image
-from warpnerf.scenes.images import image_shape
+from warpnerf.scenes.images import exif_orientation, image_shape
 from warpnerf.scenes.lens import Lens
 from warpnerf.scenes.masks import Mask, masks_of_folder, read_mask
 from warpnerf.scenes.photographs import Keeping, Photograph, keep
@@ -133,6 +133,7 @@ def assemble(
     # Decoders release the interpreter lock. The first error cancels what is not yet read.
     with ThreadPoolExecutor(usable_cores()) as pool:
         read = list(pool.map(lambda frame: _read_frame(frame, downscale), frames))
+        turned = list(pool.map(_may_lie, frames))
     left = [entry for entry in read if entry is not None]
     kept = keep([entry.photograph for entry in left], keeping, file=file, downscale=downscale)
     views = [
@@ -154,6 +155,7 @@ def assemble(
     }
     training = [views[i] for i in indices["train"]]
     unbounded = sum(kept.see_through[i] for i in indices["train"]) < len(training) / 2
+    transparent = {view.name for view, see in zip(views, kept.see_through, strict=True) if see}
     try:
         extent = estimate_extent([view.camera for view in training], unbounded=unbounded)
     except InputError as error:
@@ -176,7 +178,12 @@ def assemble(
         near_content=None if sight is None else sight.near_content,
         points=None if sight is None or points is None else points.sample,
         notes=(*notes, *kept.notes, *extent.notes),
-        warnings=(*warnings, *mask_warnings, *_oddities(views, complete)),
+        warnings=(
+            *(*warnings, *mask_warnings, *_oddities(views, complete, transparent)),
+            *_turned_warning(
+                [frame.name for frame, lies in zip(frames, turned, strict=True) if lies]
+            ),
+        ),
     )
 
 
@@ -282,9 +289,35 @@ def _share_kept(views: Sequence[View]) -> float:
     return 1.0 - ignored / pixels
 
 
-def _oddities(views: Sequence[View], splits: Mapping[str, set[str]]) -> list[str]:
+def _may_lie(frame: Frame) -> bool:
+    """Whether a photograph is shown turned, and the file does not say what its stored size is."""
+    orientation = 1 if frame.image is not None else exif_orientation(frame.path)
+    stated = frame.lens.values.get("w"), frame.lens.values.get("h")
+    on_side = orientation >= 5
+    return orientation != 1 and not (on_side and None not in stated and stated[0] != stated[1])
+
+
+def _turned_warning(names: Sequence[str]) -> list[str]:
+    if not names:
+        return []
+    return [
+        f"stored turned, with an EXIF rotation that is not applied: {len(names)} images (first: "
+        f"{names[0]}); right if their poses are those of the stored pixels, as COLMAP's are, else "
+        "save the images upright"
+    ]
+
+
+def _oddities(
+    views: Sequence[View], splits: Mapping[str, set[str]], transparent: set[str]
+) -> list[str]:
     """Warnings of photographs that can be used, and yet are likely not what was meant."""
     warnings = []
+    if 0 < len(transparent) < len(views):
+        warnings.append(
+            f"transparent pixels in only {len(transparent)} of {len(views)} images (first: "
+            f"{min(transparent)}): the scene is trained to be empty there; where something is to "
+            "be ignored instead, give masks, by --masks"
+        )
     shared = splits["train"] & splits["test"]
     if shared:
         warnings.append(

@@ -32,7 +32,7 @@ keeps the other byte: L, B and N stand for little-endian, big-endian and this ma
 T = TypeVar("T")
 
 TIFF_BITS = 258
-TIFF_ORIENTATION = 274
+ORIENTATION = 274
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -78,6 +78,21 @@ def read_values(path: Path) -> np.ndarray:
         return np.array(image)
 
     return _read(path, values)
+
+
+def exif_orientation(path: Path) -> int:
+    """How a photograph's EXIF says that it is to be turned for showing, 1 to 8; see ``read_image``.
+
+    Returns:
+        1, as it is stored, also where there is no EXIF, or none that can be read.
+    """
+    try:
+        # Of a PNG all pixels would be decoded first.
+        with Image.open(path, formats=("JPEG", "MPO", "WEBP")) as image:
+            orientation = image.getexif().get(ORIENTATION, 1)
+    except Exception:  # whatever else is in it, the photograph is read without
+        return 1
+    return orientation if orientation in range(1, 9) else 1
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -184,7 +199,7 @@ def _check_kind(path: Path, image: ImageFile.ImageFile) -> None:
     # MPO is how phones store one photograph with a preview or a depth map behind it.
     if getattr(image, "is_animated", False) and image.format != "MPO":
         raise InputError(f"{path}: holds several frames; save the one to use as PNG or JPEG.")
-    if image.format == "TIFF" and image.getexif().get(TIFF_ORIENTATION, 1) != 1:
+    if image.format == "TIFF" and image.getexif().get(ORIENTATION, 1) != 1:
         raise InputError(f"{path}: carries a rotation tag, which Pillow obeys; save it as PNG.")
     raw = _raw_mode(image)
     if raw in SIXTEEN_BIT_GRAY or (raw in OTHER_BYTE and "transparency" not in image.info):
