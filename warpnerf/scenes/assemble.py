@@ -135,6 +135,8 @@ def assemble(
         read = list(pool.map(lambda frame: _read_frame(frame, downscale), frames))
         turned = list(pool.map(_may_lie, frames))
     left = [entry for entry in read if entry is not None]
+    complete, mask_warnings = _without_masked(file, frames, left, complete)
+    notes += _mask_notes(left)
     kept = keep([entry.photograph for entry in left], keeping, file=file, downscale=downscale)
     views = [
         View(
@@ -146,8 +148,6 @@ def assemble(
         )
         for entry, image in zip(left, kept.images, strict=True)
     ]
-    complete, mask_warnings = _without_masked(file, frames, views, complete)
-    notes += _mask_notes(views)
 
     index = {view.name: i for i, view in enumerate(views)}
     indices = {
@@ -242,14 +242,14 @@ def complete_splits(
 
 
 def _without_masked(
-    file: Path, frames: Sequence[Frame], views: Sequence[View], splits: dict[str, set[str]]
+    file: Path, frames: Sequence[Frame], read: Sequence[_Read], splits: dict[str, set[str]]
 ) -> tuple[dict[str, set[str]], list[str]]:
     """The splits without images of which masks leave nothing, and warnings of what masks leave.
 
     Raises:
         InputError: No training image is left.
     """
-    left = {view.name for view in views}
+    left = {view.name for view in read}
     gone = [frame.name for frame in frames if frame.name not in left]
     splits = {split: names & left for split, names in splits.items()}
     if not splits["train"]:
@@ -263,7 +263,7 @@ def _without_masked(
             f"left out {len(gone)} of {len(frames)} images of which masks leave no pixel (first: "
             f"{gone[0]})"
         )
-    share = _share_kept(views)
+    share = _share_kept(read)
     if share < LITTLE:
         warnings.append(
             f"masks leave {share:.1%} of the pixels: white ones count, black ones are ignored, so "
@@ -272,20 +272,20 @@ def _without_masked(
     return splits, warnings
 
 
-def _mask_notes(views: Sequence[View]) -> list[str]:
+def _mask_notes(read: Sequence[_Read]) -> list[str]:
     """That there are masks, and what they leave."""
-    masked = sum(view.mask is not None for view in views)
+    masked = sum(view.mask is not None for view in read)
     if not masked:
         return []
     return [
-        f"{masked} of {len(views)} images have pixels that are ignored; {_share_kept(views):.1%} "
+        f"{masked} of {len(read)} images have pixels that are ignored; {_share_kept(read):.1%} "
         "of all pixels count"
     ]
 
 
-def _share_kept(views: Sequence[View]) -> float:
-    pixels = sum(view.camera.width * view.camera.height for view in views)
-    ignored = sum(int((~view.mask).sum()) for view in views if view.mask is not None)
+def _share_kept(read: Sequence[_Read]) -> float:
+    pixels = sum(view.camera.width * view.camera.height for view in read)
+    ignored = sum(int((~view.mask).sum()) for view in read if view.mask is not None)
     return 1.0 - ignored / pixels
 
 
