@@ -43,7 +43,7 @@ def test_depth_is_along_the_ray(tmp_path: Path, lens: str, kind: str) -> None:
         Image.fromarray(VALUES.astype(np.float32)).save(path)
     else:
         Image.fromarray(VALUES).save(path)
-    found = read_depth(DepthFile(path, 0.002), camera)
+    found = read_depth(DepthFile(path, 0.002), camera).read()
     assert found.dtype == np.float32
     along = found * -rays(camera)[..., 2]
     np.testing.assert_allclose(along, 0.002 * VALUES, rtol=3e-4 if lens != "pinhole" else 1e-6)
@@ -54,22 +54,35 @@ def test_what_is_not_known_is_not_finite(tmp_path: Path) -> None:
     values = VALUES.astype(np.float64)
     values[0] = [0.0, -1.0, np.nan, np.inf, -np.inf, 1.0, 2.0, 3.0]
     np.save(tmp_path / "d.npy", values)
-    found = read_depth(DepthFile(tmp_path / "d.npy", 1.0), camera_at(np.eye(4)))
+    found = read_depth(DepthFile(tmp_path / "d.npy", 1.0), camera_at(np.eye(4))).read()
     assert np.array_equal(np.isnan(found[0]), [True] * 5 + [False] * 3)
     assert np.isfinite(found[1:]).all()
     # Behind a fisheye's plane nothing has a depth along the axis.
     camera = camera_at(np.eye(4), fx=2.0, fy=2.0, fisheye=True)
-    found = read_depth(DepthFile(tmp_path / "d.npy", 1.0), camera)
+    found = read_depth(DepthFile(tmp_path / "d.npy", 1.0), camera).read()
     np.testing.assert_array_equal(np.isfinite(found[1:]), rays(camera)[1:, :, 2] < 0.0)
 
 
 def test_depth_of_another_size_is_taken_from_the_nearest(tmp_path: Path) -> None:
     Image.fromarray(VALUES).save(tmp_path / "d.png")
     camera = camera_at(np.eye(4), width=16, height=12, fx=1e6, fy=1e6, cx=8.0, cy=6.0)
-    found = read_depth(DepthFile(tmp_path / "d.png", 1.0), camera)
+    found = read_depth(DepthFile(tmp_path / "d.png", 1.0), camera).read()
     np.testing.assert_allclose(found, np.kron(VALUES, np.ones((2, 2))), rtol=1e-6)
-    found = read_depth(DepthFile(tmp_path / "d.png", 1.0), camera.downscaled(4))
+    found = read_depth(DepthFile(tmp_path / "d.png", 1.0), camera.downscaled(4)).read()
     np.testing.assert_allclose(found, VALUES[1::2, 1::2], rtol=1e-6)
+
+
+def test_no_more_than_the_file_has_or_the_photograph_needs_is_kept(tmp_path: Path) -> None:
+    Image.fromarray(VALUES).save(tmp_path / "d.png")
+    file = DepthFile(tmp_path / "d.png", 1.0)
+    large = camera_at(np.eye(4), width=800, height=600, cx=400.0, cy=300.0)
+    kept = read_depth(file, large)
+    assert kept.values.shape == (6, 8) and kept.shape == kept.read().shape == (600, 800)
+    small = camera_at(np.eye(4)).downscaled(2)
+    kept = read_depth(file, small)
+    assert kept.values.shape == kept.shape == (3, 4)
+    along = kept.read() * -rays(small)[..., 2]
+    np.testing.assert_allclose(along, VALUES[1::2, 1::2], rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -116,7 +129,7 @@ def test_units_are_those_of_the_file(tmp_path: Path, keys: dict[str, float], uni
     save(tmp_path / "transforms.json", content | keys)
     scene = load_scene(tmp_path)
     assert [view.depth is not None for view in scene.views] == [False, True, False, False]
-    expected = read_depth(DepthFile(tmp_path / "d.png", unit), scene.views[1].camera)
+    expected = read_depth(DepthFile(tmp_path / "d.png", unit), scene.views[1].camera).read()
     assert np.array_equal(scene.views[1].depth, expected)
     (warning,) = scene.warnings
     assert "the depth_file_path of 1 of 4 frames leads to no file (first: e.png)" in warning

@@ -237,6 +237,17 @@ def test_pixels_that_a_fisheye_does_not_see_are_masked(tmp_path: Path) -> None:
     assert np.array_equal(half, np.hypot(u - 8.0, v - 6.0) <= 2.25 * np.pi)
 
 
+def test_masks_are_kept_as_bits(tmp_path: Path) -> None:
+    content = write_transforms(tmp_path)
+    save_mask(tmp_path / "all.png")
+    save(tmp_path / "transforms.json", {**content, "mask_path": "all.png"})
+    view = load_scene(tmp_path).views[1]
+    assert view.__dict__["mask"].bits.nbytes == 6
+    assert np.array_equal(view.mask, KEPT) and view.mask.dtype == np.bool_
+    again = replace(view, name="again")
+    assert np.array_equal(again.mask, KEPT) and again.depth is None
+
+
 def test_a_training_knows_its_masks() -> None:
     scene = tiny_scene(ring(4))
     masked = replace(scene, views=[replace(view, mask=KEPT) for view in scene.views])

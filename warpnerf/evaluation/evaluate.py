@@ -156,11 +156,11 @@ def evaluate(
         target = truth(view, field.background)
         rgb = np.clip(rendering.rgb, 0.0, 1.0)
         depth_error = None
-        mask = view.mask
-        if view.depth is not None:
-            known = np.isfinite(view.depth) & (True if mask is None else mask)
+        mask, depth = view.mask, view.depth
+        if depth is not None:
+            known = np.isfinite(depth) & (True if mask is None else mask)
             if known.any():
-                depth_error = float(np.mean(np.abs(rendering.depth - view.depth)[known]))
+                depth_error = float(np.mean(np.abs(rendering.depth - depth)[known]))
         alike = alike_where_masked(rgb, target, mask)
         images.append(
             ImageMetrics(

@@ -158,10 +158,13 @@ class PixelSampler:
         struct.first_pixel = self._n_pixels
         struct.channels = image.shape[2]
         struct.pixels = pixels
-        if view.mask is not None:
-            struct.runs = wp.array(runs_of(view.mask), dtype=wp.vec2i, device=self._workers.device)
+        mask = view.mask
+        if mask is None:
+            self._n_pixels += view.camera.width * view.camera.height
+        else:
+            struct.runs = wp.array(runs_of(mask), dtype=wp.vec2i, device=self._workers.device)
             self._runs.append(struct.runs)
-        self._n_pixels += _n_counting(view)
+            self._n_pixels += int(np.count_nonzero(mask))
         return struct
 
     def draw(self, step: int, n_steps: int = 1) -> RayBatch:
@@ -198,12 +201,6 @@ class PixelSampler:
             cache=self._launches,
         )
         return batch
-
-
-def _n_counting(view: View) -> int:
-    """Pixels of a view that its mask keeps."""
-    whole = view.camera.width * view.camera.height
-    return whole if view.mask is None else int(np.count_nonzero(view.mask))
 
 
 def runs_of(mask: np.ndarray) -> np.ndarray:

@@ -12,11 +12,11 @@ import numpy as np
 from warpnerf.checks import InputError
 from warpnerf.runtime.memory import usable_cores
 from warpnerf.scenes.camera import Camera
-from warpnerf.scenes.depths import DepthFile, read_depth
+from warpnerf.scenes.depths import Depth, DepthFile, read_depth
 from warpnerf.scenes.files import find_image
 from warpnerf.scenes.images import exif_orientation, image_shape
 from warpnerf.scenes.lens import Lens
-from warpnerf.scenes.masks import Mask, masks_of_folder, read_mask
+from warpnerf.scenes.masks import Mask, PackedMask, masks_of_folder, read_mask
 from warpnerf.scenes.photographs import Keeping, Photograph, keep
 from warpnerf.scenes.points import Points, Sight, look
 from warpnerf.scenes.scene import Extent, Scene, View, estimate_extent
@@ -285,8 +285,11 @@ def _mask_notes(read: Sequence[_Read]) -> list[str]:
 
 def _share_kept(read: Sequence[_Read]) -> float:
     pixels = sum(view.camera.width * view.camera.height for view in read)
-    ignored = sum(int((~view.mask).sum()) for view in read if view.mask is not None)
-    return 1.0 - ignored / pixels
+    count = sum(
+        view.camera.width * view.camera.height if view.mask is None else view.mask.count
+        for view in read
+    )
+    return count / pixels
 
 
 def _may_lie(frame: Frame) -> bool:
@@ -361,8 +364,8 @@ class _Read:
     name: str
     camera: Camera
     photograph: Photograph
-    depth: np.ndarray | None
-    mask: np.ndarray | None
+    depth: Depth | None
+    mask: PackedMask | None
 
 
 def _read_frame(frame: Frame, downscale: int) -> _Read | None:
@@ -392,4 +395,10 @@ def _read_frame(frame: Frame, downscale: int) -> _Read | None:
         image=frame.image,
     )
     depth = None if frame.depth is None else read_depth(frame.depth, camera)
-    return _Read(name=frame.name, camera=camera, photograph=photograph, depth=depth, mask=mask)
+    return _Read(
+        name=frame.name,
+        camera=camera,
+        photograph=photograph,
+        depth=depth,
+        mask=None if mask is None else PackedMask.of(mask),
+    )

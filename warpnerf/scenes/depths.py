@@ -27,18 +27,51 @@ class DepthFile:
     """What one of its units is, scene units."""
 
 
-def read_depth(file: DepthFile, camera: Camera) -> np.ndarray:
-    """The distance to what each pixel of a camera sees.
+@dataclass(frozen=True, eq=False)
+class Depth:
+    """Depth as a file has it, for the pixels of a camera."""
 
-    Files may be of another size than photographs, as those of lidars are; each pixel takes the
-    nearest value. What is 0, below, or not finite, is not known.
+    values: np.ndarray
+    """[h, w] along the optical axis; of another size than the photograph if it is a lidar's."""
+    unit: float
+    """What one of its units is, scene units."""
+    camera: Camera
+    """Of the photograph."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """H, W of the photograph."""
+        return self.camera.height, self.camera.width
+
+    def read(self) -> np.ndarray:
+        """The distance to what each pixel sees: the nearest value, along the pixel's ray.
+
+        Returns:
+            [H, W] float32, scene units; NaN where it is not known: where the file has 0, less, or
+            what is not finite, and behind a fisheye's plane.
+        """
+        along = _nearest(self.values, self.shape).astype(np.float64) * self.unit
+        cosine = axis_cosines(self.camera)
+        known = np.isfinite(along) & (along > 0.0) & (cosine > 0.0)
+        distance = np.divide(along, cosine, out=np.full(along.shape, np.nan), where=known)
+        return distance.astype(np.float32)
+
+
+def _nearest(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """The values nearest to the pixels of an image of the same view but another size."""
+    row, column = (
+        ((np.arange(size) + 0.5) * given / size).astype(int)
+        for size, given in zip(shape, values.shape, strict=True)
+    )
+    return np.asarray(values[row[:, None], column])
+
+
+def read_depth(file: DepthFile, camera: Camera) -> Depth:
+    """Read a depth file; of one that is larger than the photograph only what that needs is kept.
 
     Args:
         file: Depths along the optical axis.
-        camera: Of the photograph, with the pixels that the result shall have.
-
-    Returns:
-        [H, W] float32, along each pixel's ray, scene units; NaN where it is not known.
+        camera: Of the photograph, with its pixels.
 
     Raises:
         InputError: The file cannot be read, or is of another shape than the photograph.
@@ -56,10 +89,6 @@ def read_depth(file: DepthFile, camera: Camera) -> np.ndarray:
             f"{file.path}: has {columns}x{rows} pixels, which is another shape than the "
             f"{camera.width}x{camera.height} of its photograph; give depth of the whole photograph."
         )
-    row = ((np.arange(camera.height) + 0.5) * rows / camera.height).astype(int)
-    column = ((np.arange(camera.width) + 0.5) * columns / camera.width).astype(int)
-    along = values[row[:, None], column].astype(np.float64) * file.unit
-    cosine = axis_cosines(camera)
-    known = np.isfinite(along) & (along > 0.0) & (cosine > 0.0)
-    distance = np.divide(along, cosine, out=np.full(along.shape, np.nan), where=known)
-    return distance.astype(np.float32)
+    if rows * columns > camera.height * camera.width:
+        values = _nearest(values, (camera.height, camera.width))
+    return Depth(values, file.unit, camera)

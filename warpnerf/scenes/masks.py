@@ -26,6 +26,29 @@ class Mask:
     """False for those of instant-ngp, where white is ignored."""
 
 
+@dataclass(frozen=True, eq=False)
+class PackedMask:
+    """Which pixels count, a bit for each."""
+
+    bits: np.ndarray
+    """[n] uint8, row by row."""
+    shape: tuple[int, int]
+    """H, W."""
+    count: int
+    """Of pixels that count."""
+
+    @staticmethod
+    def of(mask: np.ndarray) -> PackedMask:
+        """Pack a mask [H, W] bool."""
+        rows, columns = mask.shape
+        return PackedMask(np.packbits(mask), (rows, columns), int(np.count_nonzero(mask)))
+
+    def read(self) -> np.ndarray:
+        """[H, W] bool."""
+        n_pixels = self.shape[0] * self.shape[1]
+        return np.unpackbits(self.bits, count=n_pixels).view(np.bool_).reshape(self.shape)
+
+
 def mask_beside(photograph: Path) -> Mask | None:
     """instant-ngp's mask of a photograph, dynamic_mask_NAME.png in the same folder."""
     path = photograph.with_name(f"dynamic_mask_{photograph.stem}.png")

@@ -61,6 +61,33 @@ class _Image:
         view.__dict__["image"] = image
 
 
+class PackedArray(Protocol):
+    """An array of a view's size in less memory."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """H, W."""
+
+    def read(self) -> np.ndarray:
+        """The array."""
+
+
+class _Packed:
+    """The fields ``View.depth`` and ``View.mask``. A packed one is unpacked at each look."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, view: View | None, owner: type) -> np.ndarray | None:
+        if view is None:
+            return None  # what a dataclass takes for the default
+        kept = view.__dict__[self._name]
+        return kept if kept is None or isinstance(kept, np.ndarray) else kept.read()
+
+    def __set__(self, view: View, kept: np.ndarray | PackedArray | None) -> None:
+        view.__dict__[self._name] = kept
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class View:
     """One photograph and the camera that took it."""
@@ -72,12 +99,12 @@ class View:
     image: _Image = _Image()
     """[H, W, 3] uint8 rgb, or [H, W, 4] uint8 rgb with straight (not premultiplied) alpha. Given as
     an ``ImageFile`` it is read whenever it is looked at."""
-    depth: np.ndarray | None = None
+    depth: _Packed = _Packed()
     """[H, W] float32, true distance along each pixel's ray in scene units; not finite where it is
-    not known. None: not known."""
-    mask: np.ndarray | None = None
+    not known. None: not known. It may be given as a ``PackedArray``."""
+    mask: _Packed = _Packed()
     """[H, W] bool, true where a pixel counts; where it is false the pixel is neither trained on nor
-    measured. None: all count."""
+    measured. None: all count. It may be given as a ``PackedArray``."""
 
     def __post_init__(self) -> None:
         """Refuse a photograph that is not its camera's.
@@ -93,18 +120,20 @@ class View:
                 f"{self.name}: image must be uint8 [{size[0]}, {size[1]}, 3 or 4] as its camera "
                 f"is, not {dtype} {list(image.shape)}."
             )
-        if self.depth is not None and self.depth.shape != size:
+        depth = self.__dict__["depth"]
+        if depth is not None and depth.shape != size:
             raise InputError(
                 f"{self.name}: depth must be {list(size)} as its camera is, not "
-                f"{list(self.depth.shape)}."
+                f"{list(depth.shape)}."
             )
-        if self.mask is not None:
-            if self.mask.shape != size or self.mask.dtype != np.bool_:
+        mask = self.mask
+        if mask is not None:
+            if mask.shape != size or mask.dtype != np.bool_:
                 raise InputError(
                     f"{self.name}: mask must be bool {list(size)} as its camera is, not "
-                    f"{self.mask.dtype} {list(self.mask.shape)}."
+                    f"{mask.dtype} {list(mask.shape)}."
                 )
-            if not self.mask.any():
+            if not mask.any():
                 raise InputError(f"{self.name}: its mask leaves no pixel; leave out the view.")
 
     @property

@@ -286,8 +286,9 @@ class Run:
         """
         views = [scene.views[index] for index in require_split(scene, split)]
         files = picture_files([view.name for view in views])
-        known = [view.depth[np.isfinite(view.depth)] for view in views if view.depth is not None]
-        if len(known) == len(views) and any(depths.size for depths in known):
+        depths = (view.depth for view in views)
+        known = [depth[np.isfinite(depth)] for depth in depths if depth is not None]
+        if len(known) == len(views) and any(depth.size for depth in known):
             near, far = range_of(np.concatenate(known))
         else:
             near, far = depth_range(field, [view.camera for view in views])

@@ -140,6 +140,7 @@ def scene_digest(scene: Scene) -> str:
         digest.update(f"{view.image.shape}".encode())
         digest.update((np.concatenate(numbers) + 0.0).tobytes())  # no -0
         digest.update(np.ascontiguousarray(view.image).data)
-        if view.mask is not None:
-            digest.update(b"mask" + np.packbits(view.mask).tobytes())
+        mask = view.mask
+        if mask is not None:
+            digest.update(b"mask" + np.packbits(mask).tobytes())
     return digest.hexdigest()
