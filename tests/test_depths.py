@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from PIL import Image
 from tiny_scenes import camera_at, save, write_transforms
 from watched_command import assert_trained, make_scene, train
@@ -102,6 +104,23 @@ def test_what_is_no_depth_is_refused(tmp_path: Path, write: Any, says: str) -> N
     write(tmp_path / "d.npy")
     with pytest.raises(InputError, match=rf"d\.npy: .*({says})"):
         read_depth(DepthFile(tmp_path / "d.npy", 1.0), camera_at(np.eye(4)))
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.data())
+def test_damage_of_an_array_is_an_input_error(
+    tmp_path_factory: pytest.TempPathFactory, data: Any
+) -> None:
+    path = tmp_path_factory.mktemp("npy") / "d.npy"
+    np.save(path, VALUES)
+    content = bytearray(path.read_bytes())
+    for _ in range(data.draw(st.integers(1, 3))):
+        content[data.draw(st.integers(0, 127))] = data.draw(st.integers(0, 255))
+    path.write_bytes(content)
+    try:
+        read_depth(DepthFile(path, 1.0), camera_at(np.eye(4)))
+    except InputError as error:
+        assert "\n" not in str(error)
 
 
 def test_coloured_depth_is_refused(tmp_path: Path) -> None:

@@ -43,7 +43,7 @@ def read_header(stream: IO[bytes], what: str) -> Header:
         first = version == (1, 0)
         read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
         shape, fortran, dtype = read(stream)
-    except (ValueError, EOFError, SyntaxError, TypeError, RecursionError, OSError) as error:
+    except Exception as error:  # parsers of Python run over it, with errors of all kinds
         text = str(error).partition("\n")[0][:100]
         raise InputError(f"{what}: is not readable as an array ({text}); save it again.") from None
     if dtype.kind not in "fiu":
