@@ -20,7 +20,7 @@ from warpnerf.checks import InputError
 from warpnerf.runtime.memory import usable_memory
 from warpnerf.scenes.arrays import Header, read_header, read_numbers
 from warpnerf.scenes.assemble import Frame, assemble
-from warpnerf.scenes.files import require_regular_file
+from warpnerf.scenes.files import printable, require_regular_file
 from warpnerf.scenes.images import MAX_PIXELS
 from warpnerf.scenes.lens import Lens
 from warpnerf.scenes.photographs import KEEPING, Keeping
@@ -121,7 +121,7 @@ def _open(archive: zipfile.ZipFile, file: Path, name: str) -> tuple[IO[bytes], H
     try:
         info = archive.getinfo(f"{name}.npy")
     except KeyError:
-        there = ", ".join(sorted(archive.namelist()))[:100] or "nothing"
+        there = printable(", ".join(sorted(archive.namelist()))[:100]) or "nothing"
         raise InputError(
             f"{file}: holds no {name}, but {there}; a scene has images, poses and focal."
         ) from None
