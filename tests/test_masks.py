@@ -114,6 +114,14 @@ def test_frames_name_their_masks(tmp_path: Path) -> None:
     assert f"1 of 4 images have pixels that are ignored; {share} of all pixels count" in scene.notes
 
 
+def test_a_folder_of_masks_that_is_not_used_is_told(tmp_path: Path) -> None:
+    write_transforms(tmp_path)
+    save_mask(tmp_path / "masks" / "001.png")
+    (warning,) = load_scene(tmp_path).warnings
+    assert warning.startswith(f"{tmp_path / 'masks'} is not used") and "--masks" in warning
+    assert not load_scene(tmp_path, masks=tmp_path / "masks").warnings
+
+
 def test_a_mask_may_be_that_of_all_frames(tmp_path: Path) -> None:
     content = write_transforms(tmp_path)
     save_mask(tmp_path / "car.png")

@@ -89,6 +89,12 @@ def load_transforms(
     """
     folder = file.parent
     data, frames, warnings = read_frames(file)
+    unused = folder / "masks"
+    if masks is None and unused.is_dir() and not any(frame.mask for frame in frames):
+        warnings.append(
+            f"{unused} is not used, as no frame has a mask_path; --masks {unused} ignores what is "
+            "black there"
+        )
     names = {frame.name for frame in frames}
     splits: dict[str, set[str]] = {}
     for split in ("train", "val", "test"):
