@@ -57,12 +57,17 @@ def test_steps_and_seeds_draw_what_is_their_own(device: str) -> None:
 
 
 def masked_views() -> list[View]:
-    """Three photographs that say in every pixel which one it is; the second has no mask."""
+    """Three photographs that say in every pixel which one it is.
+
+    The second has no mask, the third has alpha besides.
+    """
     views = []
     for number, view in enumerate(small_scene().views[:3]):
         height, width = view.image.shape[:2]
         row, column = np.indices((height, width))
         image = np.stack([row, column, np.full_like(row, number)], axis=2).astype(np.uint8)
+        if number == 2:
+            image = np.dstack([image, np.full((height, width), 255, np.uint8)])
         mask = np.random.default_rng(number).random((height, width)) < 0.4 - 0.1 * number
         mask[: 2 + number] = number == 0
         views.append(replace(view, image=image, mask=None if number == 1 else mask))
