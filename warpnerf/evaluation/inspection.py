@@ -253,7 +253,7 @@ def oddities(scene: Scene, found: Survey, content_distance: float, near: float) 
     times = content_distance / scene.content_distance
     if not 1.0 / MANY_TIMES <= times <= MANY_TIMES:
         odd.append(
-            f"the content distance {content_distance:.4g} is {times:.3g} times what the cameras "
+            f"the content distance {content_distance:.4g} is {times:.4g} times what the cameras "
             f"suggest, {scene.content_distance:.4g} scene units: the scaling will "
             + ("have no effect" if times < 1.0 else "hold back everything that is seen")
         )
