@@ -382,8 +382,11 @@ def test_72_out_of_memory_for_the_grid(tmp_path: Path) -> None:
 
 @needs_limits
 def test_72_out_of_memory_for_an_image(tmp_path: Path) -> None:
-    scene = make_scene(tmp_path)
+    lens = {"w": 8000, "h": 6000, "fl_x": 9000.0, "fl_y": 9000.0, "cx": 4000.0, "cy": 3000.0}
+    scene = make_scene(tmp_path, lambda content: content.update(lens))
     Image.new("RGB", (8000, 6000)).save(scene / "images/000.png")
+    for other in sorted((scene / "images").glob("*.png"))[1:]:
+        shutil.copyfile(scene / "images/000.png", other)
     prelude = leaving(100, "import warpnerf.scenes.load, warpnerf.evaluation.evaluate")
     outcome = train(scene, folder=tmp_path, prelude=prelude)
     assert_refused(outcome, "out of memory", "--downscale")

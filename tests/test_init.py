@@ -48,7 +48,7 @@ def test_train_and_evaluate_are_functions() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "home"), [("train", "training.trainer"), ("evaluate", "evaluation.evaluate")]
+    ("name", "home"), [("train", "training.train"), ("evaluate", "evaluation.evaluate")]
 )
 def test_they_stay_functions_when_their_modules_come_first(name: str, home: str) -> None:
     """Importing a submodule binds its name on the package, so none may bear a public name."""
