@@ -2,8 +2,11 @@
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+from solid_fields import ball_field
+from test_export_cameras import ball_scene
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
@@ -41,10 +44,15 @@ def test_the_python_of_the_documents_runs(
     assert names["image"].rgb.shape == (15, 20, 3)  # type: ignore[attr-defined]
     assert "psnr" in capsys.readouterr().out.lower()
 
-    after, in_torch, with_head = examples("docs/python.md")
+    after, exported, in_torch, with_head = examples("docs/python.md")
     exec(compile(after, "docs/python.md", "exec"), names)
     assert (tmp_path / "orbit.mp4").stat().st_size > 0
     assert names["result"].progress.step == 5  # type: ignore[attr-defined]
+
+    of_a_ball = names | {"result": SimpleNamespace(field=ball_field()), "scene": ball_scene()}
+    exec(compile(exported, "docs/python.md", "exec"), of_a_ball)
+    assert (tmp_path / "room.glb").stat().st_size > 0
+    assert len(of_a_ball["splats"].centres) > 100  # type: ignore[attr-defined]
 
     names |= {
         "colors": torch.rand(6, 9, 3, requires_grad=True),

@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     from warpnerf.config import PRESETS, GridConfig, MarchConfig, OptimConfig, TrainConfig
     from warpnerf.evaluation.evaluate import Evaluation, evaluate
     from warpnerf.evaluation.inspection import Inspection, inspect
+    from warpnerf.exporting.export import export
+    from warpnerf.exporting.sight import Sight, look
+    from warpnerf.exporting.splats import Splats, splats_of
+    from warpnerf.exporting.surface import Surface, extract_surface
     from warpnerf.media.camera_path import camera_path
     from warpnerf.media.demonstration import Demo, demo
     from warpnerf.media.filming import render_stills, render_video
@@ -61,6 +65,13 @@ _HOMES = {
     "demo": "media.demonstration",
     "Evaluation": "evaluation.evaluate",
     "evaluate": "evaluation.evaluate",
+    "export": "exporting.export",
+    "Sight": "exporting.sight",
+    "look": "exporting.sight",
+    "Splats": "exporting.splats",
+    "splats_of": "exporting.splats",
+    "Surface": "exporting.surface",
+    "extract_surface": "exporting.surface",
     "Field": "rendering.field",
     "Rendering": "rendering.field",
     "render_stills": "media.filming",
@@ -99,6 +110,13 @@ __all__ = [  # noqa: RUF022 (grouped by home, as above)
     "demo",
     "Evaluation",
     "evaluate",
+    "export",
+    "Sight",
+    "look",
+    "Splats",
+    "splats_of",
+    "Surface",
+    "extract_surface",
     "Field",
     "Rendering",
     "render_stills",

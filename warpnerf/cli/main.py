@@ -18,6 +18,7 @@ import tyro
 from warpnerf import __version__
 from warpnerf.checks import InputError, way_out
 from warpnerf.cli.demo import demo_command
+from warpnerf.cli.export import export_command
 from warpnerf.cli.inspect import inspect_command
 from warpnerf.cli.machine import (
     check_command,
@@ -429,6 +430,7 @@ def main(arguments: list[str] | None = None) -> int:
                 "train": train_command,
                 "eval": eval_command,
                 "render": render_command,
+                "export": export_command,
                 "check": check_command,
                 "warmup": warmup_command,
             },

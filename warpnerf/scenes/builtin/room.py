@@ -217,6 +217,11 @@ def _tracer() -> Tracer:
     return Tracer(list(_furniture()), lights, (0.5, 0.48, 0.45), spacing=0.05)
 
 
+def room_solids() -> tuple[Box, ...]:
+    """The room, which is hollow, and all that stands in it."""
+    return _tracer().solids
+
+
 def first_hit(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Exact distance along each ray to the first surface of the room.
 

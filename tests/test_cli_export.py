@@ -1,0 +1,103 @@
+"""`warpnerf export` on a tiny run: what it writes, says, and refuses."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from solid_fields import LEVEL, ball_field, read_ply
+from test_export_cameras import ball_scene
+from tiny_scenes import write_transforms
+
+from warpnerf.checks import InputError
+from warpnerf.cli.export import export_command
+from warpnerf.config import TrainConfig
+from warpnerf.exporting.export import FORMATS, export
+from warpnerf.scenes.load import load_scene
+from warpnerf.training.run import Run
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run whose scene is the ball's, written by the command's own format."""
+    folder = tmp_path_factory.mktemp("export")
+    export(ball_field(), folder / "scene", scene=ball_scene(), level=LEVEL)
+    run = Run(folder / "run")
+    scene = load_scene(folder / "scene")
+    run.create(scene, str(folder / "scene"), 1, scene.content_distance, TrainConfig())
+    run.save_field(ball_field())
+    return folder / "run"
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("ending", [e for e in FORMATS if e not in (".html", "")])
+def test_every_ending_becomes_a_file(
+    run_folder: Path, tmp_path: Path, ending: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    target = tmp_path / f"BALL{ending.upper()}"
+    target.write_bytes(b"older")
+    assert export_command(run_folder, target, threads=1) == 0
+    assert len(target.read_bytes()) > 1000
+    assert [path.name for path in tmp_path.iterdir()] == [target.name]
+    said = capsys.readouterr().out
+    assert f"as a {FORMATS[ending]}" in said and f"wrote {target}" in said
+    assert "10 of 10 training cameras" in said
+
+
+def test_options_reach_the_surface(run_folder: Path, tmp_path: Path) -> None:
+    whole, half = tmp_path / "whole.ply", tmp_path / "half.ply"
+    export_command(run_folder, whole, level=LEVEL, threads=1)
+    export_command(run_folder, half, level=LEVEL, crop=(-1, -1, -1, 0.1, 1, 1), threads=1)
+    points, _ = read_ply(half.read_bytes())
+    assert points["x"].max() <= 0.1 < read_ply(whole.read_bytes())[0]["x"].max()
+    assert np.hypot(*(points[c] - m for c, m in zip("xy", (0.1, -0.05), strict=True))).max() < 0.61
+
+
+@pytest.mark.parametrize(
+    ("file", "options", "says"),
+    [
+        ("ball.stl", {}, r"let the name end in .*\.glb.*, or in nothing for a folder"),
+        ("nowhere/ball.ply", {}, "its folder does not exist"),
+        ("folder.ply", {}, "is a folder"),
+        ("ball.ply", {"level": -1.0}, "level must be"),
+        ("ball.ply", {"level": 1e7}, "its density there is"),
+        ("ball.ply", {"crop": (5, 5, 5, 6, 6, 6)}, "lies outside of the field"),
+        ("ball.ply", {"crop": (1, 0, 0, 0, 1, 1)}, "the first below the second"),
+        ("ball.splat.ply", {"level": 3.0}, "level is of surfaces"),
+        ("ball.npz", {"min_size": 3.0}, "min_size is of surfaces"),
+        ("ball.ply", {"scene": "/no/such/place"}, "does not exist"),
+        ("ball.ply", {"device": "cuda:77"}, "device"),
+    ],
+)
+def test_bad_input_is_refused_and_nothing_is_written(
+    run_folder: Path, tmp_path: Path, file: str, options: dict[str, Any], says: str
+) -> None:
+    (tmp_path / "folder.ply").mkdir()
+    before = contents(run_folder)
+    with pytest.raises(InputError, match=says):
+        export_command(run_folder, tmp_path / file, **options)
+    assert contents(run_folder) == before
+    assert [path.name for path in tmp_path.iterdir()] == ["folder.ply"]
+
+
+def test_what_is_no_run_ends_with_a_sentence(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "warpnerf", "export", str(tmp_path), str(tmp_path / "a.ply")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    assert done.stderr.strip().endswith("config.json does not exist; name the folder of a run.")
+
+
+def test_another_scene_is_one_in_the_same_place(run_folder: Path, tmp_path: Path) -> None:
+    """Cameras that look away see nothing of the ball, and that is said."""
+    write_transforms(tmp_path / "scene", 6)
+    with pytest.raises(InputError, match="keep what is unseen"):
+        export_command(
+            run_folder, tmp_path / "a.ply", level=LEVEL, scene=str(tmp_path / "scene"), min_size=2.5
+        )

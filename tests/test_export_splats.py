@@ -1,0 +1,125 @@
+"""Splats: their file, how opaque they are, and what an independent renderer makes of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from reference.splats import draw_splats, read_splats, rotations
+from solid_fields import ball_field, camera_at, cameras_around
+
+from warpnerf.checks import InputError
+from warpnerf.exporting import splats
+from warpnerf.exporting.nodes import points_of
+from warpnerf.exporting.quaternions import quaternions
+from warpnerf.exporting.sight import look
+from warpnerf.exporting.splats import Splats, splats_of, splats_ply
+from warpnerf.rendering.field import Field
+from warpnerf.scenes.camera import Camera
+
+FIELDS = (
+    *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
+    *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+)
+
+
+def drawn(made: Splats, camera: Camera, field: Field) -> np.ndarray:
+    columns = read_splats(b"".join(splats_ply(made)))
+    size, focal = (camera.width, camera.height), (camera.fx, camera.fy)
+    return draw_splats(columns, camera.c2w, focal, (camera.cx, camera.cy), size, field.background)
+
+
+def psnr(image: np.ndarray, other: np.ndarray) -> float:
+    return float(-10.0 * np.log10(np.mean((image - other) ** 2)))
+
+
+def test_the_file_has_the_fields_of_3dgs_in_their_order() -> None:
+    made = splats_of(ball_field())
+    columns = read_splats(b"".join(splats_ply(made)))
+    assert tuple(columns) == FIELDS
+    np.testing.assert_allclose(1 / (1 + np.exp(-columns["opacity"])), made.opacity, atol=1e-6)
+    np.testing.assert_allclose(np.exp(columns["scale_1"]), made.scales[:, 1], rtol=1e-5)
+    red = 0.5 + 0.28209479177387814 * columns["f_dc_0"]
+    np.testing.assert_allclose(red, made.rgb[:, 0], atol=1e-6)
+    np.testing.assert_array_equal(columns["rot_0"], made.rotations[:, 0])
+
+
+def test_a_ball_of_splats_looks_like_the_field() -> None:
+    field = ball_field()
+    made = splats_of(field, look(field, cameras_around()))
+    assert len(made.centres) < 0.5 * len(splats_of(field).centres)  # the inside is left out
+    for position in ((2.4, 0.6, 0.9), (-1.0, -2.0, -0.8)):
+        camera = camera_at(position, 96, 80)
+        image, truth = drawn(made, camera, field), field.render(camera).rgb
+        assert psnr(image, truth) > 24.0
+        assert psnr(image[::-1], truth) < 20.0 and psnr(image[:, ::-1], truth) < 20.0
+
+
+@pytest.mark.parametrize("sigma", [2.0, 5.0])
+def test_matter_of_even_density_is_as_opaque(sigma: float) -> None:
+    """Fog all over the box, from outside; the camera sees only what lies before the faces."""
+    field = ball_field(radius=10.0)
+    grid = field.grid
+    values = grid.values.numpy()
+    values[:, 0] = np.log(np.expm1(sigma / grid.density_scale))
+    grid.values.assign(values)
+    camera = replace(camera_at((6.0, 0.5, 0.4), 24, 20), fx=900.0, fy=900.0)
+    saved = splats.FAINTEST
+    try:
+        splats.FAINTEST = 1e-4
+        made = splats_of(field)
+    finally:
+        splats.FAINTEST = saved
+    dark = replace(made, rgb=np.zeros_like(made.rgb))
+    columns = read_splats(b"".join(splats_ply(dark)))
+    passed = draw_splats(
+        columns, camera.c2w, (900.0, 900.0), (12.0, 10.0), (24, 20), (1.0, 1.0, 1.0)
+    )
+    truth = (
+        1.0
+        - replace(field, steps=replace(field.steps, transmittance_min=0.0)).render(camera).opacity
+    )
+    depth, expected = -np.log(passed[..., 0]), -np.log(truth)
+    np.testing.assert_allclose(depth.mean(), expected.mean(), rtol=0.06)
+
+
+@pytest.mark.parametrize("contraction", ["linf", "l2"])
+def test_splats_of_folded_space_are_as_large_as_their_cells(contraction: str) -> None:
+    field = ball_field((0.3, 0.0, 0.0), 1.8, contraction)
+    made = splats_of(field)
+    far = np.abs(made.centres).max(axis=1) > 1.5
+    assert far.sum() > 500
+    turned = rotations(made.rotations[far].astype(float)) * made.scales[far][:, None, :]
+    covariance = turned @ turned.transpose(0, 2, 1)
+    step = np.eye(3)
+    from warpnerf.exporting.nodes import nodes_of
+
+    nodes = nodes_of(field.grid, made.centres[far].astype(float))
+    cells = np.stack(
+        [
+            points_of(field.grid, nodes + 0.5 * e) - points_of(field.grid, nodes - 0.5 * e)
+            for e in step
+        ],
+        axis=2,
+    )
+    expected = 0.25 * cells @ cells.transpose(0, 2, 1)
+    scale = np.abs(expected).max(axis=(1, 2), keepdims=True)
+    np.testing.assert_allclose(covariance / scale, expected / scale, atol=2e-3)
+    inner = splats_of(field, crop=(field.grid.box_min, field.grid.box_max))
+    assert len(inner.centres) < len(made.centres)
+    assert (np.abs(inner.centres) <= 1.2).all()
+
+
+def test_quaternions_turn_as_their_matrices_do() -> None:
+    rng = np.random.default_rng(0)
+    wanted = rng.normal(size=(500, 4))
+    wanted[:4] = np.eye(4)  # half turns, and none
+    wanted /= np.linalg.norm(wanted, axis=1, keepdims=True)
+    made = quaternions(rotations(wanted))
+    np.testing.assert_allclose(np.abs((made * wanted).sum(axis=1)), 1.0, atol=1e-9)
+
+
+def test_nothing_to_write_is_said() -> None:
+    with pytest.raises(InputError, match="no splat is left"):
+        splats_of(ball_field(), crop=((-0.9, -0.9, -0.9), (-0.8, -0.8, -0.8)))

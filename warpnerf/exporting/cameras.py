@@ -1,0 +1,175 @@
+"""A scene as a folder that other programs train on: photographs, cameras twice, and points.
+
+transforms.json      cameras as nerfstudio and instant-ngp have them, with the split
+sparse/0/*.txt       the same as a COLMAP model, for gsplat, 3DGS, Brush
+points.ply           points of the trained surface, which transforms.json names
+images/              the photographs as they were trained on
+masks/               white where pixels count, where any photograph has a mask
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warpnerf.exporting.mesh import points_ply
+from warpnerf.exporting.quaternions import quaternions
+from warpnerf.exporting.surface import Surface
+from warpnerf.media.pictures import picture_files
+from warpnerf.scenes.camera import Camera
+from warpnerf.scenes.scene import Scene
+
+MAX_POINTS = 100_000
+"""Points that are written, at most: enough to begin splats from."""
+
+
+def write_scene(folder: Path, scene: Scene, surface: Surface) -> None:
+    """Write the folder, whole or not at all.
+
+    Args:
+        folder: New, or empty.
+        scene: What to write; images as they are in memory, so reduced where the run's were.
+        surface: Of the field that was trained on it.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    from PIL import Image
+
+    points = thinned(surface)
+    files = picture_files([view.name for view in scene.views])
+    model = colmap_text(scene, files, points)
+    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
+    temporary.mkdir()
+    try:
+        (temporary / "images").mkdir()
+        (temporary / "sparse" / "0").mkdir(parents=True)
+        (temporary / "transforms.json").write_text(transforms_json(scene, files))
+        (temporary / "points.ply").write_bytes(b"".join(points_ply(points)))
+        for name, text in model.items():
+            (temporary / "sparse" / "0" / name).write_text(text)
+        if _masked(scene):
+            (temporary / "masks").mkdir()
+        for view in scene.views:
+            Image.fromarray(view.image).save(temporary / "images" / files[view.name])
+            if _masked(scene):
+                size = (view.camera.height, view.camera.width)
+                kept = np.ones(size, bool) if view.mask is None else view.mask
+                Image.fromarray(kept).convert("L").save(temporary / "masks" / files[view.name])
+        temporary.replace(folder)
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
+
+
+def thinned(surface: Surface) -> Surface:
+    """A surface without its faces, and with MAX_POINTS of its vertices at random, the same ones."""
+    n = len(surface.points)
+    chosen = np.sort(np.random.default_rng(0).permutation(n)[:MAX_POINTS])
+    return Surface(
+        points=surface.points[chosen],
+        faces=np.zeros((0, 3), np.int32),
+        normals=surface.normals[chosen],
+        rgb=surface.rgb[chosen],
+    )
+
+
+def transforms_json(scene: Scene, files: dict[str, str]) -> str:
+    """The text of transforms.json: poses camera to world in OpenGL axes, as everywhere here.
+
+    Args:
+        scene: Its views and splits.
+        files: Names of the photographs in images/, by the names of the views.
+    """
+    frames = []
+    for view in scene.views:
+        camera, file = view.camera, files[view.name]
+        bent = ("k1", "k2", "k3", "k4") if camera.fisheye else ("k1", "k2", "k3", "p1", "p2")
+        lens = {name: getattr(camera, name) for name in ("cx", "cy", *bent)}
+        mask = {"mask_path": f"masks/{file}"} if _masked(scene) else {}
+        frames.append(
+            {
+                "file_path": f"images/{file}",
+                **mask,
+                "camera_model": "OPENCV_FISHEYE" if camera.fisheye else "OPENCV",
+                "fl_x": camera.fx,
+                "fl_y": camera.fy,
+                **lens,
+                "w": camera.width,
+                "h": camera.height,
+                "transform_matrix": [*camera.c2w.tolist(), [0.0, 0.0, 0.0, 1.0]],
+            }
+        )
+    # nerfstudio wants one lens model for all, at the top; here, frames may differ.
+    model = frames[0]["camera_model"]
+    tree: dict[str, Any] = {"camera_model": model, "ply_file_path": "points.ply"}
+    for split, indices in scene.splits.items():
+        if indices:
+            names = [f"images/{files[scene.views[index].name]}" for index in indices]
+            tree[f"{split}_filenames"] = names
+    return json.dumps(tree | {"frames": frames}, indent=1) + "\n"
+
+
+def colmap_text(scene: Scene, files: dict[str, str], points: Surface) -> dict[str, str]:
+    """The files of a COLMAP model as text; its points have no tracks.
+
+    Args:
+        scene: Its views.
+        files: Names of the photographs, by the names of the views.
+        points: What goes to points3D.txt.
+
+    Returns:
+        Texts, by the files' names.
+    """
+    lenses: dict[str, int] = {}
+    images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; then its points: none"]
+    for number, view in enumerate(scene.views, 1):
+        lens = lenses.setdefault(_lens(view.camera), len(lenses) + 1)
+        rotation, translation = _world_to_camera(view.camera)
+        pose = " ".join(f"{x:.17g}" for x in (*rotation, *translation))
+        images += [f"{number} {pose} {lens} {files[view.name]}", ""]
+    cameras = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMETERS"]
+    cameras += [f"{number} {lens}" for lens, number in lenses.items()]
+    colour = np.round(255.0 * points.rgb).astype(int)
+    rows = [
+        f"{number} {x:.7g} {y:.7g} {z:.7g} {r} {g} {b} 0"
+        for number, ((x, y, z), (r, g, b)) in enumerate(
+            zip(points.points.tolist(), colour.tolist(), strict=True), 1
+        )
+    ]
+    texts = {
+        "cameras.txt": cameras,
+        "images.txt": images,
+        "points3D.txt": ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK", *rows],
+    }
+    return {name: "\n".join(lines) + "\n" for name, lines in texts.items()}
+
+
+def _masked(scene: Scene) -> bool:
+    """Whether any photograph has a mask: nerfstudio wants one for all, then."""
+    return any(view.mask is not None for view in scene.views)
+
+
+def _lens(camera: Camera) -> str:
+    """A lens as cameras.txt has it, in the simplest of COLMAP's models that holds it."""
+    model, numbers = "PINHOLE", [camera.fx, camera.fy, camera.cx, camera.cy]
+    bent = [camera.k1, camera.k2, camera.p1, camera.p2]
+    if camera.fisheye:
+        model, numbers = "OPENCV_FISHEYE", [*numbers, *camera.radial]
+    elif camera.k3 != 0.0:
+        model, numbers = "FULL_OPENCV", [*numbers, *bent, camera.k3, 0.0, 0.0, 0.0]
+    elif any(bent):
+        model, numbers = "OPENCV", [*numbers, *bent]
+    text = " ".join(f"{x:.17g}" for x in numbers)
+    return f"{model} {camera.width} {camera.height} {text}"
+
+
+def _world_to_camera(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Quaternion w, x, y, z and translation, world to camera in OpenCV axes."""
+    rotation = (camera.c2w[:, :3] * [1.0, -1.0, -1.0]).T
+    return quaternions(rotation[None])[0], -rotation @ camera.position

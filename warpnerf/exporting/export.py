@@ -1,0 +1,135 @@
+"""One door to every format: ``export`` writes what the ending of a file's name says."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from warpnerf.checks import InputError
+from warpnerf.exporting import cameras as scenes
+from warpnerf.exporting import mesh, page, splats, surface, volume
+from warpnerf.exporting.sight import look
+from warpnerf.rendering.field import Field
+from warpnerf.scenes.scene import Scene, up_direction
+from warpnerf.training.checkpoint import write_atomically
+
+SURFACES = (".glb", ".obj", ".ply", ".points.ply", "")
+SPLATS = (".splat.ply", ".html")
+VOLUMES = (".nvdb", ".npz")
+FORMATS = {
+    ".glb": "mesh",
+    ".obj": "mesh",
+    ".ply": "mesh",
+    ".points.ply": "points",
+    ".splat.ply": "splats",
+    ".html": "page",
+    ".nvdb": "volume",
+    ".npz": "volume",
+    "": "scene",
+}
+"""What files of these endings hold; without an ending it is a folder."""
+
+
+def export(
+    field: Field,
+    path: str | Path,
+    *,
+    scene: Scene | None = None,
+    unseen: bool = False,
+    level: float | None = None,
+    crop: surface.Crop | None = None,
+    min_size: float | None = None,
+    on_camera: Callable[[int], None] | None = None,
+) -> Path:
+    """Write a field for other programs, as the ending of the name says.
+
+    .glb, .obj, .ply: a mesh with colours at its vertices. .points.ply: its vertices, with normals
+    and colours. .splat.ply: Gaussian splats. .html: a page that shows these without a network;
+    needs the extra ``viewer``. .nvdb, .npz: density, and colour in .npz, on a grid. No ending: a
+    folder with photographs, cameras for nerfstudio and COLMAP, and points.
+
+    Args:
+        field: What to write.
+        path: Of the file, which is replaced, or of a new folder.
+        scene: What the field was trained on: only what its training cameras see is written, in the
+            colours that they see. None: all of the field is; for a page and a folder it is needed.
+        unseen: Write what no training camera sees, too.
+        level: Of a surface's density, 1 / scene unit; see ``extract_surface``.
+        crop: Lower and upper corner of what is written, scene units; None: the field's box, for
+            splats all of space.
+        min_size: Smaller parts of a surface are dropped, scene units; see ``extract_surface``.
+        on_camera: Called with the number of training cameras that were looked through.
+
+    Returns:
+        Where it went.
+
+    Raises:
+        InputError: Another ending, a place that cannot be written to, options of another format, a
+            missing scene or package, or nothing to write.
+        OSError: It cannot be written; what was there before is left as it was.
+    """
+    path = Path(path)
+    ending = checked_ending(path)
+    for name, value in (("level", level), ("min_size", min_size)):
+        if value is not None and ending not in SURFACES:
+            raise InputError(
+                f"{path}: {name} is of surfaces, and this file holds none; leave it out."
+            )
+    surface.check_options(field, level, crop, min_size)  # before what takes long
+    if scene is None and ending in ("", ".html"):
+        raise InputError(f"{path}: a {FORMATS[ending]} needs the scene of the training; give it.")
+    cameras = [] if scene is None else scene.training_cameras
+    sight = look(field, cameras, on_camera) if cameras else None
+    if ending in SPLATS:
+        made = splats.splats_of(field, sight, unseen=unseen, crop=crop)
+        if scene is not None and ending == ".html":
+            pieces = page.splats_html(made, cameras, field.background)
+        else:
+            pieces = splats.splats_ply(made)
+    elif ending in VOLUMES:
+        block = volume.volume_of(field, sight, unseen=unseen, crop=crop)
+        pieces = volume.volume_nvdb(block) if ending == ".nvdb" else volume.volume_npz(block)
+    else:
+        found = surface.extract_surface(
+            field, sight, unseen=unseen, level=level, crop=crop, min_size=min_size
+        )
+        if scene is not None and ending == "":
+            scenes.write_scene(path, scene, found)
+            return path
+        if ending == ".glb":
+            up = up_direction(cameras) if cameras else None
+            pieces = mesh.mesh_glb(found, up)
+        else:
+            write = {".obj": mesh.mesh_obj, ".ply": mesh.mesh_ply, ".points.ply": mesh.points_ply}
+            pieces = write[ending](found)
+    write_atomically(path, *pieces)
+    return path
+
+
+def checked_ending(path: str | Path) -> str:
+    """The ending of a name that says what is written: a key of FORMATS.
+
+    Raises:
+        InputError: It is none of these, the place cannot be written to, or viser is missing.
+    """
+    path = Path(path)
+    name = path.name.lower()
+    known = sorted(filter(None, FORMATS), key=len, reverse=True)
+    ending = next((ending for ending in known if name.endswith(ending)), path.suffix)
+    if ending not in FORMATS:
+        raise InputError(
+            f"{path}: no such format; let the name end in {', '.join(known[::-1])}, or in nothing "
+            "for a folder of photographs, cameras and points."
+        )
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: its folder does not exist; make it first.")
+    if ending and path.is_dir():
+        raise InputError(f"{path}: is a folder; choose another name.")
+    if not ending and path.exists() and not (path.is_dir() and not any(path.iterdir())):
+        raise InputError(f"{path}: exists already; name a new folder.")
+    if not os.access(path.parent, os.W_OK):
+        raise InputError(f"{path}: its folder cannot be written to; choose another one.")
+    if ending == ".html":
+        page.require_viser()
+    return ending

@@ -1,0 +1,54 @@
+"""PLY, binary and little-endian: vertices with named numbers, and triangles."""
+
+from __future__ import annotations
+
+import numpy as np
+
+KINDS = {"f4": "float", "u1": "uchar"}
+"""PLY's names of numbers, by numpy's."""
+
+
+def ply(columns: dict[str, np.ndarray], faces: np.ndarray | None = None) -> list[bytes]:
+    """The pieces of a PLY file.
+
+    Args:
+        columns: A vertex's properties in the order of the file, [n_vertices] float32 or uint8 each.
+        faces: [n_faces, 3] of vertices; None: the file has only vertices.
+
+    Returns:
+        Header, vertices, and faces where there are any.
+    """
+    table = np.empty(
+        len(next(iter(columns.values()))),
+        [(name, f"<{column.dtype.str[1:]}") for name, column in columns.items()],
+    )
+    lines = ["ply", "format binary_little_endian 1.0", "comment warpnerf"]
+    lines += [f"element vertex {len(table)}"]
+    for name, column in columns.items():
+        table[name] = column
+        lines.append(f"property {KINDS[column.dtype.str[1:]]} {name}")
+    pieces = [table.tobytes()]
+    if faces is not None:
+        lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+        rows = np.empty(len(faces), [("n", "u1"), ("vertices", "<i4", 3)])
+        rows["n"], rows["vertices"] = 3, faces
+        pieces.append(rows.tobytes())
+    header = "\n".join([*lines, "end_header"]) + "\n"
+    return [header.encode(), *pieces]
+
+
+def surface_columns(points: np.ndarray, normals: np.ndarray, rgb: np.ndarray) -> dict:
+    """Columns of coloured points with normals, under the names that readers expect.
+
+    Args:
+        points: [n, 3] scene units.
+        normals: [n, 3] unit vectors.
+        rgb: [n, 3] in [0, 1].
+    """
+    colour = np.round(255.0 * rgb).astype(np.uint8)
+    named = (
+        (("x", "y", "z"), points.astype(np.float32)),
+        (("nx", "ny", "nz"), normals.astype(np.float32)),
+        (("red", "green", "blue"), colour),
+    )
+    return {name: values[:, k] for names, values in named for k, name in enumerate(names)}

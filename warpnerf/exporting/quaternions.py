@@ -1,0 +1,41 @@
+"""Rotations as quaternions, which is how files of splats and of cameras hold them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def quaternions(rotations: np.ndarray) -> np.ndarray:
+    """Unit quaternions w, x, y, z of rotation matrices.
+
+    Four times the outer product of a quaternion with itself is made of sums and differences of the
+    matrix's entries. Of its rows, the one with the largest diagonal entry loses no digits.
+
+    Args:
+        rotations: [n, 3, 3].
+
+    Returns:
+        [n, 4].
+    """
+    m = rotations
+    diagonal = np.stack(
+        [
+            1.0 + m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2],
+            1.0 + m[:, 0, 0] - m[:, 1, 1] - m[:, 2, 2],
+            1.0 - m[:, 0, 0] + m[:, 1, 1] - m[:, 2, 2],
+            1.0 - m[:, 0, 0] - m[:, 1, 1] + m[:, 2, 2],
+        ],
+        axis=1,
+    )
+    x, y, z = m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]
+    xy, xz, yz = m[:, 0, 1] + m[:, 1, 0], m[:, 0, 2] + m[:, 2, 0], m[:, 1, 2] + m[:, 2, 1]
+    rows = np.stack(
+        [
+            np.stack([diagonal[:, 0], x, y, z], axis=1),
+            np.stack([x, diagonal[:, 1], xy, xz], axis=1),
+            np.stack([y, xy, diagonal[:, 2], yz], axis=1),
+            np.stack([z, xz, yz, diagonal[:, 3]], axis=1),
+        ]
+    )
+    quaternion = rows[diagonal.argmax(axis=1), np.arange(len(m))]
+    return quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)

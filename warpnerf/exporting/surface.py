@@ -1,0 +1,237 @@
+"""The surface of a field: where its density crosses a level, as far as cameras see it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from warpnerf.checks import InputError, require_at_least, require_positive
+from warpnerf.exporting.colour import colours
+from warpnerf.exporting.nodes import nodes_of, points_of, values_at, voxel_edges
+from warpnerf.exporting.sight import SEEN, Sight
+from warpnerf.rendering.field import Field
+
+LEVEL_OPACITY = 0.2
+"""Of a voxel edge at the level that is the default; benchmarks/mesh.py tries others."""
+
+MIN_SIZE = 8.0
+"""Smallest component that is kept by default, in voxel edges."""
+
+Crop = tuple[Sequence[float], Sequence[float]]
+"""Lower and upper corner, scene units."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Surface:
+    """Triangles with normals and colours at their vertices."""
+
+    points: np.ndarray
+    """[n_vertices, 3] float32, scene units."""
+    faces: np.ndarray
+    """[n_faces, 3] int32, counter-clockwise as seen from outside."""
+    normals: np.ndarray
+    """[n_vertices, 3] float32 unit vectors, outward: against the density's gradient."""
+    rgb: np.ndarray
+    """[n_vertices, 3] float32 in [0, 1], sRGB as in the photographs."""
+
+
+def extract_surface(
+    field: Field,
+    sight: Sight | None = None,
+    *,
+    unseen: bool = False,
+    level: float | None = None,
+    crop: Crop | None = None,
+    min_size: float | None = None,
+) -> Surface:
+    """Find the surface by marching cubes.
+
+    They run over the raw density, whose trilinear interpolation is what rendering reads, so that
+    vertices lie exactly where the density has the level.
+
+    Args:
+        field: A trained field.
+        sight: From ``look`` through the cameras of its training: what none of them sees is dropped,
+            and colours are those that they see. None: all is kept, and colours are those seen
+            along the normals.
+        unseen: Keep what no camera sees, too.
+        level: Density of the surface, 1 / scene unit; None: that of which a voxel edge is 20 %
+            opaque.
+        crop: Only triangles inside this box; None: the field's box.
+        min_size: Components whose box has a shorter diagonal are dropped, scene units; None: eight
+            voxel edges.
+
+    Returns:
+        The surface. It is open where the crop cuts through something, and where cameras see no
+        further.
+
+    Raises:
+        InputError: A value is wrong, or there is no such surface.
+    """
+    grid = field.grid
+    edge = float(grid.voxel_size.mean())
+    check_options(field, level, crop, min_size)
+    level = -math.log1p(-LEVEL_OPACITY) / edge if level is None else level
+    min_size = MIN_SIZE * edge if min_size is None else min_size
+    box = checked_crop(field, crop)
+    raw = raw_density(field)
+    nodes, faces = _marching_cubes(raw, _raw_of(field, level), field)
+    points = points_of(grid, nodes)
+    kept = inside(points, box)
+    if not kept.any():
+        raise InputError(
+            f"level {level:g}: the field has no surface of this density inside the crop; its "
+            f"density there is {_density_range(field, raw, box)} per scene unit; choose a level "
+            "in between."
+        )
+    if sight is not None and not unseen:
+        kept &= values_at(sight.light, nodes) > SEEN
+    faces = faces[kept[faces].all(axis=1)]
+    faces = faces[_large_components(points, faces, min_size)]
+    if not len(faces):
+        raise InputError(
+            f"level {level:g}: no part of the surface of this density is both seen by a training "
+            f"camera and {min_size:g} scene units across; choose a lower level, a smaller minimum "
+            "size, or keep what is unseen."
+        )
+    used, faces = np.unique(faces, return_inverse=True)
+    points = points[used]
+    normals = normals_at(field, raw, points)
+    return Surface(
+        points=points.astype(np.float32),
+        faces=faces.reshape(-1, 3).astype(np.int32),
+        normals=normals.astype(np.float32),
+        rgb=colours(field, sight, points, normals),
+    )
+
+
+def check_options(
+    field: Field, level: float | None, crop: Crop | None, min_size: float | None
+) -> None:
+    """Raise InputError if a value that was given is of no use."""
+    if level is not None:
+        require_positive("level", level)
+    if min_size is not None:
+        require_at_least("min_size", min_size, 0.0)
+    checked_crop(field, crop)
+
+
+def checked_crop(field: Field, crop: Crop | None) -> np.ndarray:
+    """The box of what is exported, [2, 3]: lower and upper corner, scene units.
+
+    Raises:
+        InputError: It is no box, or outside of a field that ends at its own.
+    """
+    own = np.stack([field.grid.box_min, field.grid.box_max])
+    if crop is None:
+        return own
+    box = np.asarray(crop, np.float64)
+    if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[0] < box[1]).all():
+        raise InputError(
+            "crop must be a lower and an upper corner, x y z each, the first below the second, not "
+            f"{_corner(box.ravel())}."
+        )
+    if field.grid.contraction == "none" and ((box[1] <= own[0]) | (box[0] >= own[1])).any():
+        raise InputError(
+            f"crop from {_corner(box[0])} to {_corner(box[1])} lies outside of the field, which "
+            f"reaches from {_corner(own[0])} to {_corner(own[1])}; choose a box that meets it."
+        )
+    return box
+
+
+def inside(points: np.ndarray, box: np.ndarray) -> np.ndarray:
+    """Which of points [n, 3] lie in a box [2, 3]; what is infinite does not."""
+    return ((points >= box[0]) & (points <= box[1])).all(axis=1)
+
+
+def raw_density(field: Field) -> np.ndarray:
+    """What the grid holds of density, [X, Y, Z] float32."""
+    return np.ascontiguousarray(field.grid.values.numpy()[:, 0]).reshape(field.grid.size)
+
+
+def density(field: Field, raw: np.ndarray) -> np.ndarray:
+    """Density of raw densities, in 1 / scene unit; the same shape."""
+    grid = field.grid
+    return (grid.density_scale * np.logaddexp(0.0, raw + grid.density_shift)).astype(np.float32)
+
+
+def normals_at(field: Field, raw: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Unit vectors against the gradient of the density, by differences over a voxel edge.
+
+    Args:
+        field: The field.
+        raw: Its raw density, [X, Y, Z].
+        points: [n, 3] scene units.
+
+    Returns:
+        [n, 3] float64; upward where the gradient is 0.
+    """
+    half = 0.5 * voxel_edges(field.grid, points)
+    falling = np.empty((len(points), 3))
+    for axis, direction in enumerate(np.eye(3)):
+        before, after = (
+            values_at(raw, nodes_of(field.grid, points + (sign * half)[:, None] * direction))
+            for sign in (-1.0, 1.0)
+        )
+        falling[:, axis] = before - after
+    length = np.linalg.norm(falling, axis=1, keepdims=True)
+    return np.where(length > 0.0, falling / np.maximum(length, 1e-30), [0.0, 0.0, 1.0])
+
+
+def _raw_of(field: Field, level: float) -> float:
+    """The raw density of a density: the inverse of ``density``."""
+    x = level / field.grid.density_scale
+    return x + math.log(-math.expm1(-x)) - field.grid.density_shift
+
+
+def _marching_cubes(raw: np.ndarray, level: float, field: Field) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [n, 3] in node coordinates, and faces [m, 3] with the lower values outside."""
+    import warp.geometry  # is no part of `import warp`
+
+    values = wp.array(raw, dtype=wp.float32, device=field.workers.device)
+    vertices, indices = warp.geometry.IsoSurfaceMarchingCubes.extract(values, level)
+    # Its faces look towards the higher values.
+    return vertices.numpy().astype(np.float64), indices.numpy().reshape(-1, 3)[:, ::-1]
+
+
+def _large_components(points: np.ndarray, faces: np.ndarray, min_size: float) -> np.ndarray:
+    """Which faces belong to a component whose box has at least a diagonal of min_size, [n_faces].
+
+    Every vertex takes the smallest label of its faces', and the label that this label's vertex has,
+    until nothing changes.
+    """
+    labels = np.arange(len(points))
+    while len(faces):
+        smallest = labels[faces].min(axis=1)
+        new = labels.copy()
+        for corner in range(3):
+            np.minimum.at(new, labels[faces[:, corner]], smallest)
+            np.minimum.at(new, faces[:, corner], smallest)
+        new = new[new]
+        if (new == labels).all():
+            break
+        labels = new
+    low, high = np.full((len(points), 3), np.inf), np.full((len(points), 3), -np.inf)
+    used = np.unique(faces)
+    np.minimum.at(low, labels[used], points[used])
+    np.maximum.at(high, labels[used], points[used])
+    roots = labels[faces[:, 0]]
+    return np.linalg.norm(high[roots] - low[roots], axis=1) >= min_size
+
+
+def _density_range(field: Field, raw: np.ndarray, box: np.ndarray) -> str:
+    """The least and the greatest density of nodes in a box, in words."""
+    nodes = np.stack(np.meshgrid(*map(np.arange, raw.shape), indexing="ij"), -1).reshape(-1, 3)
+    found = raw.reshape(-1)[inside(points_of(field.grid, nodes), box)]
+    if not found.size:
+        return "that of no node: it is smaller than a voxel"
+    low, high = density(field, np.array([found.min(), found.max()]))
+    return f"{low:.3g} to {high:.3g}"
+
+
+def _corner(corner: np.ndarray) -> str:
+    return " ".join(f"{x:g}" for x in corner)

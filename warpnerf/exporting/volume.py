@@ -1,0 +1,106 @@
+"""Density, and colour, at the nodes of a regular grid: numpy's .npz and NanoVDB's .nvdb."""
+
+from __future__ import annotations
+
+import io
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+
+from warpnerf.checks import InputError
+from warpnerf.exporting.colour import colours
+from warpnerf.exporting.nodes import nodes_of, points_of
+from warpnerf.exporting.sight import SEEN, Sight
+from warpnerf.exporting.surface import Crop, checked_crop, density, normals_at, raw_density
+from warpnerf.rendering.field import Field
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Volume:
+    """A block of a field's nodes, at equal distances."""
+
+    density: np.ndarray
+    """[X, Y, Z] float32, 1 / scene unit; 0 in what is left out."""
+    rgb: np.ndarray
+    """[X, Y, Z, 3] uint8, sRGB as in the photographs; 0 in what is left out."""
+    seen: np.ndarray
+    """[X, Y, Z] bool, whether a training camera sees it; true where it is not known."""
+    box_min: np.ndarray
+    """[3] float64, the first node, scene units."""
+    box_max: np.ndarray
+    """[3] float64, the last node."""
+
+
+def volume_of(
+    field: Field,
+    sight: Sight | None = None,
+    *,
+    unseen: bool = False,
+    crop: Crop | None = None,
+) -> Volume:
+    """The nodes of a field in a box, without what lies outside of the field's own.
+
+    Args:
+        field: A trained field.
+        sight: Of the cameras of its training, as for ``extract_surface``: what none sees is empty.
+        unseen: Keep what no camera sees, too.
+        crop: The box; None: the field's.
+
+    Returns:
+        The volume.
+
+    Raises:
+        InputError: The crop is no box, or holds no two nodes along an axis.
+    """
+    grid = field.grid
+    box = checked_crop(field, crop)
+    box = np.clip(box, grid.box_min, grid.box_max)
+    low, high = nodes_of(grid, box)
+    first, last = np.ceil(low - 1e-6).astype(int), np.floor(high + 1e-6).astype(int)
+    if (first >= last).any():
+        raise InputError(
+            "crop holds fewer than two nodes of the grid along an axis, whose voxels have edges of "
+            f"{grid.voxel_size.max():.3g} scene units; choose a larger box inside the field's."
+        )
+    block = tuple(slice(a, b + 1) for a, b in zip(first, last, strict=True))
+    corners = points_of(grid, np.stack([first, last]))
+    raw = raw_density(field)
+    seen = np.ones(grid.size, bool) if sight is None else sight.light > SEEN
+    sigma, seen = density(field, raw[block]), seen[block]
+    there = np.ones_like(seen) if unseen else seen
+    points = points_of(grid, np.argwhere(there) + first)
+    rgb = np.zeros((*seen.shape, 3), np.uint8)
+    rgb[there] = np.round(255.0 * colours(field, sight, points, normals_at(field, raw, points)))
+    return Volume(
+        density=np.where(there, sigma, np.float32(0.0)),
+        rgb=rgb,
+        seen=seen,
+        box_min=corners[0],
+        box_max=corners[1],
+    )
+
+
+def volume_npz(volume: Volume) -> list[bytes]:
+    """An .npz file, whose keys are the names of the volume's fields."""
+    file = io.BytesIO()
+    np.savez_compressed(file, **vars(volume))
+    return [file.getvalue()]
+
+
+def volume_nvdb(volume: Volume) -> list[bytes]:
+    """A NanoVDB file of a volume's density; index space counts nodes, world space scene units."""
+    step = (volume.box_max - volume.box_min) / (np.array(volume.density.shape) - 1)
+    stored = wp.Volume.load_from_numpy(
+        volume.density,
+        min_world=tuple(map(float, volume.box_min)),
+        voxel_size=tuple(map(float, step)),
+        bg_value=0.0,
+        device="cpu",
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "volume.nvdb"
+        stored.save_to_nvdb(path)
+        return [path.read_bytes()]
