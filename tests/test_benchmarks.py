@@ -326,6 +326,22 @@ def test_schedules(tmp_path):
         assert f"{row['psnr']:.2f}" in printed
 
 
+def test_the_truth_of_meshes():
+    """What photographs of the room show lies on surfaces that mesh.py measures distances to."""
+    pytest.importorskip("scipy")
+    import mesh
+
+    from warpnerf.scenes.load import load_scene
+
+    points, colours = mesh.photographed(load_scene("builtin:room", downscale=20))
+    assert points.shape == colours.shape == (120 * 8 * 6, 3)
+    assert mesh.distance_to_room(points).max() < 1e-4
+    lifted = points + np.array([0.0, 0.0, 0.01])  # off the floor and into the ceiling
+    level = np.isclose(points[:, 2], 0.0, atol=1e-6) | np.isclose(points[:, 2], 2.6, atol=1e-6)
+    assert level.sum() > 100
+    np.testing.assert_allclose(mesh.distance_to_room(lifted[level]).max(), 0.01, atol=1e-4)
+
+
 def test_ray_order(tmp_path, on_cpu):
     options = ("builtin:room-sparse", "--downscale", "16", "--steps", "4", "--threads", "2")
     record, printed = run("ray_order.py", tmp_path / "record.json", *options, "--rounds", "2")
