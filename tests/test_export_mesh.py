@@ -103,6 +103,8 @@ def test_crop_and_size_drop_what_they_say() -> None:
     ("options", "says"),
     [
         ({"level": 1e9}, "its density there is .* to 400 per scene unit"),
+        ({"level": 1e300}, "its density there is .* to 400 per scene unit"),
+        ({"level": 1e-310}, "its density there is .* to 400 per scene unit"),
         ({"level": 0.0}, "level must be a finite number above 0"),
         ({"level": float("nan")}, "level must be a finite number above 0"),
         ({"min_size": -1.0}, "min_size must be"),

@@ -184,8 +184,9 @@ def normals_at(field: Field, raw: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 def _raw_of(field: Field, level: float) -> float:
     """The raw density of a density: the inverse of ``density``."""
-    x = level / field.grid.density_scale
-    return x + math.log(-math.expm1(-x)) - field.grid.density_shift
+    x = max(level / field.grid.density_scale, 1e-300)
+    raw = x + math.log(-math.expm1(-x)) - field.grid.density_shift
+    return min(max(raw, -1e30), 1e30)  # as far as single precision goes
 
 
 def _marching_cubes(raw: np.ndarray, level: float, field: Field) -> tuple[np.ndarray, np.ndarray]:
