@@ -304,7 +304,7 @@ class FreeCells:
     def cropped(
         self, grid: VoxelGrid, low: np.ndarray, high: np.ndarray, workers: Workers
     ) -> FreeCells:
-        """The same, with all free whose cells lie outside of a box; no array of this one changes.
+        """The same, and free is what does not lie wholly in a box; no array of this one changes.
 
         Args:
             grid: That these cells belong to.
@@ -319,8 +319,8 @@ class FreeCells:
         # The box's share of the domain, whose border lies around it.
         share = 0.5 + (share - 0.5) / (1.0 + grid.border)
         for axis, n in enumerate(size):
-            middles = (np.arange(n) + 0.5) / n
-            inside = (share[0, axis] <= middles) & (middles <= share[1, axis])
+            edges = np.arange(n + 1) / n
+            inside = (share[0, axis] <= edges[:-1] + 1e-6) & (edges[1:] - 1e-6 <= share[1, axis])
             occupied = occupied & np.expand_dims(inside, [a for a in range(3) if a != axis])
         distance = np.where(occupied, 0, int(occupancy.FAR) + 1).astype(np.uint8)
         there = wp.array(distance.ravel(), dtype=wp.uint8, device=workers.device)

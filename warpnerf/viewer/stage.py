@@ -37,7 +37,8 @@ class Stage:
         self._server = server
         self._world = world
         self._handles: list[Any] = []
-        self._size = 0.0  # of a camera, viser's units
+        self.length = 0.0
+        """Of a camera's pyramid, viser's units."""
         self._scale = 1.0
         self.cameras: list[Camera] = []
         """Those that are shown."""
@@ -45,7 +46,7 @@ class Stage:
             views = [scene.views[index] for index in scene.splits["train"]]
             views = [views[index] for index in spread(len(views), MAX_CAMERAS)]
             self.cameras = [view.camera for view in views]
-            self._size = _frustum_size(self.cameras, world)
+            self.length = _length(self.cameras, world)
             for view in views:
                 self._add_camera(view)
         self._places = np.array([camera.position for camera in self.cameras]).reshape(-1, 3)
@@ -53,14 +54,14 @@ class Stage:
     def show_cameras(self, visible: bool, scale: float) -> None:
         """Show or hide them, so many times as large as at first."""
         self._scale = scale
-        for handle in self._handles:
+        for handle, camera in zip(self._handles, self.cameras, strict=True):
             handle.visible = visible
-            handle.scale = scale * self._size
+            handle.scale = scale * _frustum_scale(camera, self.length)
 
     def in_the_way(self, position: np.ndarray) -> list[str]:
         """Names of the cameras that one stands in at a position [3], scene units."""
         apart = self._world.scale * np.linalg.norm(self._places - position, axis=1)
-        return [self._handles[i].name for i in np.flatnonzero(apart < self._scale * self._size)]
+        return [self._handles[i].name for i in np.flatnonzero(apart < self._scale * self.length)]
 
     def show_box(self, crop: tuple[Sequence[float], Sequence[float]] | None) -> None:
         """Show a box by its corners, scene units; None: none."""
@@ -95,7 +96,7 @@ class Stage:
             f"/cameras/{len(self._handles):04}",
             fov=2.0 * float(np.arctan(0.5 * camera.height / camera.fy)),
             aspect=camera.width / camera.fx * camera.fy / camera.height,
-            scale=self._size,
+            scale=_frustum_scale(camera, self.length),
             thickness=1.5,
             thickness_units="screen",
             color=CAMERA_COLOUR,
@@ -138,10 +139,15 @@ def _to_stand_in(camera: Camera, world: World) -> Callable[[Any], None]:
     return clicked
 
 
-def _frustum_size(cameras: Sequence[Camera], world: World) -> float:
-    """Of a camera in viser's units: smaller where they stand close together."""
+def _frustum_scale(camera: Camera, length: float) -> float:
+    """What viser calls the scale of a pyramid of some length: the root of a quarter of its volume."""
+    return length * float(np.cbrt(camera.width / camera.fx * camera.height / camera.fy / 12.0))
+
+
+def _length(cameras: Sequence[Camera], world: World) -> float:
+    """Of the cameras' pyramids, viser's units: shorter where they stand close together."""
     positions = world.scale * np.array([camera.position for camera in cameras])
     apart = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
     np.fill_diagonal(apart, np.inf)
     nearest = float(np.median(apart.min(axis=1)))
-    return float(np.clip(0.4 * nearest, 0.02 * DISTANCE, 0.06 * DISTANCE))
+    return float(np.clip(0.6 * nearest, 0.03 * DISTANCE, 0.1 * DISTANCE))
