@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import json
+import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -11,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser import browser, needs_browser, screenshot
+from PIL import Image
 from test_viewer_session import serving
 from tiny_fields import tiny_field
 from tiny_scenes import ring, tiny_scene
@@ -23,7 +25,14 @@ from warpnerf.viewer.painter import Painter, Settings, Subject
 from warpnerf.viewer.session import Session
 from warpnerf.viewer.stage import stand_in
 
-pytestmark = [needs_browser, pytest.mark.timeout(240)]
+sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
+
+from chromium import browser, missing
+
+pytestmark = [
+    pytest.mark.skipif(missing() is not None, reason=f"the page is not tested: {missing()}"),
+    pytest.mark.timeout(240),
+]
 
 WIDTH, HEIGHT = 900, 400
 LEFT = slice(0, 560)  # columns that the panel does not hide
@@ -44,6 +53,11 @@ def scene() -> Scene:
 def chromium() -> Iterator[Any]:
     with browser() as chromium:
         yield chromium
+
+
+def screenshot(page: Any) -> np.ndarray:
+    """What a page shows, [H, W, 3] uint8."""
+    return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))
 
 
 def eventually(holds: Callable[[], bool], seconds: float = 60.0) -> None:

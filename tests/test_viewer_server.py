@@ -8,17 +8,21 @@ import sys
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
-from page_client import PageClient, connection
 from tiny_scenes import ring
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from warpnerf.checks import InputError
 from warpnerf.viewer.server import address, close_server, may_enter, open_server
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
+
+from page_client import PageClient, connection
 
 NAMES = {"localhost", "box.lan"}
 

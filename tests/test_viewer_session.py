@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -13,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from page_client import PageClient, connection
 from tiny_fields import tiny_field
 from tiny_scenes import ring, tiny_scene
 
@@ -24,6 +24,10 @@ from warpnerf.training.trainer import Trainer
 from warpnerf.viewer.painter import Subject
 from warpnerf.viewer.session import Session
 from warpnerf.viewer.viewpoint import DISTANCE, FLIP
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
+
+from page_client import PageClient, connection
 
 DISTANCE_OF_CONTENT = 3.0
 TINY = replace(
@@ -235,6 +239,30 @@ def test_pictures_get_their_share_and_no_more(
         began, drawn = now[0], 0.0
         session.after_update()
         assert drawn == 0.0
+
+
+def test_a_fault_of_the_page_does_not_end_a_training(
+    field: Field, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    subject = Subject(name="it", field=lambda: field)
+    with (
+        Session(
+            [subject], None, content_distance=DISTANCE_OF_CONTENT, training=True, port=0
+        ) as session,
+        PageClient(session.server.get_port()) as page,
+    ):
+        page.look_from(opencv(ring(5)[0]))
+        page.wait(lambda _: session._pages)
+
+        def fail(*arguments: Any) -> None:
+            raise RuntimeError("of viser's")
+
+        monkeypatch.setattr(session._painter, "paint", fail)
+        session._credit = 0.1
+        with pytest.warns(UserWarning, match="the page failed .*of viser's.* training goes on"):
+            session.after_update()
+        session.after_update()
+        assert not session._pages
 
 
 def resident_bytes() -> int:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import threading
+import warnings
 from collections.abc import Sequence
 from time import monotonic
 from types import TracebackType
@@ -61,7 +62,7 @@ class Page:
         self._pictures += 1
         now = monotonic()
         width, height = self.screen.size
-        if self.screen.fine:
+        if self.screen.fine or not self._said.content:
             self._said.content = f"{width} x {height} pixels"
         elif now - self._since > 0.5:
             rate = self._pictures / (now - self._since)
@@ -181,6 +182,16 @@ class Session:
         share = self._panel.share
         earned = (now - self._last) * share / (1.0 - share)
         self._credit = min(self._credit + earned, MAX_DEBT)
+        try:
+            self._spend()
+        except Exception as error:  # whatever is wrong with a page: the training is worth more
+            self._pages.clear()
+            close_server(self.server)
+            warnings.warn(f"the page failed ({error!r}); training goes on without it", stacklevel=2)
+        self._last = monotonic()
+
+    def _spend(self) -> None:
+        """Draw as long as there is time to spend, and something to draw."""
         while self._credit > 0.0:
             page, due = self._next()
             began = monotonic()
@@ -188,7 +199,6 @@ class Session:
                 break
             self._advance(page)
             self._credit -= monotonic() - began
-        self._last = monotonic()
 
     def notify(self, title: str, body: str) -> None:
         """Say something in all pages."""

@@ -140,7 +140,7 @@ def _to_stand_in(camera: Camera, world: World) -> Callable[[Any], None]:
 
 
 def _frustum_scale(camera: Camera, length: float) -> float:
-    """What viser calls the scale of a pyramid of some length: the root of a quarter of its volume."""
+    """What viser calls the scale of a pyramid of some length: its volume sets it."""
     return length * float(np.cbrt(camera.width / camera.fx * camera.height / camera.fy / 12.0))
 
 

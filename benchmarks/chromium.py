@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 import importlib.util
-import io
 import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
-
-import numpy as np
-import pytest
-from PIL import Image
 
 CHROMIUM = (
     os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
@@ -29,10 +24,12 @@ FLAGS = [
     "--disable-sync",
 ]
 
-needs_browser = pytest.mark.skipif(
-    CHROMIUM is None or importlib.util.find_spec("playwright") is None,
-    reason="no Chromium (apt-get install chromium), or no playwright: the page is not tested",
-)
+
+def missing() -> str | None:
+    """Why there is no browser, or None."""
+    if importlib.util.find_spec("playwright") is None:
+        return "no playwright: pip install playwright"
+    return "no Chromium: apt-get install chromium" if CHROMIUM is None else None
 
 
 @contextmanager
@@ -45,8 +42,3 @@ def browser() -> Iterator[Any]:
             yield chromium
         finally:
             chromium.close()
-
-
-def screenshot(page: Any) -> np.ndarray:
-    """What a page shows, [H, W, 3] uint8."""
-    return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))
