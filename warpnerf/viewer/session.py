@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from warpnerf.evaluation.near_field import NEAR_SHARE
-from warpnerf.media.camera_path import look_at
+from warpnerf.media.camera_path import look_at, path_lens
 from warpnerf.scenes.scene import Scene, up_direction
 from warpnerf.viewer.painter import Painter, Settings, Subject
 from warpnerf.viewer.panel import Panel
@@ -243,6 +243,7 @@ class Session:
         page = Page(client, Screen(self._painter, show, self._coarse, self._fine))
         self._pages[client.client_id] = page
         self._look(page)
+        self._stage.show_photographs()
 
         # A coroutine, which the server's own thread runs: a pool of threads could mix up the order.
         @client.camera.on_update
@@ -273,7 +274,7 @@ def _first_look(
         c2w [3, 4] in scene units, vertical field of view in radians, and what is up, [3].
     """
     if scene is not None:
-        camera = scene.training_cameras[0]
+        camera = path_lens(scene.training_cameras[:1], None)
         return camera.c2w, fov_to_see(camera, ASPECT), up_direction(scene.training_cameras)
     middle, extent = 0.5 * (box[0] + box[1]), box[1] - box[0]
     up, before = np.array([0.0, 0.0, 1.0]), np.array([0.0, extent[1], 0.0])

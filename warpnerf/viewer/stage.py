@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from PIL import Image
 
+from warpnerf.checks import InputError
+from warpnerf.media.camera_path import path_lens
 from warpnerf.media.contact_sheet import spread
 from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.scene import Scene, View
@@ -37,6 +41,7 @@ class Stage:
         self._server = server
         self._world = world
         self._handles: list[Any] = []
+        self._views: list[View] = []  # whose photographs are not shown yet
         self.length = 0.0
         """Of a camera's pyramid, viser's units."""
         self._scale = 1.0
@@ -44,12 +49,23 @@ class Stage:
         """Those that are shown."""
         if scene is not None:
             views = [scene.views[index] for index in scene.splits["train"]]
-            views = [views[index] for index in spread(len(views), MAX_CAMERAS)]
-            self.cameras = [view.camera for view in views]
+            self._views = [views[index] for index in spread(len(views), MAX_CAMERAS)]
+            self.cameras = [_straight(view.camera) for view in self._views]
             self.length = _length(self.cameras, world)
-            for view in views:
-                self._add_camera(view)
+            for camera in self.cameras:
+                self._add_camera(camera)
         self._places = np.array([camera.position for camera in self.cameras]).reshape(-1, 3)
+
+    def show_photographs(self) -> None:
+        """Begin to put the photographs on their cameras, in a thread of its own; once."""
+        views, self._views = self._views, []
+        if views:
+            threading.Thread(target=self._put_up, args=(views,), daemon=True).start()
+
+    def _put_up(self, views: Sequence[View]) -> None:
+        for handle, view in zip(self._handles, views, strict=True):
+            with suppress(InputError):  # its file is no longer what it was
+                handle.image = thumbnail(view.image)
 
     def show_cameras(self, visible: bool, scale: float) -> None:
         """Show or hide them, so many times as large as at first."""
@@ -89,8 +105,7 @@ class Stage:
             thickness_units="screen",
         )
 
-    def _add_camera(self, view: View) -> None:
-        camera = view.camera
+    def _add_camera(self, camera: Camera) -> None:
         wxyz, position = self._world.pose(camera.c2w)
         handle = self._server.scene.add_camera_frustum(
             f"/cameras/{len(self._handles):04}",
@@ -100,7 +115,6 @@ class Stage:
             thickness=1.5,
             thickness_units="screen",
             color=CAMERA_COLOUR,
-            image=thumbnail(view.image),
             format="jpeg",
             wxyz=wxyz,
             position=position,
@@ -130,6 +144,11 @@ def thumbnail(image: np.ndarray) -> np.ndarray:
         paper = Image.new("RGBA", picture.size, "white")
         picture = Image.alpha_composite(paper, picture)
     return np.asarray(picture.convert("RGB"))
+
+
+def _straight(camera: Camera) -> Camera:
+    """A camera of straight lines, as viser's are, that sees about as much."""
+    return path_lens([camera], None) if camera.fisheye else camera
 
 
 def _to_stand_in(camera: Camera, world: World) -> Callable[[Any], None]:

@@ -101,7 +101,7 @@ def _subject(name: str, field: Field) -> Subject:
 def _scene_of(source: str, downscale: int) -> Scene | None:
     print(f"reading {source}", flush=True)
     try:
-        return load_scene(source, downscale=downscale)
+        return load_scene(source, downscale=downscale, images="files")
     except InputError as error:
         print(f"note: shown without its photographs: {error} Name them by --scene.", flush=True)
         return None
