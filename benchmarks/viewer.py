@@ -51,7 +51,6 @@ def main() -> None:
     field = wn.load_field(arguments.run / "field.safetensors", arguments.device)
     record: dict[str, Any] = {
         "machine": machine(arguments.device, Workers(arguments.device).count),
-        "run": str(arguments.run),
         "model": field.model.name,
         "grid": field.grid.size,
         "window": [WIDTH, HEIGHT],
