@@ -81,8 +81,10 @@ class Screen:
         self._shown = 0.0
         self.size = (0, 0)
         """Width and height of the picture that the page got last."""
+        self.coarse = False
+        """Whether that was a coarse one."""
         self.fine = False
-        """Whether that was all of the fine one."""
+        """Whether that was all of a fine one."""
 
     def look_from(self, viewpoint: Viewpoint) -> None:
         """The page's camera is there now."""
@@ -130,7 +132,7 @@ class Screen:
         columns = np.arange(wide) * size[0] // wide
         rows = np.arange(high) * size[1] // high
         self._canvas, self._row = picture[rows[:, None], columns], 0
-        self._send(picture, COARSE_QUALITY, fine=False)
+        self._send(picture, COARSE_QUALITY, coarse=True)
 
     def _draw_band(self, viewpoint: Viewpoint, settings: Settings) -> None:
         if self._row == 0:
@@ -147,8 +149,11 @@ class Screen:
         if done or monotonic() - self._shown >= SHOW_EVERY:
             self._send(self._canvas, FINE_QUALITY if done else COARSE_QUALITY, fine=done)
 
-    def _send(self, picture: np.ndarray, quality: int, *, fine: bool) -> None:
-        self.size, self.fine = (picture.shape[1], picture.shape[0]), fine
+    def _send(
+        self, picture: np.ndarray, quality: int, *, coarse: bool = False, fine: bool = False
+    ) -> None:
+        self.size = picture.shape[1], picture.shape[0]
+        self.coarse, self.fine = coarse, fine
         self._shown = monotonic()
         self._show(picture, quality)
 

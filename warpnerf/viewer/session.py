@@ -58,13 +58,13 @@ class Page:
             self._hidden[name] = self.client.scene.add_frame(name, show_axes=False, visible=False)
 
     def say(self) -> None:
-        """Count a picture, and say now and then how large they are and how many in a second."""
-        self._pictures += 1
+        """Say how large the pictures are, and while the camera moves how many come in a second."""
         now = monotonic()
         width, height = self.screen.size
+        self._pictures += self.screen.coarse
         if self.screen.fine or not self._said.content:
             self._said.content = f"{width} x {height} pixels"
-        elif now - self._since > 0.5:
+        elif self.screen.coarse and now - self._since > 0.5:
             rate = self._pictures / (now - self._since)
             self._said.content = f"{width} x {height} pixels, {rate:.0f} pictures/s"
         else:
