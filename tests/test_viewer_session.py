@@ -21,7 +21,7 @@ from warpnerf.config import PRESETS, TrainConfig
 from warpnerf.media.pictures import to_bytes
 from warpnerf.rendering.field import Field
 from warpnerf.training.trainer import Trainer
-from warpnerf.viewer.painter import Subject
+from warpnerf.viewer.painter import KINDS, LAYOUTS, Subject
 from warpnerf.viewer.session import Session
 from warpnerf.viewer.viewpoint import DISTANCE, FLIP
 
@@ -158,6 +158,38 @@ def test_nonsense_about_a_camera_is_passed_over(field: Field) -> None:
         before = len(page.pictures)
         page.look_from(opencv(ring(5)[1]))
         page.wait(lambda page: len(page.pictures) > before)
+
+
+def test_what_a_page_can_set_stays_within_its_ends(field: Field) -> None:
+    """Sliders and menus are the page's; what it sends may be anything."""
+    with (
+        serving(field, field, scene=tiny_scene(ring(5))) as session,
+        PageClient(session.server.get_port()) as page,
+    ):
+        page.look_from(opencv(ring(5)[0]))
+        page.wait_for_size(80, 60)
+        controls = [
+            message["uuid"]
+            for kind, messages in page.messages.items()
+            for message in messages
+            if kind.startswith("Gui") and "uuid" in message and "value" in message
+        ]
+        assert len(controls) > 10
+        for value in (float("nan"), 1e300, -1e300, "evil", True, [float("nan")] * 2, [9.0, -9.0]):
+            for uuid in controls:
+                with PageClient(session.server.get_port()) as other:
+                    other.look_from(opencv(ring(5)[1]))
+                    other.say(
+                        {"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"value": value}}
+                    )
+        before = len(page.pictures)
+        page.look_from(opencv(ring(5)[2]))
+        page.wait_for_size(80, 60, before)
+        settings = session._panel.settings
+        assert settings.kind in KINDS and settings.layout in LAYOUTS
+        numbers = [settings.near, settings.far, settings.within, settings.divider]
+        assert np.isfinite(numbers).all() and 0.0 < settings.within <= DISTANCE_OF_CONTENT
+        assert settings.crop is None or np.isfinite(settings.crop).all()
 
 
 def test_one_stands_in_a_camera_without_seeing_it(field: Field) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -69,7 +70,7 @@ class Panel:
             slider = gui.add_slider(
                 "Time for pictures", 0.05, 0.9, 0.05, SHARE, hint="share of it, from training"
             )
-            slider.on_update(lambda _: setattr(self, "share", slider.value))
+            slider.on_update(lambda _: setattr(self, "share", _kept(slider.value, 0.05, 0.9)))
         if stage.cameras:
             self._add_cameras()
         self._add_crop(box)
@@ -99,16 +100,21 @@ class Panel:
 
         @kind.on_update
         def _(_: Any) -> None:
-            show_what_matters()
-            self._set(kind=kind.value)
+            if kind.value in KINDS:
+                show_what_matters()
+                self._set(kind=kind.value)
 
         def set_depths(_: Any) -> None:
-            if 0.0 <= near.value < far.value:
+            if 0.0 <= near.value < far.value < np.inf:
                 self._set(near=near.value, far=far.value)
 
         near.on_update(set_depths)
         far.on_update(set_depths)
-        within.on_update(lambda _: self._set(within=within.value * self._content_distance))
+
+        @within.on_update
+        def _(_: Any) -> None:
+            self._set(within=_kept(within.value, 0.02, 1.0) * self._content_distance)
+
         show_what_matters()
         if n_subjects > 1:
             layout = gui.add_dropdown("Runs", LAYOUTS, initial_value=settings.layout)
@@ -117,12 +123,14 @@ class Panel:
 
             @layout.on_update
             def _(_: Any) -> None:
+                if layout.value not in LAYOUTS:
+                    return
                 divider.visible = layout.value == "divided"
                 # What stands in the scene is drawn where one picture over all of the page has it.
                 self._server.scene.set_global_visibility(layout.value != "side by side")
                 self._set(layout=layout.value)
 
-            divider.on_update(lambda _: self._set(divider=divider.value))
+            divider.on_update(lambda _: self._set(divider=_kept(divider.value, 0.0, 1.0)))
             self._server.scene.set_global_visibility(settings.layout != "side by side")
 
     def _add_cameras(self) -> None:
@@ -130,19 +138,18 @@ class Panel:
         with gui.add_folder("Training cameras"):
             shown = gui.add_checkbox("Show", True, hint="click one to stand in it")
             size = gui.add_slider("Size", 0.2, 5.0, 0.1, 1.0)
-            number = gui.add_slider("Stand in", 1, max(2, len(cameras)), 1, 1)
+            name = gui.add_dropdown("Stand in", list(cameras), initial_value=next(iter(cameras)))
 
         def show(_: Any) -> None:
-            self._stage.show_cameras(shown.value, size.value)
+            self._stage.show_cameras(shown.value, _kept(size.value, 0.2, 5.0))
 
         shown.on_update(show)
         size.on_update(show)
 
-        @number.on_update
+        @name.on_update
         def _(event: Any) -> None:
-            if event.client is not None:
-                index = min(number.value, len(cameras)) - 1
-                stand_in(event.client, cameras[index], self._world)
+            if event.client is not None and name.value in cameras:
+                stand_in(event.client, cameras[name.value], self._world)
 
     def _add_crop(self, box: tuple[np.ndarray, np.ndarray]) -> None:
         gui = self._server.gui
@@ -160,7 +167,8 @@ class Panel:
             ]
 
         def crop(_: Any) -> None:
-            ends = np.array([axis.value for axis in ranges])
+            ends = np.array([axis.value for axis in ranges]).reshape(3, 2)
+            ends = np.clip(np.nan_to_num(ends), box[0][:, None], box[1][:, None])
             corners = (tuple(ends[:, 0]), tuple(ends[:, 1])) if cropped.value else None
             self._stage.show_box(corners)
             self._set(crop=corners)
@@ -170,7 +178,7 @@ class Panel:
             axis.on_update(crop)
 
     def _add_path(self) -> None:
-        gui, recorder = self._server.gui, self._recorder
+        gui, recorder, playing = self._server.gui, self._recorder, threading.Lock()
         with gui.add_folder("Camera path", expand_by_default=False):
             said = gui.add_markdown("")
             seconds = gui.add_slider(
@@ -194,7 +202,7 @@ class Panel:
         def _(event: Any) -> None:
             viewpoint = self._viewpoint_of(event.client_id)
             if viewpoint is not None:
-                recorder.add(viewpoint, seconds.value)
+                recorder.add(viewpoint, _kept(seconds.value, 0.5, 20.0))
                 show()
 
         @drop.on_click
@@ -210,8 +218,11 @@ class Panel:
         @play.on_click
         def _(event: Any) -> None:
             path = recorder.path
-            if path is not None and len(recorder) > 1:
-                preview(event.client, path, self._world)
+            if path is not None and len(recorder) > 1 and playing.acquire(blocking=False):
+                try:
+                    preview(event.client, path, self._world, self._server.get_clients)
+                finally:
+                    playing.release()
 
         @save.on_click
         def _(event: Any) -> None:
@@ -220,3 +231,8 @@ class Panel:
                 event.client.send_file_download(FILE_NAME, path.to_json(), save_immediately=True)
 
         show()
+
+
+def _kept(value: float, low: float, high: float) -> float:
+    """A slider's value, within its ends: a page can send any number."""
+    return float(np.clip(np.nan_to_num(value, nan=low), low, high))

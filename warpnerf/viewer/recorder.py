@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     import viser
 
 PREVIEW_FPS = 15
+MOST_KEYS = 500
 FILE_NAME = "path.json"
 
 
@@ -29,10 +31,14 @@ class Recorder:
     def add(self, viewpoint: Viewpoint, seconds: float) -> None:
         """Pass here, so many seconds after the key before. The last one's window is the picture's.
 
+        A key more than MOST_KEYS is forgotten.
+
         Args:
             viewpoint: Where a page looks from.
             seconds: Of no matter for the first key.
         """
+        if len(self._keys) >= MOST_KEYS:
+            return
         at = self._keys[-1].seconds + seconds if self._keys else 0.0
         self._size = viewpoint.width, viewpoint.height
         fov = math.degrees(viewpoint.fov)
@@ -66,12 +72,19 @@ class Recorder:
         return np.array([camera.position for camera in path.cameras(16 * len(self))])
 
 
-def preview(client: viser.ClientHandle, path: RecordedPath, world: World) -> None:
-    """Fly a page's camera along a path, in its own time."""
+def preview(
+    client: viser.ClientHandle,
+    path: RecordedPath,
+    world: World,
+    clients: Callable[[], Mapping[int, object]],
+) -> None:
+    """Fly a page's camera along a path, in its own time, as long as it is one of the clients."""
     cameras = path.cameras(max(2, round(PREVIEW_FPS * path.seconds)))
     began = time.monotonic()
     for number, camera in enumerate(cameras):
         time.sleep(max(0.0, began + number / PREVIEW_FPS - time.monotonic()))
+        if client.client_id not in clients():
+            return
         wxyz, position = world.pose(camera.c2w)
         with client.atomic():
             client.camera.fov = 2.0 * math.atan(0.5 * camera.height / camera.fy)

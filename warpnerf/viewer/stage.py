@@ -45,16 +45,18 @@ class Stage:
         self.length = 0.0
         """Of a camera's pyramid, viser's units."""
         self._scale = 1.0
-        self.cameras: list[Camera] = []
-        """Those that are shown."""
+        self.cameras: dict[str, Camera] = {}
+        """Those that are shown, by the names of their photographs."""
         if scene is not None:
             views = [scene.views[index] for index in scene.splits["train"]]
             self._views = [views[index] for index in spread(len(views), MAX_CAMERAS)]
-            self.cameras = [_straight(view.camera) for view in self._views]
-            self.length = _length(self.cameras, world)
-            for camera in self.cameras:
+            self.cameras = {view.name: _straight(view.camera) for view in self._views}
+            self.length = _length(list(self.cameras.values()), world)
+            for camera in self.cameras.values():
                 self._add_camera(camera)
-        self._places = np.array([camera.position for camera in self.cameras]).reshape(-1, 3)
+        self._places = np.array([camera.position for camera in self.cameras.values()]).reshape(
+            -1, 3
+        )
 
     def show_photographs(self) -> None:
         """Begin to put the photographs on their cameras, in a thread of its own; once."""
@@ -70,7 +72,7 @@ class Stage:
     def show_cameras(self, visible: bool, scale: float) -> None:
         """Show or hide them, so many times as large as at first."""
         self._scale = scale
-        for handle, camera in zip(self._handles, self.cameras, strict=True):
+        for handle, camera in zip(self._handles, self.cameras.values(), strict=True):
             handle.visible = visible
             handle.scale = scale * _frustum_scale(camera, self.length)
 
