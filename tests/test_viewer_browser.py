@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from test_viewer_session import serving
+from served import serving
 from tiny_fields import tiny_field
 from tiny_scenes import ring, tiny_scene
 

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import os
 import sys
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from served import DISTANCE_OF_CONTENT, serving
 from tiny_fields import tiny_field
 from tiny_scenes import ring, tiny_scene
 
@@ -29,7 +27,6 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 
 from page_client import PageClient, connection
 
-DISTANCE_OF_CONTENT = 3.0
 TINY = replace(
     PRESETS["fast"], steps=60, threads=2, grid=replace(PRESETS["fast"].grid, voxels=4096)
 )
@@ -46,38 +43,6 @@ def opencv(pose: np.ndarray) -> np.ndarray:
     c2w[:, :3] *= FLIP
     c2w[:, 3] *= DISTANCE / DISTANCE_OF_CONTENT
     return c2w
-
-
-class Ended(Exception):
-    pass
-
-
-@contextmanager
-def serving(*fields: Field, scene: Any = None) -> Iterator[Session]:
-    """A session whose pictures are made in a thread of its own."""
-    subjects = [Subject(name=f"run {i}", field=lambda f=f: f) for i, f in enumerate(fields)]
-    session = Session(subjects, scene, content_distance=DISTANCE_OF_CONTENT, port=0)
-    failed: list[BaseException] = []
-
-    def serve() -> None:
-        try:
-            session.serve()
-        except Ended:
-            pass
-        except BaseException as error:
-            failed.append(error)
-
-    def end() -> Any:
-        raise Ended
-
-    thread = threading.Thread(target=serve, daemon=True)
-    thread.start()
-    with session:
-        yield session
-        session._next = end  # type: ignore[method-assign]
-        session._news.set()
-        thread.join(20)
-    assert not failed
 
 
 def seen(field: Field, pose: np.ndarray, size: tuple[int, int] = (80, 60)) -> np.ndarray:
