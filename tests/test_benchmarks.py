@@ -467,3 +467,27 @@ def test_needs_counts_lines(model):
     assert needs.n_samples == needed.sum() > 100
     assert needs.lines == len(set().union(*groups.values()))
     assert needs.lines_by_rays == sum(len(lines) for lines in groups.values()) > needs.lines
+
+
+@pytest.mark.slow
+def test_viewer(tmp_path):
+    from tiny_fields import tiny_field
+
+    from warpnerf.config import TrainConfig
+    from warpnerf.scenes.load import load_scene
+    from warpnerf.training.run import Run
+
+    made = Run(tmp_path / "made")
+    scene = load_scene("builtin:room-sparse", downscale=8)
+    made.create(scene, "builtin:room-sparse", 8, scene.content_distance, TrainConfig())
+    made.save_field(tiny_field())
+    options = (str(made.folder), "--rounds", "2", "--seconds", "1", "--steps", "100")
+    record, printed = run("viewer.py", tmp_path / "record.json", *options, "--no-browser")
+    assert is_interval(record["first_picture_seconds"])
+    assert is_interval(record["fine_picture_seconds"])
+    assert record["moving_pictures_per_second"]["median"] > 1.0
+    assert record["moving_pixels"]["high"] <= 800 * 600
+    assert is_interval(record["painting"]["bands"]["core_seconds"])
+    assert record["training"]["pictures"] > 0
+    assert is_interval(record["training"]["ratios"]["nobody looks"])
+    assert "at rest after" in printed

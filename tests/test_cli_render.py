@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 from PIL import Image
 from tiny_fields import tiny_field
-from tiny_scenes import write_transforms
+from tiny_scenes import ring, write_transforms
 
 from warpnerf.checks import InputError
 from warpnerf.cli.render import render_command
 from warpnerf.config import TrainConfig
+from warpnerf.media.recorded_path import Key, RecordedPath
 from warpnerf.scenes.load import load_scene
 from warpnerf.training.run import Run
 
@@ -53,6 +54,43 @@ def test_a_path_becomes_a_video(
     assert "depth from" in said and "scene units" in said
     assert "frame 5 of 5" in said
     assert f"wrote {target}" in said
+
+
+def test_a_recorded_path_becomes_a_video_of_its_own_size_and_length(
+    run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    keys = [
+        Key(seconds=0.5 * i, fov=40.0, c2w=pose[:3].tolist()) for i, pose in enumerate(ring(5)[:3])
+    ]
+    file = tmp_path / "mine.json"
+    file.write_bytes(RecordedPath(width=30, height=20, keys=keys).to_json())
+    target = tmp_path / "frames"
+    assert render_command(run_folder, path=str(file), output=target, fps=10.0, threads=1) == 0
+    pictures = [Image.open(frame) for frame in sorted(target.iterdir())]
+    assert len(pictures) == 10 and pictures[0].width == 2 * 30 + 4
+    assert "path " + str(file) in capsys.readouterr().out
+    shown = np.asarray(pictures[-1])[:20, :30] / 255.0
+    field = Run(run_folder).load_field("cpu", 1)[0]
+    last = RecordedPath(width=30, height=20, keys=keys).cameras(10)[-1]
+    np.testing.assert_allclose(shown, field.render(last).rgb, atol=0.01)
+    assert shown.std() > 0.05
+    options: dict[str, Any] = {"seconds": 0.3, "size": (24, 12), "fps": 10.0, "threads": 1}
+    assert render_command(run_folder, path=str(file), **options) == 0
+    assert (run_folder / "mine.mp4").exists()
+
+
+@pytest.mark.parametrize(
+    ("path", "says"),
+    [
+        ("spiral", r"--path spiral is none of auto, orbit, through, back"),
+        ("no/such.json", "no/such.json"),
+    ],
+)
+def test_a_path_that_is_none_is_refused(run_folder: Path, path: str, says: str) -> None:
+    before = contents(run_folder)
+    with pytest.raises(InputError, match=says):
+        render_command(run_folder, path=path)
+    assert contents(run_folder) == before
 
 
 def test_by_default_the_video_goes_into_the_run(run_folder: Path) -> None:

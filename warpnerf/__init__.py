@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from warpnerf.media.camera_path import camera_path
     from warpnerf.media.demonstration import Demo, demo
     from warpnerf.media.filming import render_stills, render_video
+    from warpnerf.media.recorded_path import RecordedPath, read_path
     from warpnerf.media.scene_plan import plan_picture
     from warpnerf.model.interface import Model
     from warpnerf.model.models import Deferred, Features, Rgb, SphericalHarmonics
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     )
     from warpnerf.training.state import Progress, TrainingState
     from warpnerf.training.train import TrainResult, train
+    from warpnerf.viewer.view import view
 
 __version__ = "0.1.0"
 
@@ -76,6 +78,8 @@ _HOMES = {
     "Rendering": "rendering.field",
     "render_stills": "media.filming",
     "render_video": "media.filming",
+    "RecordedPath": "media.recorded_path",
+    "read_path": "media.recorded_path",
     "Inspection": "evaluation.inspection",
     "inspect": "evaluation.inspection",
     "plan_picture": "media.scene_plan",
@@ -85,6 +89,7 @@ _HOMES = {
     "TrainingState": "training.state",
     "TrainResult": "training.train",
     "train": "training.train",
+    "view": "viewer.view",
 }
 
 __all__ = [  # noqa: RUF022 (grouped by home, as above)
@@ -121,6 +126,8 @@ __all__ = [  # noqa: RUF022 (grouped by home, as above)
     "Rendering",
     "render_stills",
     "render_video",
+    "RecordedPath",
+    "read_path",
     "Inspection",
     "inspect",
     "plan_picture",
@@ -130,6 +137,7 @@ __all__ = [  # noqa: RUF022 (grouped by home, as above)
     "TrainingState",
     "TrainResult",
     "train",
+    "view",
 ]
 
 

@@ -29,6 +29,7 @@ from warpnerf.cli.machine import (
 from warpnerf.cli.model_options import chosen_model
 from warpnerf.cli.progress import ProgressBar
 from warpnerf.cli.render import render_command
+from warpnerf.cli.view import PageOptions, training_page, view_command
 from warpnerf.config import PRESETS, Scaling, TrainConfig
 from warpnerf.runtime.signals import Stopped, StopRequest, raise_when_asked
 from warpnerf.runtime.terminal import UntilClosed
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from warpnerf.training.run import Run
     from warpnerf.training.state import Progress
     from warpnerf.training.trainer import Trainer
+    from warpnerf.viewer.session import Session
 
 FAILED = 1
 BAD_INPUT = 2
@@ -69,6 +71,9 @@ def train_command(
     seed: int | None = None,
     checkpoint_every: float | None = None,
     overwrite: bool = False,
+    view: bool = False,
+    host: str | None = None,
+    port: int | None = None,
 ) -> int:
     """Train a voxel grid on a scene, and look at its test views.
 
@@ -100,7 +105,11 @@ def train_command(
         seed: Same seed and threads: same result on the CPU.
         checkpoint_every: Seconds between two checkpoints to resume from; by default 300.
         overwrite: Replace the run that the output folder holds.
+        view: Serve a page to look at the training in a browser.
+        host: Where, by name or address of this machine; by default 127.0.0.1.
+        port: Where; 0: any that is free. By default 8080, or the next that is free.
     """
+    page = PageOptions.chosen(view, host, port)
     chosen: dict[str, Any] = {
         "steps": steps,
         "time_limit": time_limit,
@@ -132,14 +141,14 @@ def train_command(
                     f"--{name} does not go with --resume: the run in {resume} goes on as it was "
                     "begun; leave it out."
                 )
-        return _resume(resume, scene, masks, images, changed)
+        return _resume(resume, scene, masks, images, changed, page)
     if scene is None or output is None:
         raise InputError(
             "train wants a SCENE and --output DIR for a new run, or --resume DIR to go on with one."
         )
     config = changed(PRESETS[preset or "fast"])
     factor = 1 if downscale is None else downscale
-    return _begin(scene, output, factor, masks, images, config, overwrite)
+    return _begin(scene, output, factor, masks, images, config, overwrite, page)
 
 
 def eval_command(
@@ -201,6 +210,7 @@ def _begin(
     images: Place,
     config: TrainConfig,
     overwrite: bool,
+    page: PageOptions | None,
 ) -> int:
     """Train from the first step on."""
     from warpnerf.scenes.files import exists
@@ -225,12 +235,12 @@ def _begin(
     for oddity in oddities(trained, survey(source), trainer.content_distance, config.march.near):
         print(f"  odd: {oddity}", flush=True)
     run = Run(output)
-    with run.only_writer():
+    with training_page(page, scene, trainer) as session, run.only_writer():
         Run.require_free(output, overwrite)  # once more, now that nobody else begins there
         folder = None if masks is None else str(masks.resolve())
         distance = trainer.content_distance
         run.create(trained, _absolute(source), downscale, distance, config, folder)
-        return _train(run, scene, trainer)
+        return _train(run, scene, trainer, session)
 
 
 def _resume(
@@ -239,13 +249,14 @@ def _resume(
     masks: Path | None,
     images: Place,
     changed: Callable[[TrainConfig], TrainConfig],
+    page: PageOptions | None,
 ) -> int:
     """Train from the last checkpoint on."""
     from warpnerf.training.run import Run
 
     Run(folder).read_config()
     with Run(folder).only_writer():
-        return _go_on(Run(folder), moved, masks, images, changed)
+        return _go_on(Run(folder), moved, masks, images, changed, page)
 
 
 def _go_on(
@@ -254,6 +265,7 @@ def _go_on(
     masks: Path | None,
     images: Place,
     changed: Callable[[TrainConfig], TrainConfig],
+    page: PageOptions | None,
 ) -> int:
     from warpnerf.training.trainer import Trainer
 
@@ -271,9 +283,10 @@ def _go_on(
         if new != old:
             print(f"  note: {name} {new} instead of {old}: sums are rounded in another order")
     print(f"  going on after step {trainer.steps_done}")
-    run.rewind_log(trainer.steps_done)
-    del state  # the trainer has copies
-    return _train(run, scene, trainer)
+    with training_page(page, scene, trainer) as session:
+        run.rewind_log(trainer.steps_done)
+        del state  # the trainer has copies
+        return _train(run, scene, trainer, session)
 
 
 def _read(
@@ -294,8 +307,9 @@ def _split_to_look_at(scene: Scene) -> str:
     return "test" if scene.splits.get("test") else "train"
 
 
-def _train(run: Run, scene: Scene, trainer: Trainer) -> int:
+def _train(run: Run, scene: Scene, trainer: Trainer, session: Session | None) -> int:
     """Train to the end, or until asked to stop; look at the test views."""
+    between = None if session is None else session.after_update
     with StopRequest() as stop:
         try:
             with ProgressBar("first step") as bar:
@@ -304,7 +318,7 @@ def _train(run: Run, scene: Scene, trainer: Trainer) -> int:
                     run.log(progress)
                     bar.report(progress.fraction, _text(progress))
 
-                trainer.run(on_progress, run.save_checkpoint, lambda: stop.asked)
+                trainer.run(on_progress, run.save_checkpoint, lambda: stop.asked, between)
         except FloatingPointError as error:
             kept = "Nothing was saved before."
             if run.last_step is not None:
@@ -316,6 +330,8 @@ def _train(run: Run, scene: Scene, trainer: Trainer) -> int:
             return stopped.exit_code
         if trainer.fraction >= 1.0:
             run.save_field(trainer.field())
+    if session is not None:
+        session.notify("The training has ended", f"warpnerf view {run.folder} shows what it left.")
     if stop.exit_code is not None:
         step = trainer.steps_done
         saved = f"stopped and saved after step {step}; go on with: {run.resume_command}"
@@ -431,6 +447,7 @@ def main(arguments: list[str] | None = None) -> int:
                 "eval": eval_command,
                 "render": render_command,
                 "export": export_command,
+                "view": view_command,
                 "check": check_command,
                 "warmup": warmup_command,
             },

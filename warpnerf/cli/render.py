@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, cast, get_args
 
 import tyro
 
@@ -12,8 +12,12 @@ from warpnerf.checks import InputError, cannot_write, require_positive
 from warpnerf.cli.progress import ProgressBar
 
 if TYPE_CHECKING:
+    from warpnerf.media.recorded_path import RecordedPath
     from warpnerf.scenes.camera import Camera
     from warpnerf.scenes.scene import Scene
+
+SECONDS = 8.0
+"""Length of a video along a path that has no length of its own."""
 
 MAX_FRAMES = 100_000
 """An hour at 25 frames per second, and a little more."""
@@ -22,12 +26,12 @@ MAX_FRAMES = 100_000
 def render_command(
     folder: tyro.conf.Positional[Path],
     /,
-    path: Literal["auto", "orbit", "through", "back"] = "auto",
+    path: Annotated[str, tyro.conf.arg(metavar="{auto,orbit,through,back}|FILE.json")] = "auto",
     stills: Literal["test", "train", "val", "all"] | None = None,
     output: Path | None = None,
     size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="WIDTH HEIGHT")] = None,
     fps: float = 30.0,
-    seconds: float = 8.0,
+    seconds: float | None = None,
     distance: float | None = None,
     depths: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="NEAR FAR")] = None,
     scene: str | None = None,
@@ -40,13 +44,14 @@ def render_command(
         folder: Output folder of a training run.
         path: orbit: around what the cameras look at. through: through the training cameras.
             back: the same, backing away from them, where floaters show. auto: orbit where the
-            cameras look at one thing, else through.
+            cameras look at one thing, else through. FILE.json: a path recorded in the viewer.
         stills: Render the views of this split as PNG pictures instead of a video.
         output: FILE.mp4, FILE.gif, or a new folder for PNG frames; for stills a folder. By default
-            PATH.mp4 (video.mp4 for auto) or stills/ in the run's folder.
-        size: Of the colour picture, pixels; by default as the photographs.
+            PATH.mp4 (video.mp4 for auto, and for a recorded path its file's name) or stills/ in
+            the run's folder.
+        size: Of the colour picture, pixels; by default as the photographs, or as recorded.
         fps: Frames per second.
-        seconds: Length of the video.
+        seconds: Length of the video; by default 8, or as recorded.
         distance: How far `back` backs away, scene units; by default half the content distance.
         depths: What gets the first and the last colour, scene units; by default what is seen.
         scene: Where the run's photographs are now, if they have moved.
@@ -64,10 +69,11 @@ def render_command(
         raise InputError("--distance is how far --path back backs away; give both or neither.")
     if stills is not None and path != "auto":
         raise InputError("--stills renders the views of a split, along no path; give one of them.")
+    recorded = _recorded(path)
     run = Run(folder)
     config = run.read_config()
     if stills is None:
-        name = "video" if path == "auto" else path
+        name = "video" if path == "auto" else path if recorded is None else Path(path).stem
         target, note = video_file(output or folder / f"{name}.mp4", fps)
         if note:
             print(note, flush=True)
@@ -77,17 +83,23 @@ def render_command(
     field, notes = run.load_field(device, threads)
     for note in notes:
         print(f"warpnerf: note: {note}", file=sys.stderr)
-    views = load_scene(scene or config.scene, downscale=config.downscale, images="files")
 
     cameras: list[Camera]
-    if stills is None:
-        from warpnerf.media.camera_path import camera_path, natural_path
+    if recorded is not None:
+        length = recorded.seconds or SECONDS  # one place only takes no time
+        n_frames = _n_frames(fps, length if seconds is None else seconds)
+        cameras = recorded.cameras(n_frames, size)
+        what = f"{n_frames} frames, path {path}"
+    elif stills is None:
+        from warpnerf.media.camera_path import PathKind, camera_path, natural_path
 
-        kind = natural_path(views) if path == "auto" else path
-        n_frames = _n_frames(fps, seconds)
+        views = load_scene(scene or config.scene, downscale=config.downscale, images="files")
+        kind = natural_path(views) if path == "auto" else cast(PathKind, path)
+        n_frames = _n_frames(fps, SECONDS if seconds is None else seconds)
         cameras = camera_path(views, kind, n_frames, size=size, distance=distance)
         what = f"{n_frames} frames, path {kind!r}"
     else:
+        views = load_scene(scene or config.scene, downscale=config.downscale, images="files")
         named = _still_cameras(views, stills, size)
         cameras = list(named.values())
         what = f"{len(cameras)} views"
@@ -112,6 +124,21 @@ def render_command(
             raise cannot_write(f"--output {target}", error) from error
     print(f"wrote {target}")
     return 0
+
+
+def _recorded(path: str) -> RecordedPath | None:
+    """The path in a file; None where the name of a kind of path is given."""
+    from warpnerf.media.camera_path import PathKind
+    from warpnerf.media.recorded_path import read_path
+
+    kinds = ("auto", *get_args(PathKind))
+    if path in kinds:
+        return None
+    if not path.endswith(".json"):
+        raise InputError(
+            f"--path {path} is none of {', '.join(kinds)}, and no FILE.json that the viewer saved."
+        )
+    return read_path(path)
 
 
 def _n_frames(fps: float, seconds: float) -> int:

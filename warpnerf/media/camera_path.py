@@ -212,10 +212,10 @@ def _through(cameras: Sequence[Camera], n_frames: int, content_distance: float) 
     if len(keys) < 2:
         raise InputError("a path through the cameras needs 2 of them; use --path orbit.")
     fine = np.linspace(0.0, len(keys) - 1.0, 64 * len(keys))
-    poses = _spline(keys, fine)
+    poses = spline(keys, fine)
     travelled = np.cumsum(_between(poses[:-1], poses[1:], content_distance))
     even = np.linspace(0.0, travelled[-1], n_frames)
-    return list(_spline(keys, np.interp(even, [0.0, *travelled], fine)))
+    return list(spline(keys, np.interp(even, [0.0, *travelled], fine)))
 
 
 def _in_order(poses: np.ndarray, content_distance: float) -> np.ndarray:
@@ -241,7 +241,7 @@ def _between(a: np.ndarray, b: np.ndarray, content_distance: float) -> np.ndarra
     )
 
 
-def _spline(keys: np.ndarray, at: np.ndarray) -> np.ndarray:
+def spline(keys: np.ndarray, at: np.ndarray) -> np.ndarray:
     """The Catmull-Rom spline through poses [k, 3, 4], at places [n] from 0 to k - 1; [n, 3, 4].
 
     Rotations are those nearest to its own, which are none: U V^T of the singular values.

@@ -196,6 +196,12 @@ def require_memory(size: tuple[int, int, int], n_floats: int, device: wp.Device)
         )
 
 
+def _cells(grid: VoxelGrid) -> tuple[int, int, int]:
+    """MX, MY, MZ: a cell is two voxels wide, or a little more."""
+    x, y, z = (max(1, (n - 1) // 2) for n in grid.size)
+    return x, y, z
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FreeCells:
     """Which cells of a grid's domain hold nothing visible: distances to the nearest that does."""
@@ -234,7 +240,7 @@ class FreeCells:
             sampler: Where steps lie.
         """
         device = workers.device
-        size = tuple(max(1, (n - 1) // 2) for n in grid.size)
+        size = _cells(grid)
         span = 1 if device.is_cuda else size[2]  # a core takes a row
 
         def launch(kernel: wp.Kernel, n: int, *arguments: Any) -> None:
@@ -264,7 +270,6 @@ class FreeCells:
             highest = joined
         n, cells = math.prod(size), wp.vec3i(*size)
         distance = wp.empty(n, dtype=wp.uint8, device=device)
-        spread = wp.empty_like(distance)
         launch(
             occupancy.mark_occupied_kernel(sampler),
             n,
@@ -277,10 +282,49 @@ class FreeCells:
             alpha_min,
             distance,
         )
+        return FreeCells._around(distance, size, grid.border, workers)
+
+    @staticmethod
+    def _around(
+        distance: wp.array, size: tuple[int, int, int], border: float, workers: Workers
+    ) -> FreeCells:
+        """From which cells are occupied, 0 there and the farthest distance elsewhere."""
+        span = 1 if workers.device.is_cuda else size[2]  # a core takes a row
+        n, spread = math.prod(size), wp.empty_like(distance)
         for axis in range(3):
-            launch(occupancy.spread_distance, n, cells, axis, distance, spread)
+            workers.launch(
+                occupancy.spread_distance,
+                n // span,
+                *(span, wp.vec3i(*size), axis, distance, spread),
+                chunk=max(1, NODES // span),
+            )
             distance, spread = spread, distance
-        return FreeCells(distance=distance, size=(size[0], size[1], size[2]), border=grid.border)
+        return FreeCells(distance=distance, size=size, border=border)
+
+    def cropped(
+        self, grid: VoxelGrid, low: np.ndarray, high: np.ndarray, workers: Workers
+    ) -> FreeCells:
+        """The same, and free is what does not lie wholly in a box; no array of this one changes.
+
+        Args:
+            grid: That these cells belong to.
+            low: [3] lower corner, scene units, within the grid's box.
+            high: [3] upper corner.
+            workers: Where to work.
+        """
+        size = _cells(grid)
+        occupied = self.distance.numpy() == 0
+        occupied = np.ones(size, bool) if self.size != size else occupied.reshape(size)
+        share = np.stack([low, high] - grid.box_min) / (grid.box_max - grid.box_min)
+        # The box's share of the domain, whose border lies around it.
+        share = 0.5 + (share - 0.5) / (1.0 + grid.border)
+        for axis, n in enumerate(size):
+            edges = np.arange(n + 1) / n
+            inside = (share[0, axis] <= edges[:-1] + 1e-6) & (edges[1:] - 1e-6 <= share[1, axis])
+            occupied = occupied & np.expand_dims(inside, [a for a in range(3) if a != axis])
+        distance = np.where(occupied, 0, int(occupancy.FAR) + 1).astype(np.uint8)
+        there = wp.array(distance.ravel(), dtype=wp.uint8, device=workers.device)
+        return FreeCells._around(there, size, grid.border, workers)
 
     @cached_property
     def struct(self) -> FreeSpace:

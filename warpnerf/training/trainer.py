@@ -124,8 +124,11 @@ class Trainer:
         on_progress: Callable[[Progress], None] | None = None,
         on_checkpoint: Callable[[TrainingState], None] | None = None,
         stop: Callable[[], bool] = lambda: False,
+        between: Callable[[], None] | None = None,
     ) -> Progress:
         """Update until the training is done, or ``stop`` says so; callbacks are those of ``train``.
+
+        ``between`` is called after each update, and its time is not counted as training.
 
         Raises:
             FloatingPointError: The loss, or a value in the grid, is no longer a finite number.
@@ -133,6 +136,10 @@ class Trainer:
         saved_step, saved_at = self.steps_done, time.monotonic()
         while self.fraction < 1.0 and not stop():
             self.update()
+            if between is not None and self._started is not None:
+                began = time.perf_counter()
+                between()
+                self._started += time.perf_counter() - began
             if self.report_due:
                 progress = self.report()
                 if on_progress is not None:

@@ -1,0 +1,107 @@
+"""Look at trained fields: one, or two beside each other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from warpnerf.checks import InputError
+from warpnerf.media.filming import depth_range
+from warpnerf.rendering.field import Field
+from warpnerf.scenes.load import load_scene
+from warpnerf.scenes.scene import Scene
+from warpnerf.training.run import Run
+from warpnerf.viewer.painter import Subject
+from warpnerf.viewer.server import require_viser
+from warpnerf.viewer.session import Session
+
+
+def view(
+    *shown: Field | str | Path,
+    scene: Scene | None = None,
+    host: str = "127.0.0.1",
+    port: int | None = None,
+    device: str = "cpu",
+    threads: int | None = None,
+) -> None:
+    """Serve a page in which fields are looked at, until interrupted; print its address.
+
+    Args:
+        shown: A field or the folder of a run; or two, in the same coordinates, to be compared.
+        scene: Its training cameras are shown; None: those of the first run's scene.
+        host: Name or address of this machine to listen at. Any but 127.0.0.1 lets others in.
+        port: None: 8080, or the next that is free; 0: any that is free.
+        device: For runs: cpu, cuda, cuda:1, ...
+        threads: For runs, CPU threads; None: one per usable core.
+
+    Raises:
+        InputError: viser is missing, a folder holds no field, or host and port cannot be listened
+            at.
+    """
+    with open_view(
+        shown, scene=scene, host=host, port=port, device=device, threads=threads
+    ) as session:
+        print(f"look at {session.address}; Ctrl-C ends it", flush=True)
+        session.serve()
+
+
+def open_view(
+    shown: Sequence[Field | str | Path],
+    *,
+    scene: Scene | str | None,
+    host: str,
+    port: int | None,
+    device: str,
+    threads: int | None,
+) -> Session:
+    """The page of ``view``, not served yet. A scene may also be given by its folder or name.
+
+    Photographs that cannot be read are no reason not to look at a field: a note is printed.
+    """
+    require_viser()
+    if len(shown) not in (1, 2):
+        raise InputError(f"name one field or run, or two to compare, not {len(shown)}.")
+    subjects, distance = [], None
+    for number, what in enumerate(shown, 1):
+        if isinstance(what, Field):
+            subjects.append(_subject(f"field {number}", what))
+            continue
+        run = Run(what)
+        config = run.read_config()
+        field, notes = run.load_field(device, threads)
+        for note in notes:
+            print(f"note: {note}", flush=True)
+        subjects.append(_subject(run.folder.resolve().name, field))
+        if distance is None:
+            distance = config.content_distance
+            if not isinstance(scene, Scene):
+                scene = _scene_of(scene or config.scene, config.downscale)
+    assert not isinstance(scene, str)
+    first = subjects[0].field()
+    if scene is not None:
+        distance = distance or scene.content_distance
+    depths = None if scene is None else depth_range(first, scene.training_cameras)
+    half = 0.5 * float(np.linalg.norm(first.grid.box_max - first.grid.box_min))
+    return Session(
+        subjects,
+        scene,
+        content_distance=distance or half,
+        depths=depths,
+        host=host,
+        port=port,
+    )
+
+
+def _subject(name: str, field: Field) -> Subject:
+    return Subject(name=name, field=lambda: field)
+
+
+def _scene_of(source: str, downscale: int) -> Scene | None:
+    print(f"reading {source}", flush=True)
+    try:
+        return load_scene(source, downscale=downscale, images="files")
+    except InputError as error:
+        print(f"note: shown without its photographs: {error} Name them by --scene.", flush=True)
+        return None
