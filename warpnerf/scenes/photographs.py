@@ -19,7 +19,7 @@ from typing import Literal
 import numpy as np
 
 from warpnerf.checks import InputError
-from warpnerf.runtime.memory import available_memory, usable_cores
+from warpnerf.runtime.memory import available_memory, lies_in_memory, usable_cores
 from warpnerf.scenes.images import box_filter, read_image
 from warpnerf.scenes.pixel_file import PixelFile
 
@@ -168,6 +168,8 @@ def keep(
     note = f"photographs on disk: {_gib(needed)} in {folder}, removed at the end"
     if keeping.place == "auto" and available is not None:
         note += f"; {_gib(available)} of memory are free"
+    if lies_in_memory(folder):
+        note += "; but that folder lies in memory itself (tmpfs): choose one on a disk"
     return Kept(images=[*kept], see_through=see_through, notes=(note,))
 
 
