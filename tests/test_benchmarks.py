@@ -288,7 +288,9 @@ def test_footprint(tmp_path):
 def test_photos_on_disk(tmp_path):
     options = ("--photographs", "12", "--size", "200", "150", "--steps", "30", "--model", "rgb")
     record, printed = run(
-        "photos_on_disk.py", tmp_path / "record.json", *options, "--rounds", "3", "--updates", "2"
+        "photos_on_disk.py",
+        tmp_path / "record.json",
+        *(*options, "--in-turns", "5", "--rounds", "3", "--updates", "2"),
     )
     assert record["decoded_bytes"] == 12 * 200 * 150 * 3
     assert is_interval(record["disk_over_memory"])
