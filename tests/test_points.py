@@ -25,6 +25,7 @@ from warpnerf.media.scene_plan import plan_picture
 from warpnerf.scenes.load import load_scene
 from warpnerf.scenes.points import Points, look
 from warpnerf.scenes.scene import Scene
+from warpnerf.training.checkpoint import load_checkpoint, save_checkpoint
 from warpnerf.training.train import train
 from warpnerf.training.trainer import Trainer
 
@@ -281,7 +282,7 @@ def test_training_takes_each_camera_s_distance() -> None:
     np.testing.assert_array_equal(one, values[1])
 
 
-def test_a_resumed_training_keeps_them() -> None:
+def test_a_resumed_training_keeps_them(tmp_path: Path) -> None:
     scene = scene_of_two_distances()
     whole = Trainer(scene, PER_CAMERA)
     whole.run()
@@ -289,6 +290,15 @@ def test_a_resumed_training_keeps_them() -> None:
     half.run(stop=lambda: half.steps_done >= 10)
     state = half.state()
     assert state.content_distances == [2.0, 2.0, 2.0, 6.0, 6.0]
+    file = tmp_path / "state.safetensors"
+    save_checkpoint(file, replace(state, content_distances=None))
+    with pytest.raises(InputError, match="content distances of cameras are not as its config"):
+        load_checkpoint(file)
+    save_checkpoint(file, state)
+    state = load_checkpoint(file)
+    fewer = replace(state, content_distances=[2.0])
+    with pytest.raises(InputError, match="has 1 content distances, but tiny 5 training views"):
+        Trainer(scene, PER_CAMERA, fewer)
     anew = replace(scene, content_distances=scene.content_distances * 1.001)
     resumed = Trainer(anew, PER_CAMERA, state)
     resumed.run()
