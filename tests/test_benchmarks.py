@@ -304,7 +304,7 @@ def test_extents(tmp_path):
     options = ("room-scan", "--views", "9", "--steps", "20", "--voxels", "8000", "--threads", "1")
     record, printed = run("extents.py", tmp_path / "record.json", *options)
     rows = {row["extent"]: row for row in record["rows"]}
-    assert list(rows) == ["cameras", "points", "per camera"]
+    assert list(rows) == ["cameras", "coarse", "points", "per camera"]
     assert rows["cameras"]["longest_edge"] < 1.5  # a guess
     for extent in ("points", "per camera"):
         assert 5.0 < rows[extent]["longest_edge"] < 6.0  # the room's
