@@ -5,8 +5,8 @@
 Makes a scene of generated JPEGs in a temporary folder. First `warpnerf train --images disk` runs as
 users run it, and the most memory of its own that it takes is read from the system: pages that no
 file holds (RssAnon), and all pages, those of files included (VmHWM). Then, in this process, two
-trainings that differ in where their photographs are take turns of an update each, as long as memory
-holds both; a round's ratio is of the time for as many updates. Prints these and writes
+trainings that differ in where their photographs are take turns, on so few of them that memory holds
+both; a round's ratio is of the time for as many updates. Prints these and writes
 benchmarks/results/photos_on_disk_<device>.json.
 """
 
@@ -40,8 +40,9 @@ def main() -> None:
     parser.add_argument("--photographs", type=int, default=200)
     parser.add_argument("--size", type=int, nargs=2, default=(4000, 3000), help="width, height")
     parser.add_argument("--steps", type=int, default=300, help="of the training that is watched")
-    parser.add_argument("--rounds", type=int, default=15)
-    parser.add_argument("--updates", type=int, default=10, help="of each side in a round")
+    parser.add_argument("--in-turns", type=int, default=60, help="photographs of those in turns")
+    parser.add_argument("--rounds", type=int, default=31)
+    parser.add_argument("--updates", type=int, default=5, help="of each side in a round")
     parser.add_argument("--folder", type=Path, help="for the scene; there has to be room on disk")
     add_model(parser)
     arguments = parser.parse_args()
@@ -52,7 +53,8 @@ def main() -> None:
         write_scene(folder / "scene", arguments.photographs, *arguments.size)
         decoded = 3 * arguments.photographs * arguments.size[0] * arguments.size[1]
         watched = watch(folder, arguments)
-        ratios = race(folder / "scene", arguments)
+        write_scene(folder / "fewer", arguments.in_turns, *arguments.size)
+        ratios = race(folder / "fewer", arguments)
     print(f"decoded                {decoded / 2**30:6.2f} GiB")
     print(f"memory of its own      {(watched['anonymous'] or 0) / 2**30:6.2f} GiB")
     print(f"with pages of files    {(watched['resident'] or 0) / 2**30:6.2f} GiB")
@@ -61,6 +63,7 @@ def main() -> None:
         "machine": machine(arguments.device, Workers(arguments.device).count),
         "model": arguments.model,
         "photographs": arguments.photographs,
+        "in_turns": arguments.in_turns,
         "size": list(arguments.size),
         "steps": arguments.steps,
         "decoded_bytes": decoded,

@@ -288,7 +288,9 @@ def test_footprint(tmp_path):
 def test_photos_on_disk(tmp_path):
     options = ("--photographs", "12", "--size", "200", "150", "--steps", "30", "--model", "rgb")
     record, printed = run(
-        "photos_on_disk.py", tmp_path / "record.json", *options, "--rounds", "3", "--updates", "2"
+        "photos_on_disk.py",
+        tmp_path / "record.json",
+        *(*options, "--in-turns", "5", "--rounds", "3", "--updates", "2"),
     )
     assert record["decoded_bytes"] == 12 * 200 * 150 * 3
     assert is_interval(record["disk_over_memory"])
@@ -302,7 +304,7 @@ def test_extents(tmp_path):
     options = ("room-scan", "--views", "9", "--steps", "20", "--voxels", "8000", "--threads", "1")
     record, printed = run("extents.py", tmp_path / "record.json", *options)
     rows = {row["extent"]: row for row in record["rows"]}
-    assert list(rows) == ["cameras", "points", "per camera"]
+    assert list(rows) == ["cameras", "coarse", "points", "per camera"]
     assert rows["cameras"]["longest_edge"] < 1.5  # a guess
     for extent in ("points", "per camera"):
         assert 5.0 < rows[extent]["longest_edge"] < 6.0  # the room's

@@ -89,6 +89,19 @@ def test_files_in_a_container_s_memory_count_as_free(
     assert memory.available_memory() == 0
 
 
+def test_folders_in_memory_are_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a" / "b").mkdir(parents=True)
+    mounts = tmp_path / "mounts"
+    mounts.write_text(
+        f"/dev/vda / ext4 rw 0 0\ntmpfs {tmp_path}/a tmpfs rw 0 0\n/dev/b {tmp_path}/c xfs rw 0 0\n"
+    )
+    monkeypatch.setattr(memory, "MOUNTS", mounts)
+    found = {name: memory.lies_in_memory(tmp_path / name) for name in ("a", "a/b", "c", ".")}
+    assert found == {"a": True, "a/b": True, "c": False, ".": False}
+    monkeypatch.setattr(memory, "MOUNTS", tmp_path / "nowhere")
+    assert not memory.lies_in_memory(tmp_path / "a")
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="no such limit there")
 def test_what_the_process_has_is_not_free() -> None:
     code = (

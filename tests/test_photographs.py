@@ -88,13 +88,16 @@ def test_evaluation_reads_the_views_of_its_split_one_by_one(
     assert read == ["000.png", "008.png"]
 
 
-def test_the_file_on_disk_has_no_name(tmp_path: Path) -> None:
+def test_the_file_on_disk_has_no_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "cache"
     folder.mkdir()
     scene = load_scene(mixed_scene(tmp_path / "scene"), images="disk", image_folder=folder)
     assert list(folder.iterdir()) == []
     (note,) = [note for note in scene.notes if "on disk" in note]
-    assert note == f"photographs on disk: 0.0 GiB in {folder}, removed at the end"
+    assert note.startswith(f"photographs on disk: 0.000916 MiB in {folder}, removed at the end")
+    monkeypatch.setattr(photographs, "lies_in_memory", lambda folder: True)
+    notes = load_scene(tmp_path / "scene", images="disk", image_folder=folder).notes
+    assert any("that folder lies in memory itself (tmpfs): choose one on a" in n for n in notes)
     image = scene.views[1].image
     assert not image.flags.writeable and not image.flags.owndata
     expect_random_reads(image)  # nor does that change it
@@ -143,7 +146,7 @@ def test_the_command_says_where_they_are_and_goes_on_anywhere(
     monkeypatch.setattr(photographs, "TELL_EVERY", -1.0)
     assert main([*begin, "--images", "disk"]) == 0
     said = capsys.readouterr().out
-    assert f"photographs on disk: 0.0 GiB in {tmp_path}, removed at the end" in said
+    assert f"MiB in {tmp_path}, removed at the end" in said
     assert "read 7 of 8 photographs" in said
     field = (run / "field.safetensors").read_bytes()
     assert main(["train", "--resume", str(run), "--images", "disk"]) == 0

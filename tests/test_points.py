@@ -25,6 +25,7 @@ from warpnerf.media.scene_plan import plan_picture
 from warpnerf.scenes.load import load_scene
 from warpnerf.scenes.points import Points, look
 from warpnerf.scenes.scene import Scene
+from warpnerf.training.checkpoint import load_checkpoint, save_checkpoint
 from warpnerf.training.train import train
 from warpnerf.training.trainer import Trainer
 
@@ -76,6 +77,15 @@ def test_an_off_centre_principal_point_counts() -> None:
         assert aside.seen_by("a", camera_at(pose, cx=cx))[:, 0] == pytest.approx(seen)
 
 
+def test_a_fisheye_lens_sees_by_the_angle() -> None:
+    pose = look_at((0.0, -3.0, 0.0), (0.0, 0.0, 0.0))
+    angles = np.radians([0.0, 20.0, 40.0, 70.0, 80.0])
+    around = np.stack([np.sin(angles), np.cos(angles) - 3.0, 0.0 * angles], axis=1)
+    wide = camera_at(pose, fx=3.0, fy=3.0, fisheye=True)  # half the picture is 76 degrees
+    points = Points(positions=around, tracks=None, source="")
+    np.testing.assert_array_equal(points.seen_by("a", wide), around[:4])
+
+
 def test_distances_are_each_camera_s_own() -> None:
     cameras = [camera_at(pose) for r in (2.0, 4.0, 8.0) for pose in ring(3, radius=r, height=0.0)]
     seen = [ball() for _ in cameras]
@@ -89,7 +99,6 @@ def test_distances_are_each_camera_s_own() -> None:
     assert sight.near_content == pytest.approx(1.5, rel=0.03)
     np.testing.assert_allclose(sight.box_max, 0.53, rtol=0.05)
     np.testing.assert_allclose(sight.box_min, -sight.box_max, rtol=0.05)
-    np.testing.assert_allclose(sight.middle, 0.0, atol=0.05)
 
 
 def test_wrong_points_change_little() -> None:
@@ -111,9 +120,11 @@ def test_wrong_points_change_little() -> None:
 def test_a_camera_counts_as_much_as_another() -> None:
     cameras = [camera_at(pose) for pose in ring(4)]
     aside = np.array([5.0, 0.0, 0.0])
-    seen = [ball(4000, seed=1), *(ball(100, seed=s) + aside for s in (2, 3, 4))]
+    seen = [ball(9000, seed=1), *(ball(100, seed=s) + aside for s in (2, 3, 4))]
     sight = look(cameras, seen, range(4))
-    assert sight is not None and sight.middle[0] > 4.0
+    assert sight is not None and sight.box_max[0] > 5.0  # 3 % of the points are there
+    alone = look(cameras, [ball(100), *seen[:1] * 3], range(4))
+    assert alone is not None and alone.box_max[0] < 1.0
 
 
 def test_a_flat_scene_has_a_box_with_depth() -> None:
@@ -130,6 +141,11 @@ def test_too_few_points_tell_nothing() -> None:
     assert look(cameras, [ball(9)] * 4, range(4)) is None
     assert look(cameras, [ball(9)] * 2 + [ball(10)] * 2, range(3)) is None
     assert look(cameras, [ball(9)] * 2 + [ball(10)] * 2, range(4)) is not None
+    assert look(cameras, [np.zeros((20, 3))] * 4, range(4)) is None  # all in one place
+    at_cameras = [np.tile(camera.position, (20, 1)) for camera in cameras]
+    assert look(cameras, at_cameras, range(4)) is None
+    sight = look(cameras, [*at_cameras[:2], ball(), ball()], range(4))
+    assert sight is not None and (sight.distances > 1.0).all()
 
 
 def by_points(scene: Scene) -> bool:
@@ -153,7 +169,7 @@ def test_a_model_s_points_give_the_extent(tmp_path: Path) -> None:
     write_points(model, ball(5))
     few = load_scene(tmp_path)
     assert not by_points(few) and few.content_distance == without.content_distance
-    assert any("are not used: too few of them" in note for note in few.notes)
+    assert any("are not used: too few tell" in note for note in few.notes)
 
 
 def test_an_object_keeps_the_box_that_the_cameras_see(tmp_path: Path) -> None:
@@ -266,7 +282,7 @@ def test_training_takes_each_camera_s_distance() -> None:
     np.testing.assert_array_equal(one, values[1])
 
 
-def test_a_resumed_training_keeps_them() -> None:
+def test_a_resumed_training_keeps_them(tmp_path: Path) -> None:
     scene = scene_of_two_distances()
     whole = Trainer(scene, PER_CAMERA)
     whole.run()
@@ -274,6 +290,15 @@ def test_a_resumed_training_keeps_them() -> None:
     half.run(stop=lambda: half.steps_done >= 10)
     state = half.state()
     assert state.content_distances == [2.0, 2.0, 2.0, 6.0, 6.0]
+    file = tmp_path / "state.safetensors"
+    save_checkpoint(file, replace(state, content_distances=None))
+    with pytest.raises(InputError, match="content distances of cameras are not as its config"):
+        load_checkpoint(file)
+    save_checkpoint(file, state)
+    state = load_checkpoint(file)
+    fewer = replace(state, content_distances=[2.0])
+    with pytest.raises(InputError, match="has 1 content distances, but tiny 5 training views"):
+        Trainer(scene, PER_CAMERA, fewer)
     anew = replace(scene, content_distances=scene.content_distances * 1.001)
     resumed = Trainer(anew, PER_CAMERA, state)
     resumed.run()

@@ -20,6 +20,8 @@ CONTAINER_USES = (
     ),
 )
 """Likewise, what it uses, and how much of that are files, which make room when it is asked for."""
+MOUNTS = Path("/proc/mounts")
+"""Where Linux says which file system a folder is in."""
 CORE_LIMITS = (
     (Path("/sys/fs/cgroup/cpu.max"),),
     (
@@ -47,6 +49,18 @@ def available_memory() -> int | None:
     left = [_free(), _own_left(), *map(_container_left, CONTAINER_LIMITS, CONTAINER_USES)]
     known = [max(0, n_bytes) for n_bytes in (*left, usable_memory()) if n_bytes is not None]
     return min(known, default=None)
+
+
+def lies_in_memory(folder: Path) -> bool:
+    """Whether files of a folder take memory instead of room on a disk, as in Linux's tmpfs."""
+    try:
+        words = [line.split() for line in MOUNTS.read_text().splitlines()]
+    except OSError:
+        return False
+    kinds = {Path(place): kind for _, place, kind, *_ in words}
+    folder = folder.resolve()
+    mounted = next((path for path in (folder, *folder.parents) if path in kinds), None)
+    return mounted is not None and kinds[mounted] in ("tmpfs", "ramfs")
 
 
 def _free() -> int | None:

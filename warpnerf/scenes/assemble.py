@@ -190,7 +190,7 @@ def assemble(
 def _seen_extent(extent: Extent, points: Points, sight: Sight | None, unbounded: bool) -> Extent:
     """The extent by what cameras see; the box of an object stays what the cameras look at."""
     if sight is None:
-        note = f"points of {points.source} are not used: too few of them are seen by the cameras"
+        note = f"points of {points.source} are not used: too few tell what the cameras see"
         return replace(extent, notes=(*extent.notes, note))
     distance = (
         f"content distance {sight.content_distance:.3g}: median distance of the points of "

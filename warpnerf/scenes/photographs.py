@@ -19,7 +19,7 @@ from typing import Literal
 import numpy as np
 
 from warpnerf.checks import InputError
-from warpnerf.runtime.memory import available_memory, usable_cores
+from warpnerf.runtime.memory import available_memory, lies_in_memory, usable_cores
 from warpnerf.scenes.images import box_filter, read_image
 from warpnerf.scenes.pixel_file import PixelFile
 
@@ -136,12 +136,12 @@ def keep(
     height, width, _ = photographs[0].shape
     need = (
         f"{file}: {len(photographs)} photographs (the first of {width}x{height} pixels) need "
-        f"{_gib(needed)}"
+        f"{_size(needed)}"
     )
     if place == "memory":
         if available is not None and needed > available:
             raise InputError(
-                f"{need}, but {_gib(available)} of memory are free; keep them on disk (--images "
+                f"{need}, but {_size(available)} of memory are free; keep them on disk (--images "
                 f"disk), or use --downscale {_reduction(downscale, needed, available)}."
             )
         images = list(_read_all(photographs))
@@ -151,7 +151,7 @@ def keep(
         free = shutil.disk_usage(folder).free
         if needed > free:
             raise InputError(
-                f"{need}, but {_gib(free)} are free in {folder}; make room there, or use "
+                f"{need}, but {_size(free)} are free in {folder}; make room there, or use "
                 f"--downscale {_reduction(downscale, needed, free)}."
             )
         pixels = PixelFile(folder)
@@ -165,9 +165,11 @@ def keep(
             f"{need} in {folder}, which cannot be written: {error.strerror or error}; make room or "
             "give access there, or use a larger --downscale."
         ) from None
-    note = f"photographs on disk: {_gib(needed)} in {folder}, removed at the end"
+    note = f"photographs on disk: {_size(needed)} in {folder}, removed at the end"
     if keeping.place == "auto" and available is not None:
-        note += f"; {_gib(available)} of memory are free"
+        note += f"; {_size(available)} of memory are free"
+    if lies_in_memory(folder):
+        note += "; but that folder lies in memory itself (tmpfs): choose one on a disk"
     return Kept(images=[*kept], see_through=see_through, notes=(note,))
 
 
@@ -197,5 +199,5 @@ def _reduction(downscale: int, needed: int, room: int) -> int:
     return math.ceil(downscale * math.sqrt(needed / max(room, 1)))
 
 
-def _gib(n_bytes: int) -> str:
-    return f"{n_bytes / 2**30:.1f} GiB"
+def _size(n_bytes: int) -> str:
+    return f"{n_bytes / 2**30:.1f} GiB" if n_bytes >= 2**29 else f"{n_bytes / 2**20:.3g} MiB"

@@ -123,13 +123,14 @@ def look(
         outside: Share of what cameras see that may lie outside the box at each of its faces.
 
     Returns:
-        What they see; None where too few training cameras see points enough to tell.
+        What they see; None where points do not tell it to enough of the training cameras.
     """
     away = [
         np.linalg.norm(points - camera.position, axis=1)
         for camera, points in zip(cameras, seen, strict=True)
     ]
     own = np.array([np.median(a) if len(a) >= FEW else np.nan for a in away])
+    own[own <= 0.0] = np.nan
     if np.isfinite(own[list(training)]).mean() < MIN_SHARE:
         return None
     content_distance = float(np.nanmedian(own[list(training)]))
@@ -143,8 +144,11 @@ def look(
     points = np.concatenate([seen[i] for i in training])[near]
     shares = (outside, 0.5, 1.0 - outside)
     low, middle, high = np.stack([_quantiles(axis, weight[near], shares) for axis in points.T], 1)
+    edges = high - low
+    if edges.max() <= 0.0:  # all in one place
+        return None
     # A facade is flat, its box is not.
-    margin = np.maximum(MARGIN * (high - low), 0.5 * (MIN_EDGE * (high - low).max() - (high - low)))
+    margin = np.maximum(MARGIN * edges, 0.5 * (MIN_EDGE * edges.max() - edges))
     return Sight(
         distances=distances,
         content_distance=content_distance,
