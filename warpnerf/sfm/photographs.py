@@ -5,15 +5,17 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 from PIL import ExifTags, Image
 
 from warpnerf.checks import InputError
+from warpnerf.runtime.memory import usable_cores
 from warpnerf.scenes.contents import NEEDED
 from warpnerf.scenes.files import exists
-from warpnerf.scenes.images import image_size
+from warpnerf.scenes.images import image_size, require_whole_image
 from warpnerf.sfm.config import Lenses
 
 UPRIGHT = {
@@ -48,7 +50,7 @@ class Photograph:
 def read_photographs(
     paths: Sequence[Path], *, lenses: Lenses, masks: Path | None
 ) -> list[Photograph]:
-    """Look at photographs without decoding them.
+    """Look at photographs: whether each is whole, and what it says of its lens.
 
     Args:
         paths: Of photographs.
@@ -60,14 +62,17 @@ def read_photographs(
         One for each path.
 
     Raises:
-        InputError: Too few, one is no photograph, sizes differ where one lens is asked for, or no
-            mask is there, or one of another size.
+        InputError: Too few, one is no whole photograph, sizes differ where one lens is asked for,
+            or no mask is there, or one of another size.
     """
     if len(paths) < NEEDED:
         raise InputError(
             f"{paths[0].parent if paths else 'the folder'}: {len(paths)} photographs are too few: "
             f"poses need at least {NEEDED}, and a good scene 30 or more; take more."
         )
+    # Decoders release the interpreter lock. COLMAP would go on with half a picture.
+    with ThreadPoolExecutor(usable_cores()) as pool:
+        list(pool.map(require_whole_image, paths))
     keys: dict[object, int] = {}
     photographs = []
     for number, path in enumerate(paths):

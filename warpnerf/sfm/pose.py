@@ -22,8 +22,7 @@ from warpnerf.scenes.contents import (
     unread_photographs,
     what_is_there,
 )
-from warpnerf.scenes.files import exists
-from warpnerf.scenes.images import read_image
+from warpnerf.scenes.files import exists, printable
 from warpnerf.sfm import scene_files
 from warpnerf.sfm.config import Lenses, PoseConfig
 from warpnerf.sfm.frames import sharp_frames
@@ -117,10 +116,8 @@ def pose(
             lambda stage, done, of: report(stage, done / max(of, 1), f"{done} of {of}"),
         )
         if "unread" in found:
-            damaged = [p.path for p in photographs if p.path.name in found["unread"]]
-            for path in damaged:
-                read_image(path)  # says what is wrong with it
-            raise InputError(f"{damaged[0]}: COLMAP cannot read it; convert it to JPEG or PNG.")
+            name = printable(found["unread"][0])
+            raise InputError(f"{source}: COLMAP cannot read {name}; save it as JPEG or PNG.")
         if not found["registered"]:
             raise InputError(nothing_placed(source, found, len(photographs)))
         posing = summary(output, photographs, found)
@@ -206,9 +203,9 @@ def _sweep(place: Path, name: str) -> None:
 def _is_alive(process: int) -> bool:
     try:
         os.kill(process, 0)
-    except ProcessLookupError:
+    except (ProcessLookupError, OverflowError):
         return False
-    except (OSError, OverflowError):  # another user's
+    except OSError:  # another user's
         return True
     return True
 
