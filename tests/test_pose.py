@@ -23,6 +23,15 @@ from warpnerf.sfm.pose import is_made_of, pose
 from warpnerf.sfm.summary import Posing
 
 N = 12
+PLY = """ply
+format ascii 1.0
+element vertex 1
+property float x
+property float y
+property float z
+end_header
+0 0 0
+"""
 
 
 class Colmap:
@@ -32,6 +41,7 @@ class Colmap:
         self.job: dict[str, Any] = {}
         self.changes: dict[str, Any] = {}
         self.lost: tuple[str, ...] = ()
+        self.lens: dict[str, Any] = {"model": "SIMPLE_RADIAL"}
 
     def __call__(self, job: dict[str, Any], on_report: Any) -> dict[str, Any]:
         self.job = job
@@ -41,10 +51,10 @@ class Colmap:
         on_report("features", len(names), len(names))
         placed = [name for name in names if name not in self.lost]
         Path(job["model"]).mkdir(parents=True)
-        (Path(job["model"]) / "images.bin").touch()
-        Path(job["points"]).touch()
+        (Path(job["model"]) / "points.bin").touch()
+        Path(job["points"]).write_text(PLY)
         poses = zip(placed, ring(len(placed)), strict=True)
-        lens = {"model": "SIMPLE_RADIAL", "fl_x": 10.0, "fl_y": 10.0, "cx": 4.0, "cy": 3.0}
+        lens = {"fl_x": 10.0, "fl_y": 10.0, "cx": 4.0, "cy": 3.0, **self.lens}
         return {
             "registered": {name: p[:3].tolist() for name, p in poses},
             "cameras": {name: {**lens, "w": 8, "h": 6, "k1": 0.01} for name in placed},
@@ -217,15 +227,27 @@ def test_a_lens_that_few_share_is_a_simple_one(
     assert {p["camera_model"] for p in colmap.job["photographs"]} == {"PINHOLE"}
 
 
+def test_fisheye_lenses_come_through(tmp_path: Path, photos: Path, colmap: Colmap) -> None:
+    colmap.lens = {"model": "OPENCV_FISHEYE", "k3": 0.02, "k4": -0.01}
+    pose(photos, tmp_path / "scene", PoseConfig(camera_model="OPENCV_FISHEYE"))
+    assert {p["camera_model"] for p in colmap.job["photographs"]} == {"OPENCV_FISHEYE"}
+    camera = load_scene(tmp_path / "scene").views[0].camera
+    assert camera.fisheye and (camera.k1, camera.k3, camera.k4) == (0.01, 0.02, -0.01)
+
+
 def test_masks_are_where_colmap_looks_and_the_scene_names_them(
     tmp_path: Path, photos: Path, colmap: Colmap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     masks = tmp_path / "my masks"
     masks.mkdir()
-    Image.new("L", (8, 6), 255).save(masks / "03.png")
+    white = np.zeros((6, 8, 3), np.uint8)
+    white[:, 4:] = 255
+    Image.fromarray(white).save(masks / "03.png")
 
     def checked(job: dict[str, Any], on_report: Any) -> dict[str, Any]:
-        assert [path.name for path in Path(job["masks"]).iterdir()] == ["03.png.png"]
+        (mask,) = Path(job["masks"]).iterdir()
+        assert mask.name == "03.png.png"
+        assert np.asarray(Image.open(mask)).sum() == 6 * 4
         return colmap(job, on_report)
 
     monkeypatch.setattr(module, "estimate", checked)
@@ -233,7 +255,8 @@ def test_masks_are_where_colmap_looks_and_the_scene_names_them(
     frames = json.loads((tmp_path / "scene" / "transforms.json").read_text())["frames"]
     named = {frame["file_path"]: frame.get("mask_path") for frame in frames}
     assert named["images/03.png"] == "masks/03.png" and named["images/04.png"] is None
-    assert (tmp_path / "scene" / "masks" / "03.png").is_file()
+    view = load_scene(tmp_path / "scene").views[3]
+    assert view.mask is not None and np.array_equal(view.mask, white[..., 0] > 0)
 
 
 @pytest.mark.parametrize(

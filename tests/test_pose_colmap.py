@@ -104,6 +104,7 @@ def test_poses_are_those_that_the_photographs_were_taken_from(
     rotation, place = errors(scene)
     assert rotation < 2.0 and place < 0.05
     assert abs(scene.views[0].camera.fx / FOCAL - 1.0) < 0.06
+    assert any("points of sparse/0" in note for note in scene.notes)  # which have tracks
     # Upright: all cameras' horizontal axes lie level.
     assert max(abs(view.camera.c2w[2, 0]) for view in scene.views) < 0.05
     assert all(view.camera.c2w[2, 1] > 0.5 for view in scene.views)

@@ -41,8 +41,8 @@ def pose_command(
             where they are many.
         frames: To take from a video, the sharpest of each of as many equal parts.
         max_image_size: Longer side, pixels, to which photographs are reduced to look for features.
-        masks: Folder of masks NAME.png or NAME.jpg.png; where they are black, nothing is looked
-            for.
+        masks: Folder of masks, named after the photographs; where they are black, nothing is looked
+            for, and nothing will be trained on.
         threads: CPU threads; by default one per usable core.
         overwrite: Replace the posed scene that the output folder holds.
     """
@@ -64,12 +64,13 @@ def pose_command(
     return 0
 
 
-def with_poses(source: str, run: Path, threads: int | None) -> str:
+def with_poses(source: str, run: Path, masks: Path | None, threads: int | None) -> str:
     """Estimate poses before a training, where a source has none and pycolmap is there.
 
     Args:
         source: What is to be trained on.
         run: The run's folder, in which the posed scene is made, or was made before.
+        masks: Folder of masks of the photographs.
         threads: CPU threads; None: one per usable core.
 
     Returns:
@@ -87,7 +88,7 @@ def with_poses(source: str, run: Path, threads: int | None) -> str:
 
     if source.startswith("builtin:") or not is_unposed(Path(source)) or not is_installed():
         return source
-    config, scene, begun = PoseConfig(threads=threads), run / IN_RUN, exists(run)
+    config, scene, begun = PoseConfig(masks=masks, threads=threads), run / IN_RUN, exists(run)
     if is_made_of(scene, Path(source), config):
         print(f"the poses of {source} are in {scene} already", flush=True)
         return str(scene)

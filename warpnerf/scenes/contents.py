@@ -11,6 +11,7 @@ from warpnerf.scenes import llff
 from warpnerf.scenes.blender import SPLITS, split_file
 from warpnerf.scenes.colmap import find_model
 from warpnerf.scenes.files import exists
+from warpnerf.scenes.npz import single_npz
 
 UNREAD_PHOTOGRAPHS = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf")
 """Endings of photographs that phones and cameras write and that are not read."""
@@ -24,7 +25,8 @@ NEEDED = 3
 def holds_scene(folder: Path) -> bool:
     """Whether a folder holds one of the formats that ``load_scene`` reads."""
     files = [*map(split_file, SPLITS[:1]), "transforms.json", llff.FILE]
-    return any(exists(folder / name) for name in files) or find_model(folder) is not None
+    known = any(exists(folder / name) for name in files)
+    return known or find_model(folder) is not None or single_npz(folder) is not None
 
 
 def photographs_in(folder: Path) -> list[Path]:
@@ -39,7 +41,12 @@ def photographs_in(folder: Path) -> list[Path]:
     Raises:
         InputError: The folder cannot be read.
     """
-    return _with_endings(folder, llff.ENDINGS) or _with_endings(folder / "images", llff.ENDINGS)
+    for place in (folder, folder / "images"):
+        found = _with_endings(place, llff.ENDINGS)
+        photographs = [path for path in found if not path.name.startswith("dynamic_mask_")]
+        if photographs:
+            return photographs
+    return []
 
 
 def unread_photographs(folder: Path) -> list[Path]:

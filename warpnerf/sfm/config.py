@@ -9,7 +9,7 @@ from typing import Literal, get_args
 from warpnerf.checks import InputError, require_one_of, require_whole
 
 CameraModel = Literal[
-    "auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"
+    "auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"
 ]
 Matching = Literal["auto", "exhaustive", "sequential"]
 Mapper = Literal["incremental", "global"]

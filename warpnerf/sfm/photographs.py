@@ -14,8 +14,8 @@ from PIL import ExifTags, Image
 from warpnerf.checks import InputError
 from warpnerf.runtime.memory import usable_cores
 from warpnerf.scenes.contents import NEEDED
-from warpnerf.scenes.files import exists
 from warpnerf.scenes.images import image_size, require_whole_image
+from warpnerf.scenes.masks import Mask, masks_of_folder
 from warpnerf.sfm.config import Lenses
 
 UPRIGHT = {
@@ -43,7 +43,7 @@ class Photograph:
     """Photographs with the same number share a lens."""
     up: tuple[int, int]
     """Which way is up in the stored pixels, by EXIF: steps to the right and up."""
-    mask: Path | None = None
+    mask: Mask | None = None
     """Where it is black, nothing is looked for."""
 
 
@@ -56,14 +56,14 @@ def read_photographs(
         paths: Of photographs.
         lenses: Which of them share a lens: those of the same size, camera and focal length by
             EXIF (auto), all (one), or none (each).
-        masks: Folder of NAME.png for photographs NAME.jpg, or NAME.jpg.png as COLMAP has it.
+        masks: Folder of masks, named after the photographs.
 
     Returns:
         One for each path.
 
     Raises:
         InputError: Too few, one is no whole photograph, sizes differ where one lens is asked for,
-            or no mask is there, or one of another size.
+            or no mask is there.
     """
     if len(paths) < NEEDED:
         raise InputError(
@@ -75,7 +75,8 @@ def read_photographs(
         list(pool.map(require_whole_image, paths))
     keys: dict[object, int] = {}
     photographs = []
-    for number, path in enumerate(paths):
+    found = masks_of_folder(masks, [p.name for p in paths]) if masks else [None] * len(paths)
+    for number, (path, mask) in enumerate(zip(paths, found, strict=True)):
         size = image_size(path)
         camera, orientation = _exif(path)
         key = {"auto": (size, camera), "one": "one", "each": number}[lenses]
@@ -85,7 +86,7 @@ def read_photographs(
                 size=size,
                 lens=keys.setdefault(key, len(keys)),
                 up=UPRIGHT.get(orientation, UPRIGHT[1]),
-                mask=None if masks is None else _mask(masks, path, size),
+                mask=mask,
             )
         )
     if lenses == "one":
@@ -97,11 +98,6 @@ def read_photographs(
                 f"{first.path.name} {_shown(first.size)}, and one lens takes photographs of one "
                 "size; use --lenses auto."
             )
-    if masks is not None and all(p.mask is None for p in photographs):
-        raise InputError(
-            f"--masks {masks}: no mask is there for {paths[0].name}, nor for another photograph; "
-            f"name them {paths[0].stem}.png or {paths[0].name}.png."
-        )
     return photographs
 
 
@@ -134,19 +130,6 @@ def _exif(path: Path) -> tuple[tuple[object, ...], int]:
             return tuple(map(str, values)), int(tags.get(ExifTags.Base.Orientation, 1))
     except Exception:  # tags are damaged in more ways than Pillow has names for
         return (), 1
-
-
-def _mask(folder: Path, photograph: Path, size: tuple[int, int]) -> Path | None:
-    for name in (f"{photograph.stem}.png", f"{photograph.name}.png"):
-        path = folder / name
-        if exists(path):
-            if image_size(path) != size:
-                raise InputError(
-                    f"{path}: has {_shown(image_size(path))} pixels, but {photograph.name} "
-                    f"{_shown(size)}; make the mask as large."
-                )
-            return path
-    return None
 
 
 def _shown(size: tuple[int, int]) -> str:

@@ -13,6 +13,8 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+from PIL import Image
+
 from warpnerf.checks import InputError
 from warpnerf.runtime.memory import usable_cores
 from warpnerf.scenes.contents import (
@@ -23,6 +25,7 @@ from warpnerf.scenes.contents import (
     what_is_there,
 )
 from warpnerf.scenes.files import exists, printable
+from warpnerf.scenes.masks import read_mask
 from warpnerf.sfm import scene_files
 from warpnerf.sfm.config import Lenses, PoseConfig
 from warpnerf.sfm.frames import sharp_frames
@@ -105,7 +108,7 @@ def pose(
         photographs = read_photographs(paths, lenses=lenses, masks=config.masks)
         in_scene = {
             **_into_scene([p.path for p in photographs], IMAGES, prepared, output),
-            **_into_scene([p.mask for p in photographs if p.mask], MASKS, prepared, output),
+            **_into_scene([p.mask.path for p in photographs if p.mask], MASKS, prepared, output),
         }
         matching = config.matching
         if matching == "auto":
@@ -239,7 +242,10 @@ def _job(
     work = prepared.absolute() / WORK
     for p in photographs:
         if p.mask is not None:
-            put_into(work / MASKS, p.mask, f"{p.path.name}.png")
+            width, height = p.size
+            counts = read_mask(p.mask, width=width, height=height, downscale=1)
+            (work / MASKS).mkdir(exist_ok=True)
+            Image.fromarray(counts).save(work / MASKS / f"{p.path.name}.png")
     return {
         "images": str(photographs[0].path.parent.absolute()),
         "work": str(work),
@@ -302,7 +308,7 @@ def _write(
     text = scene_files.transforms_text(
         poses={in_scene[p.path]: found["registered"][p.path.name] for p in placed},
         cameras={in_scene[p.path]: found["cameras"][p.path.name] for p in placed},
-        masks={in_scene[p.path]: in_scene[p.mask] for p in placed if p.mask},
+        masks={in_scene[p.path]: in_scene[p.mask.path] for p in placed if p.mask},
     )
     (prepared / scene_files.TRANSFORMS).write_text(text, encoding="utf-8")
     written = [

@@ -29,7 +29,8 @@ SUMMARY = "pose.json"
 IN_RUN = "scene"
 """Folder of a run that was given photographs without poses, for the scene made of them."""
 
-LENS_KEYS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
+LENS_KEYS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2")
+FISHEYE = "OPENCV_FISHEYE"
 
 
 class Record(msgspec.Struct):
@@ -82,10 +83,13 @@ def transforms_text(
 
     Args:
         poses: Camera to world, [3, 4], OpenGL axes, by the file path of each photograph.
-        cameras: Size, focal lengths, centre and distortion, in pixels, by the same.
+        cameras: Model, size, focal lengths, centre and distortion by the same, in pixels; all of
+            them fisheye lenses, or none.
         masks: File paths of masks by the same, where there are any.
     """
-    lenses = {path: {key: cameras[path].get(key, 0.0) for key in LENS_KEYS} for path in poses}
+    fisheye = all(camera["model"] == FISHEYE for camera in cameras.values())
+    keys = (*LENS_KEYS, *(("k3", "k4") if fisheye else ("p1", "p2")))
+    lenses = {path: {key: cameras[path].get(key, 0.0) for key in keys} for path in poses}
     different = {json.dumps(lens) for lens in lenses.values()}
     frames = []
     for path, pose in sorted(poses.items()):
@@ -96,7 +100,8 @@ def transforms_text(
             frame["mask_path"] = masks[path]
         frames.append(frame | {"transform_matrix": [*pose, [0.0, 0.0, 0.0, 1.0]]})
     shared = json.loads(different.pop()) if len(different) == 1 else {}
-    content = {"camera_model": "OPENCV", **shared, "ply_file_path": POINTS, "frames": frames}
+    content: dict[str, Any] = {"camera_model": FISHEYE if fisheye else "OPENCV"}
+    content |= {**shared, "ply_file_path": POINTS, "frames": frames}
     return json.dumps(content, indent=1) + "\n"
 
 
