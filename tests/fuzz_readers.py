@@ -2,8 +2,8 @@
 
     python tests/fuzz_readers.py --seconds 600 [--seed 0]
 
-A mutant may raise nothing but InputError, take no longer than ``LIMIT``, and no more memory than ten
-times the file besides what the whole scene takes. What fails is printed with its seed, by which
+A mutant may raise nothing but InputError, take no longer than ``LIMIT``, and no more memory than
+ten times the file besides what the whole scene takes. What fails is printed with its seed, by which
 ``--only FORMAT --seed SEED --seconds 0`` does it again.
 """
 

@@ -10,7 +10,7 @@ from typing import IO, Literal
 import numpy as np
 
 from warpnerf.checks import InputError
-from warpnerf.scenes.files import require_regular_file
+from warpnerf.scenes.files import printable, require_regular_file
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ def read_header(stream: IO[bytes], what: str) -> Header:
         read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
         shape, fortran, dtype = read(stream)
     except Exception as error:  # parsers of Python run over it, with errors of all kinds
-        text = str(error).partition("\n")[0][:100]
+        text = printable(str(error).partition("\n")[0][:100])
         raise InputError(f"{what}: is not readable as an array ({text}); save it again.") from None
     if dtype.kind not in "fiu":
         raise InputError(

@@ -266,8 +266,8 @@ def _lens(file: Path, number: int, camera: _Camera, photograph: Path, reduced: b
     place = f"camera {number}"
     if camera.model not in PARAMETERS:
         raise InputError(
-            f"{file}: {place}: the lens {camera.model} is not modelled; undistort the images to a "
-            "pinhole camera (colmap image_undistorter)."
+            f"{file}: {place}: the lens {printable(camera.model[:40])} is not modelled; undistort "
+            "the images to a pinhole camera (colmap image_undistorter)."
         )
     names = PARAMETERS[camera.model]
     if len(camera.parameters) != len(names):
