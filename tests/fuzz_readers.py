@@ -97,7 +97,7 @@ def llff(folder: Path) -> Path:
 
 def transforms(folder: Path) -> Path:
     content = write_transforms(folder)
-    extra = {"camera_model": "OPENCV", "k1": 0.01, "train_filenames": ["images/001.png"]}
+    extra = {"camera_model": "OPENCV", "k1": 0.01, "test_filenames": ["images/001.png"]}
     save(folder / "transforms.json", content | extra)
     return folder / "transforms.json"
 
@@ -216,7 +216,7 @@ class Target:
         self.name, self.folder = name, folder
         self.file = FORMATS[name](folder)
         self.raw = self.file.read_bytes()
-        self.load()  # imports, caches
+        assert self.load(), f"the scene of {name} is refused"
         self.usual = self.peak()
 
     def load(self) -> bool:
