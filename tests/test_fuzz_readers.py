@@ -8,8 +8,10 @@ import pytest
 from fuzz_readers import FORMATS, Target
 
 FOUND = {
-    "llff": (213, 235),  # a quotient that overflows; a header that Python cannot take apart
+    # A quotient that overflows, a header that Python cannot take apart, one of a gigabyte.
+    "llff": (213, 235, 5054),
     "ply-binary": (226,),  # a signalling NaN
+    "colmap-images.txt": (5619,),  # a place at infinity
     "colmap-cameras.txt": (255,),  # a lens's name that would steer a terminal
 }
 """Seeds of mutants that were not refused as they should have been."""
@@ -19,7 +21,7 @@ FOUND = {
 def test_a_mutant_loads_or_is_refused_in_a_sentence(tmp_path: Path, name: str) -> None:
     target = Target(name, tmp_path / "scene")
     for seed in (*range(25), *FOUND.get(name, ())):
-        target.attempt(seed, memory=seed < 10)
+        target.attempt(seed, memory=seed < 10 or seed > 100)
 
 
 @pytest.mark.parametrize("name", ["transforms", "colmap-images.bin"])
