@@ -220,7 +220,7 @@ def test_a_lens_that_few_share_is_a_simple_one(
     tmp_path: Path, photos: Path, colmap: Colmap
 ) -> None:
     pose(photos, tmp_path / "a")
-    assert {p["camera_model"] for p in colmap.job["photographs"]} == {"OPENCV"}
+    assert {p["camera_model"] for p in colmap.job["photographs"]} == {"RADIAL"}
     pose(photos, tmp_path / "b", PoseConfig(lenses="each"))
     assert {p["camera_model"] for p in colmap.job["photographs"]} == {"SIMPLE_RADIAL"}
     pose(photos, tmp_path / "c", PoseConfig(lenses="each", camera_model="PINHOLE"))
@@ -282,23 +282,36 @@ def test_it_says_who_was_not_placed_and_why(tmp_path: Path, photos: Path, colmap
     colmap.lost = ("01.png", "02.png", "03.png", "04.png")
     colmap.changes = {
         "features": dict.fromkeys((f"{k:02}.png" for k in range(N)), 1000) | {"01.png": 41},
-        "groups": [["00.png"] * 8, ["02.png", "x", "y"]],
-        "links": {"02.png": (90, "03.png"), "04.png": (17, "05.png")},
+        "groups": [["00.png"], ["02.png", "03.png", "04.png", "05.png"], ["01.png", "05.png"]],
+        "links": {"02.png": (90, "03.png")},
     }
     posing = pose(photos, tmp_path / "scene")
     assert posing.registered == N - 4
     assert posing.missing == {
         "01.png": "only 41 features: blurred, dark, or of something plain",
         "02.png": "in a group of 3 that shares too little with the others",
-        "03.png": "shares nothing with any other photograph",
-        "04.png": "shares 17 points with 05.png, too few or too uncertain to place it",
+        "03.png": "in a group of 3 that shares too little with the others",
+        "04.png": "in a group of 3 that shares too little with the others",
     }
     (note,) = posing.notes
     assert note.startswith("the photographs fall into 2 groups that share too little (8, 3)")
     assert "registered 8 of 12 photographs; 321 points" in str(posing)
-    assert "not registered: 04.png: shares 17 points" in str(posing)
+    assert "not registered: 04.png: in a group of 3" in str(posing)
     assert "lens SIMPLE_RADIAL for 8 x 6: focal length 10.0 pixels, k1 0.0100" in str(posing)
     assert len(load_scene(tmp_path / "scene").views) == N - 4
+
+
+def test_it_says_how_little_lonely_photographs_share(
+    tmp_path: Path, photos: Path, colmap: Colmap
+) -> None:
+    colmap.lost = ("03.png", "04.png")
+    colmap.changes = {"links": {"04.png": (17, "05.png")}}
+    posing = pose(photos, tmp_path / "scene")
+    assert posing.missing == {
+        "03.png": "shares nothing with any other photograph",
+        "04.png": "shares 17 points with 05.png, too few or too uncertain to place it",
+    }
+    assert not posing.notes
 
 
 @pytest.mark.parametrize(

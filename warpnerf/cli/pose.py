@@ -31,7 +31,7 @@ def pose_command(
     Args:
         source: Folder of photographs, or a video.
         output: The scene's folder; may be that of the photographs.
-        camera_model: Of the lens, as COLMAP names it; auto: OPENCV, but SIMPLE_RADIAL where fewer
+        camera_model: Of the lens, as COLMAP names it; auto: RADIAL, but SIMPLE_RADIAL where fewer
             than ten photographs share one.
         lenses: Which photographs share a lens. auto: those of one size, camera and focal length by
             EXIF. one: all. each: none.

@@ -21,8 +21,9 @@ class PoseConfig:
     """How poses are estimated."""
 
     camera_model: CameraModel = "auto"
-    """Of the lens, as COLMAP names it; auto: OPENCV, but SIMPLE_RADIAL where fewer than ten
-    photographs share one."""
+    """Of the lens, as COLMAP names it; auto: RADIAL, but SIMPLE_RADIAL where fewer than ten
+    photographs share one. OPENCV also finds a focal length of its own for each direction and
+    tangential distortion, for which the camera must have been turned or moved in all directions."""
     lenses: Lenses = "auto"
     """Which photographs share a lens: those of one size, camera and focal length by EXIF (auto),
     all (one), or none (each)."""

@@ -271,7 +271,7 @@ def _job(
 def _camera_model(asked: str, sharing: int) -> str:
     if asked != "auto":
         return asked
-    return "OPENCV" if sharing >= WELL_COVERED else "SIMPLE_RADIAL"
+    return "RADIAL" if sharing >= WELL_COVERED else "SIMPLE_RADIAL"
 
 
 def _notes(

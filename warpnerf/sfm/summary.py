@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from warpnerf.scenes.contents import NEEDED
 from warpnerf.scenes.files import printable
 from warpnerf.sfm.photographs import Photograph
 
 WELL_COVERED = 10
-"""Photographs from which on a scene, and the eight numbers of an OPENCV lens, are well known."""
+"""Photographs from which on a scene and its lens are well known."""
 
 FEW_FEATURES = 200
 """Below which a photograph is blurred, dark or of something plain."""
@@ -71,11 +72,12 @@ def summary(folder: Path, photographs: Sequence[Photograph], found: Mapping[str,
             f"only {len(photographs)} photographs: space that one or two of them see stays vague; "
             "30 and more are better"
         )
-    groups = [len(group) for group in found["groups"]]
-    if len(groups) > 1:
+    others = _other_groups(found)
+    if others:
+        sizes = ", ".join(str(len(group)) for group in (registered, *others))
         notes.append(
-            f"the photographs fall into {len(groups)} groups that share too little "
-            f"({', '.join(map(str, groups))}), and the largest is used; take some that join them"
+            f"the photographs fall into {len(others) + 1} groups that share too little ({sizes}), "
+            "and the largest is used; take some that join them"
         )
     elif 2 * len(registered) < len(photographs):
         notes.append(
@@ -121,13 +123,19 @@ def _why(name: str, found: Mapping[str, Any]) -> str:
     features = found["features"][name]
     if features < FEW_FEATURES:
         return f"only {features} features: blurred, dark, or of something plain"
-    for group in found["groups"][1:]:
+    for group in _other_groups(found):
         if name in group:
             return f"in a group of {len(group)} that shares too little with the others"
     if name not in found["links"]:
         return "shares nothing with any other photograph"
     shared, other = found["links"][name]
     return f"shares {shared} points with {other}, too few or too uncertain to place it"
+
+
+def _other_groups(found: Mapping[str, Any]) -> list[set[str]]:
+    """Photographs that were placed, but not with the others: models may have some in common."""
+    left = [set(group) - found["registered"].keys() for group in found["groups"]]
+    return [group for group in left if len(group) >= NEEDED]
 
 
 def _lenses(cameras: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
