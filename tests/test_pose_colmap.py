@@ -29,6 +29,16 @@ pytestmark = pytest.mark.skipif(
     reason='needs pycolmap: pip install "warpnerf[sfm]"',
 )
 
+KILLED = """
+import subprocess, warpnerf.sfm.worker
+class Killed(subprocess.Popen):
+    def __init__(self, *arguments, **options):
+        super().__init__(*arguments, **options)
+        self.kill()
+warpnerf.sfm.worker.subprocess.Popen = Killed
+"""
+"""Python that has COLMAP's process killed as soon as it is there."""
+
 N = 12
 FOCAL = 260.0
 
@@ -226,8 +236,20 @@ def test_ctrl_c_leaves_neither_files_nor_a_process(tmp_path: Path, photos: Path,
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_abort_of_colmap_is_told(tmp_path: Path, photos: Path) -> None:
+def test_a_failure_of_colmap_is_told(tmp_path: Path) -> None:
     from warpnerf.sfm.worker import estimate
 
-    with pytest.raises(RuntimeError, match=r"COLMAP ended before .* \(exit code 1\): KeyError"):
+    with pytest.raises(ChildProcessError, match=r"COLMAP failed: KeyError: .*; use other"):
         estimate({"work": str(tmp_path)}, lambda *_: None)
+
+
+def test_a_colmap_that_was_killed_is_one_sentence(tmp_path: Path, photos: Path) -> None:
+    outcome = command(
+        *("pose", photos, "--output", "run"),
+        folder=tmp_path,
+        limit=None,
+        prelude=KILLED,
+    )
+    assert outcome.code == 1 and not outcome.run.exists()
+    assert "error: COLMAP was ended by signal 9, as where memory runs out" in outcome.err
+    assert "Traceback" not in outcome.err

@@ -79,6 +79,7 @@ def pose(
     Raises:
         InputError: A photograph or the video cannot be read, nothing could be placed, ``output``
             is taken, or pycolmap is missing.
+        ChildProcessError: COLMAP failed, or was ended.
     """
     config = config or PoseConfig()
     source, output = Path(source), Path(output)
@@ -186,6 +187,8 @@ def _prepared(output: Path) -> Iterator[Path]:
     try:
         (folder / WORK).mkdir(parents=True)
         yield folder
+    except ChildProcessError:
+        raise
     except OSError as error:
         raise InputError(
             f"--output {output} cannot be written: {error.strerror or error}; make room or give "

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from warpnerf.checks import InputError
+from warpnerf.scenes.files import printable
 
 COUNTED = {"features": "descriptors", "matches": "two_view_geometries"}
 """Stages in which COLMAP does not say how far it is, and the tables that it fills."""
@@ -38,7 +39,7 @@ def estimate(job: dict[str, Any], on_report: Callable[[str, int, int], None]) ->
         What ``mapping.run`` returns.
 
     Raises:
-        RuntimeError: The process failed; the message is its last words.
+        ChildProcessError: The process failed, or was ended.
     """
     with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as words:
         process = subprocess.Popen(
@@ -84,10 +85,18 @@ def estimate(job: dict[str, Any], on_report: Callable[[str, int, int], None]) ->
                 process.stdin.close()
         words.seek(0)
         last = [line for line in words.read().splitlines() if line.strip()][-1:]
-        raise RuntimeError(
-            f"COLMAP ended before it was done (exit code {process.returncode})"
-            + "".join(f": {line[:300]}" for line in last)
+        raise ChildProcessError(_why(process.returncode, last))
+
+
+def _why(code: int, last: list[str]) -> str:
+    """Why COLMAP ended before it was done: a sentence, of its exit code and its last words."""
+    if code < 0:
+        return (
+            f"COLMAP was ended by signal {-code}, as where memory runs out; use a smaller "
+            "--max-image-size, or fewer photographs."
         )
+    said = "".join(f": {printable(line[:300])}" for line in last)
+    return f"COLMAP failed{said}; use other photographs, or another --mapper."
 
 
 def _listen(stream: TextIO, lines: queue.Queue[str]) -> None:
