@@ -43,7 +43,7 @@ def pose_command(
         max_image_size: Longer side, pixels, to which photographs are reduced to look for features.
         masks: Folder of masks, named after the photographs; where they are black, nothing is looked
             for, and nothing will be trained on.
-        threads: CPU threads; by default one per usable core.
+        threads: CPU threads, at most one per usable core, which is the default.
         overwrite: Replace the posed scene that the output folder holds.
     """
     config = PoseConfig(

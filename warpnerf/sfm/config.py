@@ -40,7 +40,7 @@ class PoseConfig:
     masks: Path | None = None
     """Folder of masks; nothing is looked for where they are black."""
     threads: int | None = None
-    """CPU threads; None: one per usable core."""
+    """CPU threads, at most one per usable core, which is the default."""
 
     def __post_init__(self) -> None:
         """Refuse what is none of these.

@@ -203,7 +203,8 @@ def _grow(
 
 
 def _by_size(found: dict[int, Any]) -> list[Any]:
-    return sorted(found.values(), key=lambda model: -model.num_reg_images())
+    models = [model for model in found.values() if model.num_reg_images() >= MIN_MODEL]
+    return sorted(models, key=lambda model: -model.num_reg_images())
 
 
 def _turn_upright(pycolmap: Any, model: Any, up: dict[str, list[int]]) -> None:

@@ -267,7 +267,7 @@ def _job(
         "matching": matching,
         "mapper": config.mapper,
         "max_image_size": config.max_image_size,
-        "threads": config.threads or usable_cores(),
+        "threads": min(config.threads or usable_cores(), usable_cores()),
     }
 
 

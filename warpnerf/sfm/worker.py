@@ -60,21 +60,22 @@ def estimate(job: dict[str, Any], on_report: Callable[[str, int, int], None]) ->
             with suppress(BrokenPipeError):  # it has ended already
                 process.stdin.write(json.dumps(job) + "\n")
                 process.stdin.flush()
-            stage, of = "", 0
+            stage, done, of = "", 0, 0
             while True:
                 try:
                     line = lines.get(timeout=POLL)
                 except queue.Empty:
                     if stage in COUNTED:
-                        on_report(stage, min(_rows(job, COUNTED[stage]), of), of)
+                        done = min(max(done, _rows(job, COUNTED[stage])), of)
+                        on_report(stage, done, of)
                     continue
                 if not line:
                     break
                 content = json.loads(line)
                 if "result" in content:
                     return dict(content["result"])
-                stage, of = content["stage"], content["of"]
-                on_report(stage, content["done"], of)
+                stage, done, of = content["stage"], content["done"], content["of"]
+                on_report(stage, done, of)
             process.wait()
         finally:
             process.kill()
