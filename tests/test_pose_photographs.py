@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -105,6 +106,14 @@ def test_too_few_and_what_is_no_whole_photograph_are_refused(tmp_path: Path) -> 
     (tmp_path / "c.jpg").write_bytes(raw[: len(raw) // 2])
     with pytest.raises(InputError, match=r"c\.jpg: is cut short or damaged"):
         lenses([*paths, tmp_path / "c.jpg"])
+
+
+@pytest.mark.skipif(os.name != "posix", reason="names that others do not allow")
+@pytest.mark.parametrize("name", ["a\nb.jpg", "a\\b.jpg"])
+def test_a_name_that_a_scene_cannot_hold_is_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(InputError, match="a scene's file cannot name it") as error:
+        lenses([photograph(tmp_path / name)] * 3)
+    assert str(error.value).isprintable()
 
 
 def test_files_are_linked_and_copied_where_that_is_not_possible(

@@ -14,6 +14,7 @@ from PIL import ExifTags, Image
 from warpnerf.checks import InputError
 from warpnerf.runtime.memory import usable_cores
 from warpnerf.scenes.contents import NEEDED
+from warpnerf.scenes.files import printable
 from warpnerf.scenes.images import image_size, require_whole_image
 from warpnerf.scenes.masks import Mask, masks_of_folder
 from warpnerf.sfm.config import Lenses
@@ -62,14 +63,20 @@ def read_photographs(
         One for each path.
 
     Raises:
-        InputError: Too few, one is no whole photograph, sizes differ where one lens is asked for,
-            or no mask is there.
+        InputError: Too few, one is no whole photograph or has a name that scenes cannot hold, sizes
+            differ where one lens is asked for, or no mask is there.
     """
     if len(paths) < NEEDED:
         raise InputError(
             f"{paths[0].parent if paths else 'the folder'}: {len(paths)} photographs are too few: "
             f"poses need at least {NEEDED}, and a good scene 30 or more; take more."
         )
+    for path in paths:
+        if not path.name.isprintable() or "\\" in path.name:
+            raise InputError(
+                f"{printable(str(path))}: a scene's file cannot name it; leave out control "
+                "characters and backslashes."
+            )
     # Decoders release the interpreter lock. COLMAP would go on with half a picture.
     with ThreadPoolExecutor(usable_cores()) as pool:
         list(pool.map(require_whole_image, paths))
