@@ -50,18 +50,31 @@ def true_pose(k: int) -> np.ndarray:
     return look_at(eye, (-0.2, 0.0, 0.5))[:3]
 
 
-@pytest.fixture(scope="module")
-def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def write_photographs(
+    folder: Path, poses: list[np.ndarray], *, width: int, height: int, focal: float
+) -> Path:
     from warpnerf.scenes.builtin.room import photograph
 
-    folder = tmp_path_factory.mktemp("room") / "photos"
     folder.mkdir()
-    for k in range(N):
+    for k, c2w in enumerate(poses):
         camera = Camera(
-            width=320, height=240, fx=FOCAL, fy=FOCAL, cx=160.0, cy=120.0, c2w=true_pose(k)
+            width=width,
+            height=height,
+            fx=focal,
+            fy=focal,
+            cx=width / 2,
+            cy=height / 2,
+            c2w=c2w,
         )
         Image.fromarray(photograph(camera, 1)[0]).save(folder / f"{k:02}.png")
     return folder
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("room") / "photos"
+    poses = [true_pose(k) for k in range(N)]
+    return write_photographs(folder, poses, width=320, height=240, focal=FOCAL)
 
 
 def errors(scene: Scene) -> tuple[float, float]:
@@ -173,6 +186,19 @@ def test_nothing_is_found_where_a_mask_is_black(tmp_path: Path, photos: Path) ->
         Image.new("L", (320, 240), 0).save(tmp_path / "masks" / path.name)
     with pytest.raises(InputError, match=r"12 of them show too little \(first: 00.png, 0 features"):
         pose(photos, tmp_path / "scene", PoseConfig(masks=tmp_path / "masks"))
+
+
+@pytest.mark.slow
+def test_a_camera_that_moves_straight_on_is_placed(tmp_path: Path) -> None:
+    """By a second try: the rays of no two photographs open as far as COLMAP asks for at first."""
+    ahead = [
+        look_at((0.9 + 0.01 * k, 0.03 * k - 2.2, 1.3), (0.75, 0.03 * k - 0.2, 1.2))[:3]
+        for k in range(10)
+    ]
+    write_photographs(tmp_path / "photos", ahead, width=480, height=360, focal=390.0)
+    assert pose(tmp_path / "photos", tmp_path / "scene").registered == 10
+    z = load_scene(tmp_path / "scene").views[5].camera.c2w[2, 1]
+    assert z > 0.9
 
 
 # --- Through the command ------------------------------------------------------------------------
