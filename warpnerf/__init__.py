@@ -32,6 +32,9 @@ if TYPE_CHECKING:
     from warpnerf.scenes.camera import Camera
     from warpnerf.scenes.load import load_scene
     from warpnerf.scenes.scene import Scene, View
+    from warpnerf.sfm.config import PoseConfig
+    from warpnerf.sfm.pose import pose
+    from warpnerf.sfm.summary import Posing
     from warpnerf.training.checkpoint import (
         load_checkpoint,
         load_field,
@@ -83,6 +86,9 @@ _HOMES = {
     "Inspection": "evaluation.inspection",
     "inspect": "evaluation.inspection",
     "plan_picture": "media.scene_plan",
+    "PoseConfig": "sfm.config",
+    "Posing": "sfm.summary",
+    "pose": "sfm.pose",
     "Scene": "scenes.scene",
     "View": "scenes.scene",
     "Progress": "training.state",
@@ -131,6 +137,9 @@ __all__ = [  # noqa: RUF022 (grouped by home, as above)
     "Inspection",
     "inspect",
     "plan_picture",
+    "PoseConfig",
+    "Posing",
+    "pose",
     "Scene",
     "View",
     "Progress",

@@ -27,6 +27,7 @@ from warpnerf.cli.machine import (
     write_json,
 )
 from warpnerf.cli.model_options import chosen_model
+from warpnerf.cli.pose import pose_command, with_poses
 from warpnerf.cli.progress import ProgressBar
 from warpnerf.cli.render import render_command
 from warpnerf.cli.view import PageOptions, training_page, view_command
@@ -79,7 +80,8 @@ def train_command(
 
     Args:
         scene: Folder with transforms.json or transforms_train.json; builtin:room or
-            builtin:room-sparse.
+            builtin:room-sparse; photographs without poses or a video, whose poses are then
+            estimated first, as by `warpnerf pose`.
         output: Folder for the configuration, the field, the log, the figures and the pictures.
         resume: Go on with the run in this folder, as it was begun; scene only if it has moved.
         preset: Starting point, by default fast; the options below replace its values.
@@ -219,6 +221,7 @@ def _begin(
         from warpnerf.training.run import Run
 
         Run.require_free(output, overwrite)
+    source = with_poses(source, output, masks, config.threads)
     scene = _read(source, downscale, masks, images, output)
 
     # Not before: these load Warp, and bad input is refused at once.
@@ -443,6 +446,7 @@ def main(arguments: list[str] | None = None) -> int:
             {
                 "demo": demo_command,
                 "inspect": inspect_command,
+                "pose": pose_command,
                 "train": train_command,
                 "eval": eval_command,
                 "render": render_command,

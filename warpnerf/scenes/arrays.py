@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import IO, Literal
 
 import numpy as np
 
 from warpnerf.checks import InputError
-from warpnerf.scenes.files import require_regular_file
+from warpnerf.scenes.files import printable, require_regular_file
+
+MAX_HEADER = 10_000
+"""Bytes of a header, as NumPy's own limit."""
 
 
 @dataclass(frozen=True)
@@ -42,9 +46,13 @@ def read_header(stream: IO[bytes], what: str) -> Header:
         version = np.lib.format.read_magic(stream)
         first = version == (1, 0)
         read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
-        shape, fortran, dtype = read(stream)
+        length = stream.read(2 if first else 4)
+        if int.from_bytes(length, "little") > MAX_HEADER:  # NumPy would make room for all of it
+            raise ValueError("its header is too long")
+        header = stream.read(int.from_bytes(length, "little"))
+        shape, fortran, dtype = read(BytesIO(length + header))
     except Exception as error:  # parsers of Python run over it, with errors of all kinds
-        text = str(error).partition("\n")[0][:100]
+        text = printable(str(error).partition("\n")[0][:100])
         raise InputError(f"{what}: is not readable as an array ({text}); save it again.") from None
     if dtype.kind not in "fiu":
         raise InputError(

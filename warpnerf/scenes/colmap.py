@@ -256,7 +256,8 @@ def _pose(image: _Image, field: str) -> np.ndarray:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
-    position = -rotation.T @ np.array(image.translation)
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused below
+        position = -rotation.T @ np.array(image.translation)
     c2w = np.concatenate([rotation.T * [1.0, -1.0, -1.0], position[:, None]], axis=1)
     return check_pose(c2w.tolist(), field=field)
 
@@ -266,8 +267,8 @@ def _lens(file: Path, number: int, camera: _Camera, photograph: Path, reduced: b
     place = f"camera {number}"
     if camera.model not in PARAMETERS:
         raise InputError(
-            f"{file}: {place}: the lens {camera.model} is not modelled; undistort the images to a "
-            "pinhole camera (colmap image_undistorter)."
+            f"{file}: {place}: the lens {printable(camera.model[:40])} is not modelled; undistort "
+            "the images to a pinhole camera (colmap image_undistorter)."
         )
     names = PARAMETERS[camera.model]
     if len(camera.parameters) != len(names):

@@ -153,6 +153,24 @@ def _divide(total: np.ndarray, count: np.ndarray | int) -> np.ndarray:
     return ((total + divisor // np.uint64(2)) // divisor).astype(np.uint8)
 
 
+def require_whole_image(path: Path) -> None:
+    """Decode an image, as roughly as that can be done, and forget it.
+
+    Args:
+        path: Of the image.
+
+    Raises:
+        InputError: Not a regular file, not a whole image, or of a kind that ``read_image`` refuses.
+    """
+
+    def decode(image: ImageFile.ImageFile) -> None:
+        _check_kind(path, image)
+        image.draft("L", (image.width // 8, image.height // 8))
+        image.load()
+
+    _read(path, decode)
+
+
 def _read(path: Path, look: Callable[[ImageFile.ImageFile], T]) -> T:
     """What something finds in an image, whose defects are all told in one way."""
     require_regular_file(path)

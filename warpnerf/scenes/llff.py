@@ -65,7 +65,8 @@ def load_llff(
     for number, (row, path) in enumerate(zip(rows.astype(np.float64), paths, strict=True)):
         place = f"row {number}"
         matrix = row[:15].reshape(3, 5)
-        down, right, backward, position, (height, width, focal) = matrix.T
+        down, right, backward, position, size = matrix.T
+        height, width, focal = size.tolist()
         if min(height, width, focal) <= 0.0:
             raise InputError(f"{file}: {place}: height, width and focal length must be above 0.")
         pose = np.stack([right, -down, backward, position], axis=1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from pathlib import Path
 from typing import get_args
 
@@ -10,6 +11,7 @@ from warpnerf.checks import InputError, require_one_of
 from warpnerf.scenes import llff
 from warpnerf.scenes.blender import SPLITS, load_blender, split_file
 from warpnerf.scenes.colmap import find_model, load_colmap
+from warpnerf.scenes.contents import VIDEOS, pose_command, what_is_there
 from warpnerf.scenes.files import exists
 from warpnerf.scenes.npz import load_npz, single_npz
 from warpnerf.scenes.photographs import Keeping, Place
@@ -17,9 +19,6 @@ from warpnerf.scenes.scene import Scene
 from warpnerf.scenes.transforms import load_transforms
 
 __all__ = ["load_scene"]
-
-PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".heic", ".webp", ".tif", ".tiff")
-VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm")
 
 BUILTIN = "builtin:"
 BUILTIN_NAMES = ("room", "room-sparse")
@@ -81,6 +80,9 @@ def load_scene(
         return llff.load_llff(path.parent, downscale=downscale, masks=masks, keeping=keeping)
     if path.suffix == ".npz":
         return load_npz(path, downscale=downscale, masks=masks, keeping=keeping)
+    if path.suffix.lower() in VIDEOS:
+        command = pose_command(shlex.quote(str(path)))
+        raise InputError(f"{path}: is a video, not a scene; make one of it by {command}.")
     raise InputError(f"{path}: is not a scene; give its folder or a transforms*.json in it.")
 
 
@@ -100,27 +102,10 @@ def _load_folder(folder: Path, downscale: int, masks: Path | None, keeping: Keep
     if archive is not None:
         return load_npz(archive, downscale=downscale, masks=masks, keeping=keeping)
     raise InputError(
-        f"{folder}: no scene found: {_what_is_there(folder)}. A scene has {split_file('train')} "
+        f"{folder}: no scene found: {what_is_there(folder)}. A scene has {split_file('train')} "
         "(Blender), transforms.json (instant-ngp, nerfstudio), sparse/0 (COLMAP), "
         f"{llff.FILE} (LLFF), or one .npz file."
     )
-
-
-def _what_is_there(folder: Path) -> str:
-    """What of use a folder without a scene holds, and the way from there."""
-    try:
-        names = [path.suffix.lower() for path in (*folder.iterdir(), *folder.glob("images/*"))]
-    except OSError as error:
-        return f"the folder cannot be read ({error.strerror})"
-    photographs = sum(name in PHOTOGRAPHS for name in names)
-    if photographs:
-        return (
-            f"it holds {photographs} photographs without poses; estimate them, as by `colmap "
-            f"automatic_reconstructor --image_path {folder} --workspace_path {folder}`"
-        )
-    if any(name in VIDEOS for name in names):
-        return "it holds a video; take frames from it and estimate their poses, as by COLMAP"
-    return "it holds neither poses nor photographs"
 
 
 def _load_builtin(name: str, downscale: int) -> Scene:

@@ -112,7 +112,7 @@ def _told(file: Path) -> Iterator[None]:
     except InputError:
         raise
     except _DAMAGE as error:
-        text = str(error).partition("\n")[0][:100] or type(error).__name__
+        text = printable(str(error).partition("\n")[0][:100]) or type(error).__name__
         raise InputError(f"{file}: is no whole .npz file ({text}); save it again.") from None
 
 

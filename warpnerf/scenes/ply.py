@@ -102,7 +102,8 @@ def _binary(
     if count == 0:
         return np.empty((0, 3))
     vertices = np.memmap(stream, vertex, "r", begin, (count,))  # only positions come to memory
-    return np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    with np.errstate(invalid="ignore"):  # NaN of any kind is the caller's to drop
+        return np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
 
 
 def _text(file: Path, stream: BinaryIO, count: int, names: list[str]) -> np.ndarray:

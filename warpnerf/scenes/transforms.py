@@ -75,8 +75,8 @@ def load_transforms(
     """Load a scene from a transforms.json.
 
     The split is the file's ``{train,val,test}_filenames``, else every 8th image is for testing. Box
-    and content distance are those of the points that ``ply_file_path`` names, or of a COLMAP model
-    in the folder whose cameras are the same, where there are such.
+    and content distance are those of the points of a COLMAP model in the folder whose cameras are
+    the same, or that ``ply_file_path`` names, where there are such.
 
     Args:
         file: The file; image paths in it are relative to its folder and stay inside it.
@@ -130,13 +130,16 @@ def load_transforms(
 def _points(
     file: Path, ply_file_path: str | None, frames: Sequence[Frame]
 ) -> tuple[Points | None, str]:
-    """The points that the file names, else those of a COLMAP model with the same cameras.
+    """The points of a COLMAP model with the same cameras, else those that the file names.
+
+    The model comes first because its points have tracks: which photograph sees which.
 
     Returns:
         The points, or None; and a warning if there are some that are not used.
     """
-    if ply_file_path is None:
-        return points_beside(file.parent, frames)
+    beside, why_not = points_beside(file.parent, frames)
+    if ply_file_path is None or (beside is not None and beside.tracks is not None):
+        return beside, why_not
     path = resolve_inside(file.parent, ply_file_path, field=f"{file}: $.ply_file_path")
     if not exists(path):
         return None, f"{file.name}: ply_file_path {printable(ply_file_path)} is not there"

@@ -7,6 +7,7 @@ field.safetensors            the trained field
 metrics.json                 figures of the test views
 test.png                     a few test views, to look at first: truth, rendering, depth, PSNR
 test/                        truth, rendering and depth of each test view, side by side
+scene/                       photographs with the poses that were estimated, where they had none
 .lock                        while a training writes here
 previous/                    a run that was replaced, until this one has saved something
 """
@@ -35,6 +36,7 @@ from warpnerf.model import models
 from warpnerf.rendering.field import Field, Rendering
 from warpnerf.scenes.files import read_json
 from warpnerf.scenes.scene import Scene, View, require_split
+from warpnerf.sfm.scene_files import IN_RUN, read_record
 from warpnerf.training import lock
 from warpnerf.training.checkpoint import (
     DamagedFileError,
@@ -397,6 +399,10 @@ class Run:
 def _counts(path: Path) -> bool:
     """Whether a file or folder of an output folder is more than an attempt to begin leaves."""
     if path.name == lock.NAME:
+        return False
+    if path.name == IN_RUN and read_record(path) is not None:
+        return False
+    if re.fullmatch(rf"\.{IN_RUN}\.\d+\.tmp", path.name):
         return False
     return not (path.name == "test" and path.is_dir() and not any(path.iterdir()))
 

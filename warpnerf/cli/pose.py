@@ -1,0 +1,113 @@
+"""`warpnerf pose`: a scene from photographs without poses, or from a video."""
+
+from __future__ import annotations
+
+import shlex
+from contextlib import suppress
+from pathlib import Path
+
+import tyro
+
+from warpnerf.cli.progress import ProgressBar
+from warpnerf.sfm.config import CameraModel, Lenses, Mapper, Matching, PoseConfig
+
+
+def pose_command(
+    source: tyro.conf.Positional[Path],
+    /,
+    output: Path,
+    camera_model: CameraModel = "auto",
+    lenses: Lenses = "auto",
+    matching: Matching = "auto",
+    mapper: Mapper = "incremental",
+    frames: int = 150,
+    max_image_size: int = 1600,
+    masks: Path | None = None,
+    threads: int | None = None,
+    overwrite: bool = False,
+) -> int:
+    """Estimate the poses of photographs, or of frames of a video, and make a scene of them.
+
+    Args:
+        source: Folder of photographs, or a video.
+        output: The scene's folder; may be that of the photographs.
+        camera_model: Of the lens, as COLMAP names it; auto: RADIAL, but SIMPLE_RADIAL where fewer
+            than ten photographs share one.
+        lenses: Which photographs share a lens. auto: those of one size, camera and focal length by
+            EXIF. one: all. each: none.
+        matching: Which pairs are compared. exhaustive: all. sequential: those near each other by
+            name. auto: sequential for videos and more than 200 photographs.
+        mapper: incremental: one photograph after the other. global: all at once, which is faster
+            where they are many.
+        frames: To take from a video, the sharpest of each of as many equal parts.
+        max_image_size: Longer side, pixels, to which photographs are reduced to look for features.
+        masks: Folder of masks, named after the photographs; where they are black, nothing is looked
+            for, and nothing will be trained on.
+        threads: CPU threads, at most one per usable core, which is the default.
+        overwrite: Replace the posed scene that the output folder holds.
+    """
+    config = PoseConfig(
+        camera_model=camera_model,
+        lenses=lenses,
+        matching=matching,
+        mapper=mapper,
+        frames=frames,
+        max_image_size=max_image_size,
+        masks=masks,
+        threads=threads,
+    )
+    _estimate(source, output, config, overwrite)
+    named = shlex.quote(str(output))
+    print(
+        f"wrote {output}; go on with: warpnerf train {named} --output runs/{output.resolve().name}"
+    )
+    return 0
+
+
+def with_poses(source: str, run: Path, masks: Path | None, threads: int | None) -> str:
+    """Estimate poses before a training, where a source has none and pycolmap is there.
+
+    Args:
+        source: What is to be trained on.
+        run: The run's folder, in which the posed scene is made, or was made before.
+        masks: Folder of masks of the photographs.
+        threads: CPU threads; None: one per usable core.
+
+    Returns:
+        The source, or the folder of the scene that was made of it.
+
+    Raises:
+        InputError: The poses cannot be estimated, or somebody else trains into the folder.
+    """
+    from warpnerf.scenes.contents import is_unposed
+    from warpnerf.scenes.files import exists
+    from warpnerf.sfm.pose import is_made_of
+    from warpnerf.sfm.scene_files import IN_RUN
+    from warpnerf.sfm.worker import is_installed
+    from warpnerf.training.lock import only_writer
+
+    if source.startswith("builtin:") or not is_unposed(Path(source)) or not is_installed():
+        return source
+    config, scene, begun = PoseConfig(masks=masks, threads=threads), run / IN_RUN, exists(run)
+    if is_made_of(scene, Path(source), config):
+        print(f"the poses of {source} are in {scene} already", flush=True)
+        return str(scene)
+    try:
+        with only_writer(run):
+            _estimate(Path(source), scene, config, overwrite=True)
+    except BaseException:
+        if not begun:
+            with suppress(OSError):  # not empty
+                run.rmdir()
+        raise
+    return str(scene)
+
+
+def _estimate(source: Path, output: Path, config: PoseConfig, overwrite: bool) -> None:
+    """Estimate poses with a bar in the terminal, and print what came of it."""
+    from warpnerf.sfm.pose import pose
+
+    print(f"estimating the poses of {source}", flush=True)
+    with ProgressBar("looking at the files") as bar:
+        posing = pose(source, output, config, overwrite=overwrite, on_progress=bar.report)
+    print(posing, flush=True)

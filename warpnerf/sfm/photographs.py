@@ -1,0 +1,143 @@
+"""The photographs that poses are estimated of: checked, with the lens and the way up of each."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from PIL import ExifTags, Image
+
+from warpnerf.checks import InputError
+from warpnerf.runtime.memory import usable_cores
+from warpnerf.scenes.contents import NEEDED
+from warpnerf.scenes.files import printable
+from warpnerf.scenes.images import image_size, require_whole_image
+from warpnerf.scenes.masks import Mask, masks_of_folder
+from warpnerf.sfm.config import Lenses
+
+UPRIGHT = {
+    1: (0, 1),
+    2: (0, 1),
+    3: (0, -1),
+    4: (0, -1),
+    5: (-1, 0),
+    6: (-1, 0),
+    7: (1, 0),
+    8: (1, 0),
+}
+"""By EXIF orientation: which way is up in the stored pixels, as steps to the right and up. It is
+the picture's first column that shows the top in 5 and 6, its last one in 7 and 8."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Photograph:
+    """One photograph, before its pose is known."""
+
+    path: Path
+    size: tuple[int, int]
+    """Width and height of the stored pixels."""
+    lens: int
+    """Photographs with the same number share a lens."""
+    up: tuple[int, int]
+    """Which way is up in the stored pixels, by EXIF: steps to the right and up."""
+    mask: Mask | None = None
+    """Where it is black, nothing is looked for."""
+
+
+def read_photographs(
+    paths: Sequence[Path], *, lenses: Lenses, masks: Path | None
+) -> list[Photograph]:
+    """Look at photographs: whether each is whole, and what it says of its lens.
+
+    Args:
+        paths: Of photographs.
+        lenses: Which of them share a lens: those of the same size, camera and focal length by
+            EXIF (auto), all (one), or none (each).
+        masks: Folder of masks, named after the photographs.
+
+    Returns:
+        One for each path.
+
+    Raises:
+        InputError: Too few, one is no whole photograph or has a name that scenes cannot hold, sizes
+            differ where one lens is asked for, or no mask is there.
+    """
+    if len(paths) < NEEDED:
+        raise InputError(
+            f"{paths[0].parent if paths else 'the folder'}: {len(paths)} photographs are too few: "
+            f"poses need at least {NEEDED}, and a good scene 30 or more; take more."
+        )
+    for path in paths:
+        if not path.name.isprintable() or "\\" in path.name:
+            raise InputError(
+                f"{printable(str(path))}: a scene's file cannot name it; leave out control "
+                "characters and backslashes."
+            )
+    # Decoders release the interpreter lock. COLMAP would go on with half a picture.
+    with ThreadPoolExecutor(usable_cores()) as pool:
+        list(pool.map(require_whole_image, paths))
+    keys: dict[object, int] = {}
+    photographs = []
+    found = masks_of_folder(masks, [p.name for p in paths]) if masks else [None] * len(paths)
+    for number, (path, mask) in enumerate(zip(paths, found, strict=True)):
+        size = image_size(path)
+        camera, orientation = _exif(path)
+        key = {"auto": (size, camera), "one": "one", "each": number}[lenses]
+        photographs.append(
+            Photograph(
+                path=path,
+                size=size,
+                lens=keys.setdefault(key, len(keys)),
+                up=UPRIGHT.get(orientation, UPRIGHT[1]),
+                mask=mask,
+            )
+        )
+    if lenses == "one":
+        first = photographs[0]
+        other = next((p for p in photographs if p.size != first.size), None)
+        if other is not None:
+            raise InputError(
+                f"--lenses one: {other.path.name} has {_shown(other.size)} pixels, but "
+                f"{first.path.name} {_shown(first.size)}, and one lens takes photographs of one "
+                "size; use --lenses auto."
+            )
+    return photographs
+
+
+def put_into(folder: Path, file: Path, name: str) -> None:
+    """Put a file into a folder as a hard link, which takes no room, or else as a copy.
+
+    Args:
+        folder: Made if it does not exist.
+        file: Stays where it is.
+        name: In the folder.
+
+    Raises:
+        OSError: The folder cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        os.link(os.path.realpath(file), folder / name)
+    except OSError:  # another disk, or a file system without links
+        shutil.copyfile(file, folder / name)
+
+
+def _exif(path: Path) -> tuple[tuple[object, ...], int]:
+    """Camera and focal length by EXIF, and its orientation; nothing and 1 where it is silent."""
+    try:
+        with Image.open(path) as image:
+            tags = image.getexif()
+            details = tags.get_ifd(ExifTags.IFD.Exif)
+            names = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
+            values = [tags.get(ExifTags.Base.Model), *map(details.get, names)]
+            return tuple(map(str, values)), int(tags.get(ExifTags.Base.Orientation, 1))
+    except Exception:  # tags are damaged in more ways than Pillow has names for
+        return (), 1
+
+
+def _shown(size: tuple[int, int]) -> str:
+    return f"{size[0]}x{size[1]}"

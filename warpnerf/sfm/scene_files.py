@@ -1,0 +1,140 @@
+"""The folder of a posed scene: transforms.json, pose.json, and how all of it comes into place.
+
+images/ or the user's own      the photographs
+transforms.json                lenses and poses of those that were placed, OpenGL axes, z up
+sparse_pc.ply                  the points that they share
+sparse/0/                      the same as a COLMAP model
+masks/                         those that were given
+pose.json                      what was found, what it was made of, and which files were written
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from warpnerf.checks import InputError
+from warpnerf.scenes.contents import holds_scene
+from warpnerf.scenes.files import exists, read_json
+
+TRANSFORMS = "transforms.json"
+POINTS = "sparse_pc.ply"
+MODEL = "sparse/0"
+SUMMARY = "pose.json"
+IN_RUN = "scene"
+"""Folder of a run that was given photographs without poses, for the scene made of them."""
+
+LENS_KEYS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2")
+FISHEYE = "OPENCV_FISHEYE"
+
+
+class Record(msgspec.Struct):
+    """What pose.json says, as far as it is read again."""
+
+    made_of: dict[str, Any]
+    written: list[str]
+
+
+def read_record(folder: Path) -> Record | None:
+    """What pose.json in a folder says; None where there is none."""
+    return read_json(folder / SUMMARY, Record) if exists(folder / SUMMARY) else None
+
+
+def require_free(folder: Path, source: Path, overwrite: bool) -> None:
+    """Raise InputError unless a posed scene may be written to a folder.
+
+    Args:
+        folder: Need not exist; may be that of the photographs.
+        source: The photographs' folder, or a video.
+        overwrite: Whether a posed scene in it may be replaced.
+
+    Raises:
+        InputError: It is a file, or holds something else, or a scene.
+    """
+    if not exists(folder):
+        return
+    if not folder.is_dir():
+        raise InputError(f"--output {folder} is a file; name a folder for the scene.")
+    if read_record(folder) is not None:
+        if overwrite:
+            return
+        raise InputError(
+            f"--output {folder} holds a posed scene already; replace it by --overwrite, or name "
+            "another folder."
+        )
+    if holds_scene(folder):
+        raise InputError(f"--output {folder} holds a scene already; name another folder.")
+    own = source.resolve().is_relative_to(folder.resolve())
+    if not own and any(folder.iterdir()):
+        raise InputError(f"--output {folder} holds other files; name a new folder.")
+
+
+def transforms_text(
+    poses: Mapping[str, Sequence[Sequence[float]]],
+    cameras: Mapping[str, Mapping[str, Any]],
+    masks: Mapping[str, str],
+) -> str:
+    """The content of transforms.json.
+
+    Args:
+        poses: Camera to world, [3, 4], OpenGL axes, by the file path of each photograph.
+        cameras: Model, size, focal lengths, centre and distortion by the same, in pixels; all of
+            them fisheye lenses, or none.
+        masks: File paths of masks by the same, where there are any.
+    """
+    fisheye = all(camera["model"] == FISHEYE for camera in cameras.values())
+    keys = (*LENS_KEYS, *(("k3", "k4") if fisheye else ("p1", "p2")))
+    lenses = {path: {key: cameras[path].get(key, 0.0) for key in keys} for path in poses}
+    different = {json.dumps(lens) for lens in lenses.values()}
+    frames = []
+    for path, pose in sorted(poses.items()):
+        frame: dict[str, Any] = {"file_path": path}
+        if len(different) > 1:
+            frame |= lenses[path]
+        if path in masks:
+            frame["mask_path"] = masks[path]
+        frames.append(frame | {"transform_matrix": [*pose, [0.0, 0.0, 0.0, 1.0]]})
+    shared = json.loads(different.pop()) if len(different) == 1 else {}
+    content: dict[str, Any] = {"camera_model": FISHEYE if fisheye else "OPENCV"}
+    content |= {**shared, "ply_file_path": POINTS, "frames": frames}
+    return json.dumps(content, indent=1) + "\n"
+
+
+def move_into(prepared: Path, folder: Path) -> None:
+    """Put the files of a prepared folder in their place, transforms.json last.
+
+    A posed scene that is there already loses the files that its record lists.
+
+    Raises:
+        OSError: They cannot be moved.
+    """
+    if not exists(folder):
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        prepared.replace(folder)
+        return
+    older = read_record(folder)
+    if older is not None:
+        remove_written(folder, older)
+    files = [path for path in prepared.rglob("*") if path.is_file()]
+    for path in sorted(files, key=lambda path: path.name == TRANSFORMS):
+        target = folder / path.relative_to(prepared)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        path.replace(target)
+
+
+def remove_written(folder: Path, record: Record) -> None:
+    """Remove the files of a posed scene, and folders that are then empty; nothing else."""
+    root = folder.resolve()
+    for name in record.written:
+        path = root / name
+        if path.resolve().is_relative_to(root) and path.is_file():
+            path.unlink()
+    folders = {parent for name in record.written for parent in Path(name).parents[:-1]}
+    for inner in sorted(folders, reverse=True):
+        with suppress(OSError):  # not empty, or never made
+            (root / inner).rmdir()
