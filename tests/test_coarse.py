@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,9 +13,11 @@ from tiny_scenes import camera_at, look_at, ring, tiny_scene
 
 import warpnerf as wn
 from warpnerf.scenes.builtin.room import first_hit, photograph
-from warpnerf.scenes.scene import Scene, View, estimate_extent
+from warpnerf.scenes.scene import Scene, View, estimate_extent, find_focus
 from warpnerf.training import coarse
 from warpnerf.training.coarse import begin, find_sight, is_needed, median_distances
+from warpnerf.training.run import Run
+from warpnerf.training.state import scene_digest
 
 
 def outward_scan(n_views: int = 40) -> tuple[Scene, float]:
@@ -117,6 +120,25 @@ def test_a_resumed_training_does_not_look_again(monkeypatch: pytest.MonkeyPatch)
         trainer.run()
     assert np.array_equal(whole.grid.values.numpy(), rest.grid.values.numpy())
     assert np.array_equal(whole.grid.box_max, rest.grid.box_max)
+
+
+def test_a_run_remembers_what_was_found(tmp_path: Path) -> None:
+    scene = guessed_scene()
+    found = replace(scene, content_distance=2.5, box_max=np.array([4.0, 5.0, 6.0]), guessed=False)
+    Run(tmp_path / "a").create(found, "somewhere", 1, 2.5, SHORT, found=True)
+    Run(tmp_path / "b").create(scene, "somewhere", 1, 3.0, SHORT)
+    again = Run(tmp_path / "a").read_config().as_trained(scene)
+    assert again.content_distance == 2.5 and again.box_max.tolist() == [4.0, 5.0, 6.0]
+    assert not again.guessed
+    assert Run(tmp_path / "b").read_config().as_trained(scene) is scene
+
+
+def test_what_was_found_does_not_change_what_a_scene_is() -> None:
+    scene = guessed_scene()
+    own = find_focus(scene.training_cameras).distance
+    assert scene_digest(replace(scene, content_distance=own)) == scene_digest(
+        replace(scene, content_distance=7.7, content_distances=np.full(6, 7.7))
+    )
 
 
 def test_median_distance_of_a_wall() -> None:

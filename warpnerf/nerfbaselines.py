@@ -18,6 +18,7 @@ from warpnerf.checks import InputError
 from warpnerf.config import PRESETS, TrainConfig
 from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.scene import Scene, View, estimate_extent
+from warpnerf.scenes.undistort import seen_pixels
 from warpnerf.training.checkpoint import load_checkpoint, save_checkpoint
 from warpnerf.training.coarse import begin
 from warpnerf.training.state import TrainingState
@@ -228,9 +229,10 @@ def scene_of(dataset: Any) -> Scene:
     for index, name in enumerate(names):
         camera = camera_of(cameras[index])
         image = np.asarray(images[index])[: camera.height, : camera.width]
-        mask = None
+        mask = seen_pixels(camera)
         if masks is not None and masks[index] is not None:
-            mask = np.asarray(masks[index])[: camera.height, : camera.width] > 0
+            given = np.asarray(masks[index])[: camera.height, : camera.width] > 0
+            mask = given if mask is None else given & mask
         if mask is not None and not mask.any():
             continue
         views.append(View(name=name, camera=camera, image=np.ascontiguousarray(image), mask=mask))

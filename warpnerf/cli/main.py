@@ -196,6 +196,7 @@ def eval_command(
     views = load_scene(
         scene or config.scene, downscale=config.downscale, masks=folder_of_masks, images="files"
     )
+    views = config.as_trained(views)
     require_measurable(views, split)
     result = evaluate(field, views, split, lpips=distance)
     print(result)
@@ -238,12 +239,13 @@ def _begin(
     for oddity in oddities(trained, survey(source), trainer.content_distance, config.march.near):
         print(f"  odd: {oddity}", flush=True)
     run = Run(output)
-    with training_page(page, scene, trainer) as session, run.only_writer():
+    with training_page(page, trained, trainer) as session, run.only_writer():
         Run.require_free(output, overwrite)  # once more, now that nobody else begins there
         folder = None if masks is None else str(masks.resolve())
         distance = trainer.content_distance
-        run.create(trained, _absolute(source), downscale, distance, config, folder)
-        return _train(run, scene, trainer, session)
+        found = scene.guessed and not trained.guessed
+        run.create(trained, _absolute(source), downscale, distance, config, folder, found)
+        return _train(run, trained, trainer, session)
 
 
 def _resume(
@@ -278,6 +280,7 @@ def _go_on(
     state.require_same_config(config)
     scene = _read(moved or begun.scene, begun.downscale, masks or begun.masks, images, run.folder)
     trainer = Trainer(scene, config, state)
+    scene = begun.as_trained(scene)
     _describe(scene, trainer.content_distance, config)
     for note in notes:
         print(f"  note: {note}")

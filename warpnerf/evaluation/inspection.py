@@ -293,8 +293,8 @@ def _odd_directions(cameras: Sequence[Camera], known: bool) -> list[str]:
     elif _focus(cameras) is None and not known:
         odd.append(
             f"no common focus: {aimed:.0%} of the training cameras have one point in the middle of "
-            "their image, so content distance and box are guesses; training looks for better ones "
-            "first"
+            "their image, so content distance and box are guesses, unless a training of 500 steps "
+            "or more looks for better ones first"
         )
     return odd
 

@@ -69,14 +69,15 @@ def find_sight(scene: Scene, config: TrainConfig) -> tuple[Sight | None, float]:
         config: Of the training that it is for.
 
     Returns:
-        What they see, None where nothing opaque has grown; seconds spent, without compiling.
+        What they see, None where nothing opaque has grown; seconds of training, to which compiling
+        and looking at depths do not count.
     """
-    limit = config.time_limit
+    limit, given = config.time_limit, config.content_distance
     small = replace(
         config,
         steps=_steps(config),
         time_limit=None if limit is None else TIME_SHARE * limit,
-        content_distance="auto",
+        content_distance="auto" if isinstance(given, str) else given,
         grid=GridConfig(
             voxels=min(VOXELS, config.grid.voxels),
             contraction=config.grid.contraction,
@@ -88,6 +89,7 @@ def find_sight(scene: Scene, config: TrainConfig) -> tuple[Sight | None, float]:
         trainer = Trainer(scene, small, sight=sight)
         seconds += trainer.run().seconds
         found = sight_of(scene, trainer.field())
+        del trainer  # its copy of the photographs, before the next one makes its own
         if found is None:
             break
         sight = found

@@ -19,7 +19,7 @@ import re
 import shlex
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -54,6 +54,14 @@ KEPT = 2
 T = TypeVar("T")
 
 
+class FoundExtent(msgspec.Struct, frozen=True):
+    """What the short trainings found, in scene units; see ``training.coarse``."""
+
+    content_distance: float
+    box_min: tuple[float, float, float]
+    box_max: tuple[float, float, float]
+
+
 class RunConfig(msgspec.Struct, frozen=True):
     """What config.json says, as far as it is read again."""
 
@@ -69,6 +77,20 @@ class RunConfig(msgspec.Struct, frozen=True):
     """Absolute path of the folder of masks that was given for all photographs; None: none was."""
     pictures: list[str] | None = None
     """File names of the pictures in test/; None in runs of the version before, which wrote all."""
+    found: FoundExtent | None = None
+    """In place of the scene's own extent, where the cameras did not tell."""
+
+    def as_trained(self, scene: Scene) -> Scene:
+        """A scene, as it was read, with the extent that the run has found for it."""
+        if self.found is None:
+            return scene
+        return replace(
+            scene,
+            content_distance=self.found.content_distance,
+            box_min=np.array(self.found.box_min),
+            box_max=np.array(self.found.box_max),
+            guessed=False,
+        )
 
 
 class Run:
@@ -146,6 +168,7 @@ class Run:
         content_distance: float,
         config: TrainConfig,
         masks: str | None = None,
+        found: bool = False,
     ) -> None:
         """Make the folder and write its configuration; an older run's files go to previous/.
 
@@ -163,6 +186,12 @@ class Run:
             "pictures": sorted(picture_files([view.name for view in scene.views]).values()),
             "train": config_to_json(config),
         }
+        if found:
+            content["found"] = {
+                "content_distance": scene.content_distance,
+                "box_min": scene.box_min.tolist(),
+                "box_max": scene.box_max.tolist(),
+            }
         try:
             (self.folder / "test").mkdir(parents=True, exist_ok=True)
             self._set_aside()

@@ -14,7 +14,7 @@ from warpnerf.checks import InputError
 from warpnerf.config import TrainConfig
 from warpnerf.model.interface import Model
 from warpnerf.rendering.field import Field
-from warpnerf.scenes.scene import Scene
+from warpnerf.scenes.scene import Scene, find_focus
 
 MAY_CHANGE = ("device", "threads", "checkpoint_every")
 """Fields of TrainConfig that a resumed training may change: what is computed stays the same. The
@@ -122,9 +122,12 @@ def _pairs(prefix: str, ours: Any, theirs: Any) -> Iterator[tuple[str, Any, Any]
 def scene_digest(scene: Scene) -> str:
     """SHA-256 over what training draws from: pixels, masks and cameras of the training views.
 
-    Poses count to 1e-5 of the content distance, and pixels of the camera to 1e-3: another machine
-    may round what it computes of them otherwise.
+    Poses count to 1e-5 of the content distance that the cameras tell, and pixels of the camera to
+    1e-3: another machine may round what it computes of them otherwise.
     """
+    unit = scene.content_distance
+    if scene.content_distances is not None:  # of points, which may come and go beside a scene
+        unit = find_focus(scene.training_cameras).distance
     digest = hashlib.sha256()
     for index in scene.splits["train"]:
         view = scene.views[index]
@@ -135,7 +138,7 @@ def scene_digest(scene: Scene) -> str:
         numbers = (
             np.round(lens, 3),
             np.round([*distortion, *camera.c2w[:, :3].ravel()], 5),
-            np.round(camera.position / scene.content_distance, 5),
+            np.round(camera.position / unit, 5),
         )
         digest.update(f"{view.image.shape}".encode())
         digest.update((np.concatenate(numbers) + 0.0).tobytes())  # no -0

@@ -22,6 +22,8 @@ class TrainResult:
     """The one that was used, scene units."""
     progress: Progress
     """The last report."""
+    scene: Scene
+    """What was trained on, with the extent that was used: it may have been looked for first."""
 
 
 def train(
@@ -61,5 +63,8 @@ def train(
     trainer = begin(scene, config, resume)
     progress = trainer.run(on_progress, on_checkpoint)
     return TrainResult(
-        field=trainer.field(), content_distance=trainer.content_distance, progress=progress
+        field=trainer.field(),
+        content_distance=trainer.content_distance,
+        progress=progress,
+        scene=trainer.scene,
     )

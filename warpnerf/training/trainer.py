@@ -68,7 +68,8 @@ class Trainer:
         self.config = config
         self.workers = Workers(config.device, config.threads)
         self.steps_done = 0
-        self._scene_digest = scene_digest(scene)
+        self._given = scene
+        self._scene_digest = None if resume is None else resume.scene_digest
         if sight is not None:
             scene = seen_scene(scene, sight)
         self.scene = scene
@@ -244,6 +245,8 @@ class Trainer:
         for parameter in self.parameters():
             if not np.isfinite(parameter.values.numpy()).all():
                 raise self._not_finite(f"{parameter.name} of the model are")
+        if self._scene_digest is None:  # not before: it takes as long as reading all photographs
+            self._scene_digest = scene_digest(self._given)
         threads = self.config.threads if self.workers.device.is_cuda else self.workers.count
         return TrainingState(
             config=replace(self.config, threads=threads),
