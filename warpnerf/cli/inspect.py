@@ -29,8 +29,8 @@ def inspect_command(
     """Say what was understood of a scene, what training will take, and what is odd.
 
     Args:
-        scene: Folder with transforms.json or transforms_train.json; builtin:room or
-            builtin:room-sparse.
+        scene: Folder of a scene (transforms.json, Blender, COLMAP, LLFF), an .npz file,
+            builtin:room or builtin:room-sparse.
         output: FILE.png for a plan: cameras, box and content distance from above and the side.
         json: Also write all of it to this file.
         downscale: As training will be given.

@@ -79,9 +79,9 @@ def train_command(
     """Train a voxel grid on a scene, and look at its test views.
 
     Args:
-        scene: Folder with transforms.json or transforms_train.json; builtin:room or
-            builtin:room-sparse; photographs without poses or a video, whose poses are then
-            estimated first, as by `warpnerf pose`.
+        scene: Folder of a scene (transforms.json, Blender, COLMAP, LLFF), an .npz file,
+            builtin:room or builtin:room-sparse; or photographs without poses or a video, whose
+            poses are then estimated first, as by `warpnerf pose`.
         output: Folder for the configuration, the field, the log, the figures and the pictures.
         resume: Go on with the run in this folder, as it was begun; scene only if it has moved.
         preset: Starting point, by default fast; the options below replace its values.
