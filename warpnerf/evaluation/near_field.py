@@ -89,7 +89,8 @@ def measure_near_field(field: Field, scene: Scene) -> NearField:
     steps = replace(field.steps, far=within, transmittance_min=0.0)
     close_by = replace(field, steps=steps)
     mass, near, n_rays = 0.0, 0, 0
-    for camera in map(coarse, scene.training_cameras):
+    for whole in scene.training_cameras:
+        camera = whole.downscaled(whole.block_for(MAX_PIXELS))
         transmittance = 1.0 - close_by.render(camera).opacity
         mass -= float(np.log(np.maximum(transmittance, MIN_TRANSMITTANCE)).sum(dtype=np.float64))
         seen = field.render(camera)
@@ -111,12 +112,6 @@ def ends_within(seen: Rendering, distance: float) -> np.ndarray:
     (sum_i w_i t_i) / opacity below it; bool, of the rendering's shape.
     """
     return np.asarray((seen.opacity >= 0.5) & (seen.depth < distance * seen.opacity))
-
-
-def coarse(camera: Camera) -> Camera:
-    """The camera with about MAX_PIXELS pixels, or as many as it has."""
-    factor = math.ceil(math.sqrt(camera.width * camera.height / MAX_PIXELS))
-    return camera.downscaled(max(1, min(factor, camera.width, camera.height)))
 
 
 def pulled_back(camera: Camera, distance: float) -> Camera:

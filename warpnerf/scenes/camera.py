@@ -142,6 +142,11 @@ class Camera:
         jacobian += bend[:, None, None] * points[:, :, None] * points[:, None, :]
         return points * scale[:, None], jacobian
 
+    def block_for(self, n_pixels: int) -> int:
+        """Edge of the smallest blocks for which ``downscaled`` has at most so many pixels."""
+        edge = math.ceil(math.sqrt(self.width * self.height / n_pixels))
+        return max(1, min(edge, self.width, self.height))
+
     def downscaled(self, factor: int) -> Camera:
         """Camera of the image whose pixels are means over ``factor`` by ``factor`` blocks.
 

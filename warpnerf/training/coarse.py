@@ -17,7 +17,6 @@ import numpy as np
 from warpnerf.config import GridConfig, TrainConfig
 from warpnerf.rendering.field import Field
 from warpnerf.rendering.rays import camera_rays
-from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.points import Sight, look
 from warpnerf.scenes.scene import Scene, View
 from warpnerf.training.state import TrainingState
@@ -33,7 +32,7 @@ TIME_SHARE = 0.06
 """The same of its time limit."""
 
 RAYS = 128
-"""Of each camera, about."""
+"""Of each camera, at most."""
 DISTANCES = 32
 """At which opacity is looked at, from NEAREST to FARTHEST."""
 NEAREST, FARTHEST = 0.005, 64.0
@@ -147,7 +146,8 @@ def _some_rays(views: Sequence[View], field: Field) -> tuple[np.ndarray, np.ndar
     """Rays spread over the pixels of all views that count: origins, directions, and whose."""
     origins, directions, owners = [], [], []
     for index, view in enumerate(views):
-        coarse, factor = _coarse_camera(view.camera)
+        factor = view.camera.block_for(RAYS)
+        coarse = view.camera.downscaled(factor)
         of_camera = [array.numpy() for array in camera_rays(coarse, field.workers)]
         counts = np.ones(coarse.width * coarse.height, bool)
         if view.mask is not None:
@@ -157,10 +157,3 @@ def _some_rays(views: Sequence[View], field: Field) -> tuple[np.ndarray, np.ndar
         directions.append(of_camera[1][counts])
         owners.append(np.full(int(counts.sum()), index))
     return np.concatenate(origins), np.concatenate(directions), np.concatenate(owners)
-
-
-def _coarse_camera(camera: Camera) -> tuple[Camera, int]:
-    """The same camera with about RAYS pixels, and the edge of the blocks that each stands for."""
-    pixels = camera.width * camera.height
-    factor = max(1, min(camera.width, camera.height, round((pixels / RAYS) ** 0.5)))
-    return camera.downscaled(factor), factor
