@@ -95,3 +95,13 @@ def test_what_poses_can_be_estimated_of(tmp_path: Path) -> None:
     unposed = {path.name for path in tmp_path.iterdir() if is_unposed(path)}
     assert unposed == {"photos", "walk.mp4"}
     assert not is_unposed(tmp_path / "nowhere.mp4")
+
+
+def test_an_exported_volume_does_not_make_photographs_a_scene(tmp_path: Path) -> None:
+    photographs(tmp_path)
+    np.savez(tmp_path / "volume.npz", density=np.zeros((2, 2, 2)))
+    assert is_unposed(tmp_path)
+    with pytest.raises(InputError, match="it holds 4 photographs without poses"):
+        load_scene(tmp_path)
+    np.savez(tmp_path / "volume.npz", images=np.zeros(1), poses=np.zeros(1), focal=1.0)
+    assert not is_unposed(tmp_path)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image
 from tiny_scenes import picture, ring, write_transforms
 
 from warpnerf.checks import InputError
@@ -398,3 +398,34 @@ def test_a_scene_knows_what_it_is_made_of(tmp_path: Path, photos: Path, colmap: 
     assert not is_made_of(scene, photos, PoseConfig(mapper="global"))
     Image.fromarray(picture(99)).save(photos / "new.png")
     assert not is_made_of(scene, photos, config)
+
+
+def test_the_same_masks_named_from_elsewhere_are_the_same(
+    tmp_path: Path, photos: Path, colmap: Colmap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    photographs(tmp_path / "masks")
+    pose(photos, tmp_path / "scene", PoseConfig(masks=tmp_path / "masks"))
+    monkeypatch.chdir(tmp_path)
+    assert is_made_of(Path("scene"), Path("photos"), PoseConfig(masks=Path("masks")))
+
+
+def test_half_a_scene_is_made_again(tmp_path: Path, photos: Path, colmap: Colmap) -> None:
+    pose(photos, tmp_path / "scene")
+    assert is_made_of(tmp_path / "scene", photos, PoseConfig())
+    (tmp_path / "scene" / "transforms.json").unlink()
+    assert not is_made_of(tmp_path / "scene", photos, PoseConfig())
+
+
+def test_photographs_stored_turned_are_no_cause_for_a_warning(
+    tmp_path: Path, colmap: Colmap
+) -> None:
+    (tmp_path / "photos").mkdir()
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 3
+    for k in range(N):
+        Image.fromarray(picture(k)).save(tmp_path / "photos" / f"{k:02}.jpg", exif=exif)
+    pose(tmp_path / "photos", tmp_path / "scene")
+    assert not load_scene(tmp_path / "scene").warnings
+    (tmp_path / "scene" / "pose.json").unlink()  # as if another program had made the scene
+    (warning,) = load_scene(tmp_path / "scene").warnings
+    assert warning.startswith("stored turned")

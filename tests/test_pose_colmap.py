@@ -216,7 +216,7 @@ def test_train_estimates_the_poses_first_and_only_once(tmp_path: Path, photos: P
     assert first.code == 0, first.err
     assert f"registered {N} of {N} photographs" in first.out
     config = json.loads((first.run / "config.json").read_text())
-    assert config["scene"] == str(first.run / "scene")
+    assert config["scene"] == "scene"
     again = trained(photos, "--overwrite", folder=tmp_path)
     assert again.code == 0, again.err
     assert "are in" in again.out and "registered" not in again.out

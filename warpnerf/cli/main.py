@@ -34,6 +34,7 @@ from warpnerf.cli.view import PageOptions, training_page, view_command
 from warpnerf.config import PRESETS, Scaling, TrainConfig
 from warpnerf.runtime.signals import Stopped, StopRequest, raise_when_asked
 from warpnerf.runtime.terminal import UntilClosed
+from warpnerf.training import lock
 
 if TYPE_CHECKING:
     from warpnerf.scenes.photographs import Place
@@ -216,13 +217,38 @@ def _begin(
     page: PageOptions | None,
 ) -> int:
     """Train from the first step on."""
+    _require_free(output, overwrite)
+    with lock.only_writer(output):
+        _require_free(output, overwrite)  # once more, now that nobody else begins there
+        return _begin_alone(source, output, downscale, masks, images, config, page)
+
+
+def _require_free(output: Path, overwrite: bool) -> None:
+    """Raise InputError unless a run may begin there; loads Warp only where something is."""
     from warpnerf.scenes.files import exists
 
-    if exists(output):
+    if exists(output) and not (
+        output.is_dir() and all(path.name == lock.NAME for path in output.iterdir())
+    ):
         from warpnerf.training.run import Run
 
         Run.require_free(output, overwrite)
-    source = with_poses(source, output, masks, config.threads)
+
+
+def _begin_alone(
+    source: str,
+    output: Path,
+    downscale: int,
+    masks: Path | None,
+    images: Place,
+    config: TrainConfig,
+    page: PageOptions | None,
+) -> int:
+    """Train from the first step on, as the only one that writes to the folder."""
+    photographs = source
+    source = with_poses(photographs, output, masks, config.threads)
+    if source != photographs:
+        masks = None  # the posed scene brings them
     scene = _read(source, downscale, masks, images, output)
 
     # Not before: these load Warp, and bad input is refused at once.
@@ -239,8 +265,7 @@ def _begin(
     for oddity in oddities(trained, survey(source), trainer.content_distance, config.march.near):
         print(f"  odd: {oddity}", flush=True)
     run = Run(output)
-    with training_page(page, trained, trainer) as session, run.only_writer():
-        Run.require_free(output, overwrite)  # once more, now that nobody else begins there
+    with training_page(page, trained, trainer) as session:
         folder = None if masks is None else str(masks.resolve())
         distance = trainer.content_distance
         found = scene.guessed and not trained.guessed

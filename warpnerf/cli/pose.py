@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from contextlib import suppress
 from pathlib import Path
 
 import tyro
@@ -69,7 +68,8 @@ def with_poses(source: str, run: Path, masks: Path | None, threads: int | None) 
 
     Args:
         source: What is to be trained on.
-        run: The run's folder, in which the posed scene is made, or was made before.
+        run: The run's folder, which nobody else writes to. The scene waits in its next/ until
+            the run begins; one that was made of the same before is taken as it is.
         masks: Folder of masks of the photographs.
         threads: CPU threads; None: one per usable core.
 
@@ -77,30 +77,22 @@ def with_poses(source: str, run: Path, masks: Path | None, threads: int | None) 
         The source, or the folder of the scene that was made of it.
 
     Raises:
-        InputError: The poses cannot be estimated, or somebody else trains into the folder.
+        InputError: The poses cannot be estimated.
     """
     from warpnerf.scenes.contents import is_unposed
-    from warpnerf.scenes.files import exists
     from warpnerf.sfm.pose import is_made_of
-    from warpnerf.sfm.scene_files import IN_RUN
+    from warpnerf.sfm.scene_files import IN_RUN, NEXT_IN_RUN
     from warpnerf.sfm.worker import is_installed
-    from warpnerf.training.lock import only_writer
 
     if source.startswith("builtin:") or not is_unposed(Path(source)) or not is_installed():
         return source
-    config, scene, begun = PoseConfig(masks=masks, threads=threads), run / IN_RUN, exists(run)
-    if is_made_of(scene, Path(source), config):
-        print(f"the poses of {source} are in {scene} already", flush=True)
-        return str(scene)
-    try:
-        with only_writer(run):
-            _estimate(Path(source), scene, config, overwrite=True)
-    except BaseException:
-        if not begun:
-            with suppress(OSError):  # not empty
-                run.rmdir()
-        raise
-    return str(scene)
+    config = PoseConfig(masks=masks, threads=threads)
+    for scene in (run / IN_RUN, run / NEXT_IN_RUN):
+        if is_made_of(scene, Path(source), config):
+            print(f"the poses of {source} are in {scene} already", flush=True)
+            return str(scene)
+    _estimate(Path(source), run / NEXT_IN_RUN, config, overwrite=True)
+    return str(run / NEXT_IN_RUN)
 
 
 def _estimate(source: Path, output: Path, config: PoseConfig, overwrite: bool) -> None:

@@ -13,7 +13,7 @@ from warpnerf.checks import InputError
 from warpnerf.runtime.memory import usable_cores
 from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.depths import Depth, DepthFile, read_depth
-from warpnerf.scenes.files import find_image
+from warpnerf.scenes.files import exists, find_image
 from warpnerf.scenes.images import exif_orientation, image_shape
 from warpnerf.scenes.lens import Lens
 from warpnerf.scenes.masks import Mask, PackedMask, masks_of_folder, read_mask
@@ -24,6 +24,9 @@ from warpnerf.scenes.undistort import seen_pixels
 
 LITTLE = 0.1
 """Share of the pixels that masks leave, below which they are likely to be inverted."""
+
+POSED = "pose.json"
+"""Lies beside a scene that `warpnerf pose` wrote, whose poses are those of the stored pixels."""
 
 HOLD_OUT = 8
 """Without a split in the file every 8th image is for testing, as in LLFF and Mip-NeRF 360."""
@@ -181,7 +184,7 @@ def assemble(
         warnings=(
             *(*warnings, *mask_warnings, *_oddities(views, complete, transparent)),
             *_turned_warning(
-                [frame.name for frame, lies in zip(frames, turned, strict=True) if lies]
+                folder, [frame.name for frame, lies in zip(frames, turned, strict=True) if lies]
             ),
         ),
     )
@@ -300,8 +303,8 @@ def _may_lie(frame: Frame) -> bool:
     return orientation != 1 and not (on_side and None not in stated and stated[0] != stated[1])
 
 
-def _turned_warning(names: Sequence[str]) -> list[str]:
-    if not names:
+def _turned_warning(folder: Path, names: Sequence[str]) -> list[str]:
+    if not names or exists(folder / POSED):
         return []
     return [
         f"stored turned, with an EXIF rotation that is not applied: {len(names)} images (first: "

@@ -11,7 +11,7 @@ from warpnerf.scenes import llff
 from warpnerf.scenes.blender import SPLITS, split_file
 from warpnerf.scenes.colmap import find_model
 from warpnerf.scenes.files import exists
-from warpnerf.scenes.npz import single_npz
+from warpnerf.scenes.npz import is_scene_file, single_npz
 
 UNREAD_PHOTOGRAPHS = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf")
 """Endings of photographs that phones and cameras write and that are not read."""
@@ -26,7 +26,10 @@ def holds_scene(folder: Path) -> bool:
     """Whether a folder holds one of the formats that ``load_scene`` reads."""
     files = [*map(split_file, SPLITS[:1]), "transforms.json", llff.FILE]
     known = any(exists(folder / name) for name in files)
-    return known or find_model(folder) is not None or single_npz(folder) is not None
+    if known or find_model(folder) is not None:
+        return True
+    archive = single_npz(folder)  # programs export other things as .npz too
+    return archive is not None and is_scene_file(archive)
 
 
 def photographs_in(folder: Path) -> list[Path]:

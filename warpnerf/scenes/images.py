@@ -86,13 +86,18 @@ def exif_orientation(path: Path) -> int:
     Returns:
         1, as it is stored, also where there is no EXIF, or none that can be read.
     """
+    orientation = read_exif(path, lambda exif: exif.get(ORIENTATION, 1))
+    return orientation if orientation is not None and orientation in range(1, 9) else 1
+
+
+def read_exif(path: Path, look: Callable[[Image.Exif], T]) -> T | None:
+    """What something finds in a photograph's EXIF; None where there is none that can be read."""
     try:
         # Of a PNG all pixels would be decoded first.
         with Image.open(path, formats=("JPEG", "MPO", "WEBP")) as image:
-            orientation = image.getexif().get(ORIENTATION, 1)
-    except Exception:  # whatever else is in it, the photograph is read without
-        return 1
-    return orientation if orientation in range(1, 9) else 1
+            return look(image.getexif())
+    except Exception:  # tags are damaged in more ways than Pillow has names for
+        return None
 
 
 def image_size(path: Path) -> tuple[int, int]:

@@ -11,7 +11,7 @@ from warpnerf.checks import InputError, require_one_of
 from warpnerf.scenes import llff
 from warpnerf.scenes.blender import SPLITS, load_blender, split_file
 from warpnerf.scenes.colmap import find_model, load_colmap
-from warpnerf.scenes.contents import VIDEOS, pose_command, what_is_there
+from warpnerf.scenes.contents import VIDEOS, is_unposed, pose_command, what_is_there
 from warpnerf.scenes.files import exists
 from warpnerf.scenes.npz import load_npz, single_npz
 from warpnerf.scenes.photographs import Keeping, Place
@@ -99,7 +99,7 @@ def _load_folder(folder: Path, downscale: int, masks: Path | None, keeping: Keep
     if exists(folder / llff.FILE):
         return llff.load_llff(folder, downscale=downscale, masks=masks, keeping=keeping)
     archive = single_npz(folder)
-    if archive is not None:
+    if archive is not None and not is_unposed(folder):
         return load_npz(archive, downscale=downscale, masks=masks, keeping=keeping)
     raise InputError(
         f"{folder}: no scene found: {what_is_there(folder)}. A scene has {split_file('train')} "

@@ -104,6 +104,15 @@ def single_npz(folder: Path) -> Path | None:
     return found[0] if len(found) == 1 else None
 
 
+def is_scene_file(file: Path) -> bool:
+    """Whether an .npz file holds images and poses."""
+    try:
+        with zipfile.ZipFile(file) as archive:
+            return {"images.npy", "poses.npy"} <= set(archive.namelist())
+    except _DAMAGE:
+        return False
+
+
 @contextmanager
 def _told(file: Path) -> Iterator[None]:
     """What is wrong with an archive, in one way."""

@@ -15,7 +15,12 @@ from warpnerf.checks import InputError
 from warpnerf.runtime.memory import usable_cores
 from warpnerf.scenes.contents import NEEDED
 from warpnerf.scenes.files import printable
-from warpnerf.scenes.images import image_size, require_whole_image
+from warpnerf.scenes.images import (
+    exif_orientation,
+    image_size,
+    read_exif,
+    require_whole_image,
+)
 from warpnerf.scenes.masks import Mask, masks_of_folder
 from warpnerf.sfm.config import Lenses
 
@@ -85,14 +90,13 @@ def read_photographs(
     found = masks_of_folder(masks, [p.name for p in paths]) if masks else [None] * len(paths)
     for number, (path, mask) in enumerate(zip(paths, found, strict=True)):
         size = image_size(path)
-        camera, orientation = _exif(path)
-        key = {"auto": (size, camera), "one": "one", "each": number}[lenses]
+        key = {"auto": (size, read_exif(path, _camera)), "one": "one", "each": number}[lenses]
         photographs.append(
             Photograph(
                 path=path,
                 size=size,
                 lens=keys.setdefault(key, len(keys)),
-                up=UPRIGHT.get(orientation, UPRIGHT[1]),
+                up=UPRIGHT[exif_orientation(path)],
                 mask=mask,
             )
         )
@@ -126,17 +130,11 @@ def put_into(folder: Path, file: Path, name: str) -> None:
         shutil.copyfile(file, folder / name)
 
 
-def _exif(path: Path) -> tuple[tuple[object, ...], int]:
-    """Camera and focal length by EXIF, and its orientation; nothing and 1 where it is silent."""
-    try:
-        with Image.open(path) as image:
-            tags = image.getexif()
-            details = tags.get_ifd(ExifTags.IFD.Exif)
-            names = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
-            values = [tags.get(ExifTags.Base.Model), *map(details.get, names)]
-            return tuple(map(str, values)), int(tags.get(ExifTags.Base.Orientation, 1))
-    except Exception:  # tags are damaged in more ways than Pillow has names for
-        return (), 1
+def _camera(exif: Image.Exif) -> tuple[str, ...]:
+    """Camera and focal length by EXIF."""
+    details = exif.get_ifd(ExifTags.IFD.Exif)
+    names = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
+    return tuple(map(str, [exif.get(ExifTags.Base.Model), *map(details.get, names)]))
 
 
 def _shown(size: tuple[int, int]) -> str:

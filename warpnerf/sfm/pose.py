@@ -144,7 +144,9 @@ def inputs(source: Path, config: PoseConfig) -> dict[str, Any]:
     """
     files = photographs_in(source) if source.is_dir() else [source]
     states = [(path, path.stat()) for path in files]
-    how = {name: str(value) for name, value in asdict(config).items() if name != "threads"}
+    masks = None if config.masks is None else config.masks.resolve()
+    settings = asdict(config) | {"masks": masks}
+    how = {name: str(value) for name, value in settings.items() if name != "threads"}
     return {
         "source": str(source.resolve()),
         "files": [[path.name, state.st_size, state.st_mtime_ns] for path, state in states],
@@ -155,7 +157,9 @@ def inputs(source: Path, config: PoseConfig) -> dict[str, Any]:
 def is_made_of(folder: Path, source: Path, config: PoseConfig) -> bool:
     """Whether a folder holds the posed scene that ``pose`` would make."""
     record = scene_files.read_record(folder)
-    return record is not None and record.made_of == inputs(source, config)
+    if record is None or not exists(folder / scene_files.TRANSFORMS):
+        return False
+    return record.made_of == inputs(source, config)
 
 
 def _is_video(source: Path) -> bool:

@@ -11,6 +11,7 @@ pose.json                      what was found, what it was made of, and which fi
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -19,15 +20,19 @@ from typing import Any
 import msgspec
 
 from warpnerf.checks import InputError
+from warpnerf.scenes.assemble import POSED
 from warpnerf.scenes.contents import holds_scene
 from warpnerf.scenes.files import exists, read_json
+from warpnerf.sfm.photographs import put_into
 
 TRANSFORMS = "transforms.json"
 POINTS = "sparse_pc.ply"
 MODEL = "sparse/0"
-SUMMARY = "pose.json"
+SUMMARY = POSED
 IN_RUN = "scene"
 """Folder of a run that was given photographs without poses, for the scene made of them."""
+NEXT_IN_RUN = "next/scene"
+"""Where that scene is until the run begins: until then the folder may hold another run."""
 
 LENS_KEYS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2")
 FISHEYE = "OPENCV_FISHEYE"
@@ -125,16 +130,44 @@ def move_into(prepared: Path, folder: Path) -> None:
         target = folder / path.relative_to(prepared)
         target.parent.mkdir(parents=True, exist_ok=True)
         path.replace(target)
+    shutil.rmtree(prepared)  # empty folders
+
+
+def copy_written(folder: Path, record: Record, target: Path) -> None:
+    """Put the files of a posed scene into another folder too, as hard links where possible.
+
+    The record comes first, so that whatever is there of a copy can be removed by it.
+
+    Raises:
+        OSError: They cannot be written.
+    """
+    for path in sorted(_written(folder, record), key=lambda path: path.name != SUMMARY):
+        place = target / path.relative_to(folder.resolve())
+        put_into(place.parent, path, path.name)
 
 
 def remove_written(folder: Path, record: Record) -> None:
     """Remove the files of a posed scene, and folders that are then empty; nothing else."""
     root = folder.resolve()
-    for name in record.written:
-        path = root / name
-        if path.resolve().is_relative_to(root) and path.is_file():
-            path.unlink()
+    for path in _written(folder, record):
+        path.unlink()
     folders = {parent for name in record.written for parent in Path(name).parents[:-1]}
     for inner in sorted(folders, reverse=True):
         with suppress(OSError):  # not empty, or never made
             (root / inner).rmdir()
+
+
+def remove_posed(folder: Path) -> None:
+    """Remove what the record of a posed scene lists, and the folder if that was all."""
+    record = read_record(folder)
+    if record is not None:
+        remove_written(folder, record)
+        with suppress(OSError):  # not empty
+            folder.rmdir()
+
+
+def _written(folder: Path, record: Record) -> list[Path]:
+    """The files that a record lists, as far as they are there; none outside the folder."""
+    root = folder.resolve()
+    paths = [root / name for name in record.written]
+    return [p for p in paths if p.resolve().is_relative_to(root) and p.is_file()]

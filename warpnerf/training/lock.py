@@ -23,7 +23,7 @@ def only_writer(folder: Path) -> Iterator[None]:
     """Be the only process that writes to a folder. The lock ends with the process, however it ends.
 
     Args:
-        folder: Made if it does not exist.
+        folder: Made if it does not exist, and then removed if nothing was written to it.
 
     Raises:
         InputError: Another process has it, or it cannot be written to.
@@ -32,20 +32,22 @@ def only_writer(folder: Path) -> Iterator[None]:
         yield
         return
     path = folder / NAME
-    there = folder.exists()
+    made = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        file = _locked(path)
-    except OSError as error:
-        if not there:
-            with suppress(OSError):
-                folder.rmdir()
-        raise cannot_write(str(folder), error) from error
-    try:
-        yield
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            file = _locked(path)
+        except OSError as error:
+            raise cannot_write(str(folder), error) from error
+        try:
+            yield
+        finally:
+            path.unlink(missing_ok=True)
+            os.close(file)
     finally:
-        path.unlink(missing_ok=True)
-        os.close(file)
+        with suppress(OSError):  # not empty, as where something was written
+            for place in made:
+                place.rmdir()
 
 
 def _locked(path: Path) -> int:

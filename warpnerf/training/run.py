@@ -9,6 +9,7 @@ test.png                     a few test views, to look at first: truth, renderin
 test/                        truth, rendering and depth of each test view, side by side
 scene/                       photographs with the poses that were estimated, where they had none
 .lock                        while a training writes here
+next/scene/                  the same, until the run that it is made for begins
 previous/                    a run that was replaced, until this one has saved something
 """
 
@@ -36,7 +37,14 @@ from warpnerf.model import models
 from warpnerf.rendering.field import Field, Rendering
 from warpnerf.scenes.files import read_json
 from warpnerf.scenes.scene import Scene, View, require_split
-from warpnerf.sfm.scene_files import IN_RUN, read_record
+from warpnerf.sfm.scene_files import (
+    IN_RUN,
+    NEXT_IN_RUN,
+    copy_written,
+    move_into,
+    read_record,
+    remove_posed,
+)
 from warpnerf.training import lock
 from warpnerf.training.checkpoint import (
     DamagedFileError,
@@ -66,7 +74,7 @@ class RunConfig(msgspec.Struct, frozen=True):
     """What config.json says, as far as it is read again."""
 
     scene: str
-    """Absolute path, or built-in name."""
+    """Path, in the file relative to the run's folder if it lies there; or built-in name."""
     downscale: int
     """Pixels of the photographs averaged, in each direction."""
     content_distance: float
@@ -172,11 +180,14 @@ class Run:
     ) -> None:
         """Make the folder and write its configuration; an older run's files go to previous/.
 
+        A scene that waits in next/ is put in its place if it is the source, and else removed.
+
         Raises:
             InputError: The folder cannot be made or written to.
         """
+        stored = self._stored(source)
         content = {
-            "scene": source,
+            "scene": stored,
             "downscale": downscale,
             "masks": masks,
             "content_distance": content_distance,
@@ -194,9 +205,15 @@ class Run:
             }
         try:
             (self.folder / "test").mkdir(parents=True, exist_ok=True)
-            self._set_aside()
+            self._set_aside(in_use=Path(source))
             text = json.dumps(content, indent=2) + "\n"
             write_atomically(self.folder / "config.json", text.encode())
+            waiting = self.folder / NEXT_IN_RUN
+            if stored == IN_RUN and _same(source, waiting):
+                move_into(waiting, self.folder / IN_RUN)
+            remove_posed(waiting)
+            with suppress(OSError):  # not empty, or not there
+                waiting.parent.rmdir()
         except OSError as error:
             raise cannot_write(f"--output {self.folder}", error) from error
 
@@ -215,7 +232,10 @@ class Run:
                 return tree | {"train": config_from_json(tree["train"])}
             return tree
 
-        return read_json(path, RunConfig, prepare, models.decode)
+        config = read_json(path, RunConfig, prepare, models.decode)
+        if config.scene.startswith("builtin:"):
+            return config
+        return msgspec.structs.replace(config, scene=str(self.folder / config.scene))
 
     def log(self, progress: Progress) -> None:
         """Append a report to log.jsonl.
@@ -398,19 +418,46 @@ class Run:
             return [name for name in listed if Path(name).name == name]
         return [path.name for path in (self.folder / "test").glob("*.png")]
 
-    def _set_aside(self) -> None:
-        """Move an older run to previous/, so that at any moment one of the two folders is whole."""
+    def _stored(self, source: str) -> str:
+        """A scene's place as config.json has it, so that a run can be moved with its scene."""
+        if source.startswith("builtin:"):
+            return source
+        if _same(source, self.folder / NEXT_IN_RUN):
+            return IN_RUN
+        path, root = Path(source).resolve(), self.folder.resolve()
+        return path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
+
+    def _own_scene(self) -> Path | None:
+        """The posed scene in the folder; None where there is none, or the run is not of it."""
+        scene = self.folder / IN_RUN
+        try:
+            return scene if _same(self.read_config().scene, scene) and read_record(scene) else None
+        except InputError:
+            return None
+
+    def _set_aside(self, in_use: Path) -> None:
+        """Move an older run to previous/, so that at any moment one of the two folders is whole.
+
+        Args:
+            in_use: What the new run is made of; stays, even if it is the older one's scene.
+        """
         self._sweep()
-        if not self.results:
+        scene = self._own_scene()
+        if self.results:
+            self._discard_previous()
+            older = self.folder / "previous"
+            (older / "test").mkdir(parents=True, exist_ok=True)
+            write_atomically(older / "config.json", (self.folder / "config.json").read_bytes())
+            record = None if scene is None else read_record(scene)
+            if scene is not None and record is not None:
+                copy_written(scene, record, older / IN_RUN)
+            for path in [*self.results, *self._by_products()]:
+                path.replace(older / path.relative_to(self.folder))
+        else:
             for path in self._by_products():
                 path.unlink()
-            return
-        self._discard_previous()
-        older = self.folder / "previous"
-        (older / "test").mkdir(parents=True, exist_ok=True)
-        write_atomically(older / "config.json", (self.folder / "config.json").read_bytes())
-        for path in [*self.results, *self._by_products()]:
-            path.replace(older / path.relative_to(self.folder))
+        if scene is not None and not _same(in_use, scene):
+            remove_posed(scene)
 
     def _discard_previous(self) -> None:
         """Remove what ``_set_aside`` put aside, but nothing that others put there."""
@@ -419,6 +466,9 @@ class Run:
             older._sweep()
             for path in [*older._by_products(), *older.results]:
                 path.unlink()
+            scene = older._own_scene()
+            if scene is not None:
+                remove_posed(scene)
             (older.folder / "config.json").unlink(missing_ok=True)
             for folder in (older.folder / "test", older.folder):
                 with suppress(OSError):  # not empty
@@ -431,9 +481,15 @@ def _counts(path: Path) -> bool:
         return False
     if path.name == IN_RUN and read_record(path) is not None:
         return False
+    if path.name == Path(NEXT_IN_RUN).parent.name and path.is_dir():
+        return any(map(_counts, path.iterdir()))
     if re.fullmatch(rf"\.{IN_RUN}\.\d+\.tmp", path.name):
         return False
     return not (path.name == "test" and path.is_dir() and not any(path.iterdir()))
+
+
+def _same(path: str | Path, other: Path) -> bool:
+    return Path(path).resolve() == other.resolve()
 
 
 def _step_of(checkpoint: Path) -> str:

@@ -1,0 +1,163 @@
+"""Runs of photographs without poses: their posed scene comes, stays and goes with the run.
+
+COLMAP's answer is made up, as in tests/test_pose.py.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from test_pose import Colmap, listing, photographs
+
+from warpnerf.checks import InputError
+from warpnerf.cli import main as command
+from warpnerf.scenes.load import load_scene
+from warpnerf.sfm import pose as module
+from warpnerf.sfm import worker
+from warpnerf.training.lock import only_writer
+from warpnerf.training.run import Run
+from warpnerf.training.trainer import Trainer
+
+
+@pytest.fixture(autouse=True)
+def colmap(monkeypatch: pytest.MonkeyPatch) -> Colmap:
+    made_up = Colmap()
+    monkeypatch.setattr(module, "estimate", made_up)
+    monkeypatch.setattr(module, "require_pycolmap", lambda: None)
+    monkeypatch.setattr(worker, "is_installed", lambda: True)
+    return made_up
+
+
+@pytest.fixture
+def old(tmp_path: Path) -> Path:
+    """The folder of a run of 12 photographs."""
+    train(photographs(tmp_path / "old"), tmp_path / "run")
+    return tmp_path / "run"
+
+
+@pytest.fixture
+def others(tmp_path: Path) -> Path:
+    """Eight photographs."""
+    return photographs(tmp_path / "others", 8)
+
+
+def train(source: Path | str, output: Path, **options: Any) -> None:
+    tiny = {"steps": 2, "threads": 1, "voxels": 512}
+    assert command.train_command(str(source), output=output, **tiny | options) == 0
+
+
+def interrupted(*_: object, **__: object) -> None:
+    raise KeyboardInterrupt
+
+
+def images_of(run: Path) -> int:
+    """Photographs of the scene that a run can be measured on."""
+    assert command.eval_command(run, threads=1, split="all") == 0
+    return len(load_scene(Run(run).read_config().scene).views)
+
+
+def test_an_old_run_is_whole_until_the_new_one_begins(
+    tmp_path: Path, old: Path, others: Path, colmap: Colmap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = listing(old)
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(command, "_read", interrupted)
+        train(others, old, overwrite=True)
+    assert before.items() <= listing(old).items() and images_of(old) == 12
+    assert command.train_command(resume=old) == 0
+    colmap.job = {}
+    train(others, old, overwrite=True)
+    assert not colmap.job  # the poses were there
+    assert images_of(old) == 8 and len(list((old / "scene" / "images").iterdir())) == 8
+    assert not (old / "next").exists() and not (old / "previous").exists()
+
+
+def test_its_scene_is_put_aside_with_it(
+    old: Path, others: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (old / "scene" / "images" / "mine.txt").write_text("mine")
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Trainer, "run", interrupted)
+        train(others, old, overwrite=True)
+    assert images_of(old / "previous") == 12
+    assert len(load_scene(Run(old).read_config().scene).views) == 8
+    train("builtin:room-sparse", old, overwrite=True, downscale=8)
+    assert not (old / "previous").exists()
+    left = [path for path in (old / "scene").rglob("*") if path.is_file()]
+    assert left == [old / "scene" / "images" / "mine.txt"]
+
+
+def test_the_same_photographs_serve_both_runs(
+    tmp_path: Path, old: Path, colmap: Colmap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    colmap.job = {}
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Trainer, "run", interrupted)
+        train(tmp_path / "old", old, overwrite=True)
+    assert not colmap.job
+    assert listing(old / "scene") == listing(old / "previous" / "scene")
+    assert images_of(old / "previous") == 12
+    train(tmp_path / "old", old, overwrite=True)
+    assert images_of(old) == 12 and not (old / "previous").exists()
+
+
+def test_poses_for_a_run_that_never_began_go_with_the_next(
+    tmp_path: Path, others: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(command, "_read", interrupted)
+        train(others, tmp_path / "run")
+    assert [path.name for path in (tmp_path / "run").iterdir()] == ["next"]
+    train("builtin:room-sparse", tmp_path / "run", downscale=8)
+    assert not {"next", "scene"} & {path.name for path in (tmp_path / "run").iterdir()}
+
+
+def test_a_run_can_be_moved_with_its_scene(tmp_path: Path, old: Path) -> None:
+    assert json.loads((old / "config.json").read_text())["scene"] == "scene"
+    moved = old.rename(tmp_path / "moved")
+    assert images_of(moved) == 12
+    assert command.train_command(resume=moved) == 0
+    assert command.render_command(moved, stills="test", output=tmp_path / "pictures") == 0
+
+
+def test_masks_come_with_the_scene(tmp_path: Path, others: Path) -> None:
+    masks = photographs(tmp_path / "masks", 8)
+    train(others, tmp_path / "run", masks=masks)
+    masks.rename(tmp_path / "elsewhere")
+    assert Run(tmp_path / "run").read_config().masks is None
+    assert images_of(tmp_path / "run") == 8
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="nothing is locked there")
+def test_nobody_else_begins_while_poses_are_estimated_and_scenes_read(
+    tmp_path: Path, others: Path, colmap: Colmap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = []
+
+    def locked(real: Any) -> Any:
+        def call(*arguments: Any) -> Any:
+            message = "is training into this folder"
+            with pytest.raises(InputError, match=message), only_writer(tmp_path / "run"):
+                pass
+            seen.append(real)
+            return real(*arguments)
+
+        return call
+
+    monkeypatch.setattr(module, "estimate", locked(colmap))
+    monkeypatch.setattr(command, "_read", locked(command._read))
+    train(others, tmp_path / "run")
+    assert len(seen) == 2
+
+
+def test_interrupted_while_poses_are_estimated_nothing_is_left(
+    tmp_path: Path, others: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "estimate", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        train(others, tmp_path / "runs" / "new")
+    assert list(tmp_path.iterdir()) == [others]
