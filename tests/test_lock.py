@@ -33,7 +33,8 @@ def test_a_second_writer_is_told_who_the_first_is(tmp_path: Path) -> None:
         assert (tmp_path / ".lock").exists()
     assert not any(tmp_path.iterdir())
     with Run(tmp_path / "new" / "folder").only_writer():
-        pass
+        assert (tmp_path / "new" / "folder").is_dir()
+    assert not any(tmp_path.iterdir())  # folders go that were made for nothing
 
 
 def test_a_process_that_is_killed_holds_nothing(tmp_path: Path) -> None:

@@ -54,10 +54,10 @@ class Colmap:
         (Path(job["model"]) / "points.bin").touch()
         Path(job["points"]).write_text(PLY)
         poses = zip(placed, ring(len(placed)), strict=True)
-        lens = {"fl_x": 10.0, "fl_y": 10.0, "cx": 4.0, "cy": 3.0, **self.lens}
+        lens = {"w": 8, "h": 6, "fl_x": 10.0, "fl_y": 10.0, "cx": 4.0, "cy": 3.0, "k1": 0.01}
         return {
             "registered": {name: p[:3].tolist() for name, p in poses},
-            "cameras": {name: {**lens, "w": 8, "h": 6, "k1": 0.01} for name in placed},
+            "cameras": dict.fromkeys(placed, lens | self.lens),
             "points": 321,
             "error": 0.5,
             "groups": [placed],
@@ -79,10 +79,10 @@ def photos(tmp_path: Path) -> Path:
     return photographs(tmp_path / "photos")
 
 
-def photographs(folder: Path, n: int = N) -> Path:
+def photographs(folder: Path, n: int = N, times: int = 1) -> Path:
     folder.mkdir(parents=True)
     for k in range(n):
-        Image.fromarray(picture(k)).save(folder / f"{k:02}.png")
+        Image.fromarray(picture(k, width=8 * times, height=6 * times)).save(folder / f"{k:02}.png")
     return folder
 
 

@@ -26,6 +26,7 @@ from warpnerf.training.trainer import Trainer
 @pytest.fixture(autouse=True)
 def colmap(monkeypatch: pytest.MonkeyPatch) -> Colmap:
     made_up = Colmap()
+    made_up.lens |= {"w": 16, "h": 12, "fl_x": 20.0, "fl_y": 20.0, "cx": 8.0, "cy": 6.0}
     monkeypatch.setattr(module, "estimate", made_up)
     monkeypatch.setattr(module, "require_pycolmap", lambda: None)
     monkeypatch.setattr(worker, "is_installed", lambda: True)
@@ -35,14 +36,14 @@ def colmap(monkeypatch: pytest.MonkeyPatch) -> Colmap:
 @pytest.fixture
 def old(tmp_path: Path) -> Path:
     """The folder of a run of 12 photographs."""
-    train(photographs(tmp_path / "old"), tmp_path / "run")
+    train(photographs(tmp_path / "old", 12, times=2), tmp_path / "run")
     return tmp_path / "run"
 
 
 @pytest.fixture
 def others(tmp_path: Path) -> Path:
     """Eight photographs."""
-    return photographs(tmp_path / "others", 8)
+    return photographs(tmp_path / "others", 8, times=2)
 
 
 def train(source: Path | str, output: Path, **options: Any) -> None:
@@ -125,7 +126,7 @@ def test_a_run_can_be_moved_with_its_scene(tmp_path: Path, old: Path) -> None:
 
 
 def test_masks_come_with_the_scene(tmp_path: Path, others: Path) -> None:
-    masks = photographs(tmp_path / "masks", 8)
+    masks = photographs(tmp_path / "masks", 8, times=2)
     train(others, tmp_path / "run", masks=masks)
     masks.rename(tmp_path / "elsewhere")
     assert Run(tmp_path / "run").read_config().masks is None

@@ -170,7 +170,7 @@ def require_whole_image(path: Path) -> None:
 
     def decode(image: ImageFile.ImageFile) -> None:
         _check_kind(path, image)
-        image.draft("L", (image.width // 8, image.height // 8))
+        image.draft("L", (max(image.width // 8, 1), max(image.height // 8, 1)))
         image.load()
 
     _read(path, decode)
