@@ -113,6 +113,14 @@ def test_photographs_that_have_moved_are_no_reason_not_to_look(
         assert len(session._stage.cameras) == 5
 
 
+def test_a_wrong_place_of_photographs_is_refused(
+    run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["view", str(run_folder), "--scene", str(tmp_path / "gone"), "--port", "0"]) == 2
+    said = capsys.readouterr()
+    assert f"{tmp_path / 'gone'}" in said.err and "shown without" not in said.out
+
+
 def test_what_cannot_be_shown_is_refused(
     run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -140,7 +148,7 @@ def test_a_place_for_no_page_is_refused(
 def test_without_viser_nothing_is_begun(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("warpnerf.viewer.server.importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("warpnerf.checks.importlib.util.find_spec", lambda name: None)
     code = main(["train", "builtin:room", "--output", str(tmp_path / "run"), "--view"])
     assert code == 2 and 'pip install "warpnerf[viewer]"' in capsys.readouterr().err
     assert not (tmp_path / "run").exists()

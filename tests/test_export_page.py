@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,9 @@ from test_export_cameras import ball_scene
 
 from warpnerf.checks import InputError
 from warpnerf.exporting.export import export
+from warpnerf.exporting.page import splats_html
+from warpnerf.exporting.splats import splats_of
+from warpnerf.scenes.camera import Camera
 
 pytest.importorskip("viser")
 
@@ -46,6 +50,26 @@ def test_without_viser_it_says_what_to_install(
     with pytest.raises(InputError, match=r'pip install "warpnerf\[viewer\]"'):
         export(ball_field(), tmp_path / "b.html", scene=ball_scene())
     assert list(tmp_path.iterdir()) == []
+
+
+def test_lengths_of_any_unit_make_the_same_page() -> None:
+    """viser shows what lies between a hundredth and a thousand of its units."""
+    scene, pages = ball_scene(), []
+    splats = splats_of(ball_field())
+    for unit in (1.0, 1024.0):  # a power of two: no digit is rounded
+        views = [replace(view, camera=in_unit(view.camera, unit)) for view in scene.views]
+        pages.append(
+            splats_html(
+                replace(splats, centres=unit * splats.centres, scales=unit * splats.scales),
+                replace(scene, views=views, content_distance=unit * scene.content_distance),
+                (0.3, 0.3, 0.3),
+            )
+        )
+    assert pages[0] == pages[1]
+
+
+def in_unit(camera: Camera, unit: float) -> Camera:
+    return replace(camera, c2w=camera.c2w * [1.0, 1.0, 1.0, unit])
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")

@@ -12,6 +12,8 @@ from tiny_fields import tiny_field
 from warpnerf.exporting import sight
 from warpnerf.exporting.nodes import nodes_of, points_of, values_at
 from warpnerf.exporting.sight import look
+from warpnerf.scenes.scene import View
+from warpnerf.scenes.undistort import seen_pixels
 
 
 @pytest.mark.parametrize("contraction", ["none", "linf", "l2"])
@@ -54,6 +56,36 @@ def test_colours_are_means_over_the_pixels_that_see_them() -> None:
     )
     assert seen.tolist() == [True, True, False]
     assert rgb[0, 0] > 0.7 > 0.4 > rgb[1, 0] and rgb[1, 1] > 0.7
+
+
+def test_pixels_that_do_not_count_see_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half of the picture masked: the other half's light, and colours, remain."""
+    field = tiny_field()
+    field = replace(field, steps=replace(field.steps, transmittance_min=0.0))
+    camera = camera_at((2.2, 0.4, 0.5))
+    mask = np.zeros((40, 48), bool)
+    mask[:, 24:] = True
+    view = View(name="half", camera=camera, image=np.zeros((40, 48, 3), np.uint8), mask=mask)
+    shown, half = field.render(camera), look(field, [view])
+    opacity = shown.opacity[mask].sum(dtype=np.float64)
+    assert 0.0 < opacity < 0.9 * shown.opacity.sum()
+    assert half.light.sum(dtype=np.float64) == pytest.approx(opacity, rel=1e-4)
+    weighted = (shown.rgb * shown.opacity[..., None])[mask].sum(axis=0, dtype=np.float64)
+    np.testing.assert_allclose(half.colour.sum(axis=(0, 1, 2), dtype=float), weighted, rtol=1e-4)
+    monkeypatch.setattr(sight, "MAX_RAYS", 48 * 40 // 4)  # blocks of 2 x 2
+    assert look(field, [view]).light.sum() == pytest.approx(opacity, rel=0.05)
+
+
+def test_corners_outside_of_a_fisheyes_circle_see_nothing() -> None:
+    field = tiny_field()
+    field = replace(field, steps=replace(field.steps, transmittance_min=0.0))
+    camera = replace(camera_at((0.3, 0.2, 0.4)), fx=7.0, fy=7.0, fisheye=True)
+    seen = seen_pixels(camera)
+    assert seen is not None and 0.3 < seen.mean() < 0.9
+    opacity = field.render(camera).opacity
+    assert opacity[~seen].sum() > 0.1 * opacity.sum()
+    light = look(field, [camera]).light
+    assert light.sum(dtype=np.float64) == pytest.approx(float(opacity[seen].sum()), rel=1e-4)
 
 
 def test_fewer_rays_stand_for_as_many_pixels(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -56,6 +56,17 @@ def test_a_ball_of_splats_looks_like_the_field() -> None:
         assert psnr(image[::-1], truth) < 20.0 and psnr(image[:, ::-1], truth) < 20.0
 
 
+@pytest.mark.filterwarnings("error")
+def test_the_rim_of_folded_space_is_left_out_silently() -> None:
+    """Opaque everywhere: the outermost nodes are infinitely far away."""
+    field = ball_field(contraction="linf")
+    values = field.grid.values.numpy()
+    values[:, 0] = 10.0
+    field.grid.values.assign(values)
+    made = splats_of(field)
+    assert len(made.centres) > 1000 and np.isfinite(made.centres).all()
+
+
 @pytest.mark.parametrize("sigma", [2.0, 5.0])
 def test_matter_of_even_density_is_as_opaque(sigma: float) -> None:
     """Fog all over the box, from outside; the camera sees only what lies before the faces."""

@@ -14,7 +14,8 @@ from warpnerf.media.pictures import depth_colours, depth_picture, to_bytes
 from warpnerf.model.grid import FreeCells
 from warpnerf.rendering.field import Field
 from warpnerf.viewer.painter import Painter, Settings, Subject
-from warpnerf.viewer.viewpoint import Viewpoint, World, fov_to_see
+from warpnerf.viewer.recorder import Recorder
+from warpnerf.viewer.viewpoint import Viewpoint, World, first_look, fov_to_see
 
 SIZE = (40, 30)
 SETTINGS = Settings(near=1.0, far=4.0, within=2.5)
@@ -161,6 +162,28 @@ def test_what_is_no_camera_is_none(said: dict[str, Any]) -> None:
     world = World(scale=1.0)
     assert world.viewpoint(**good) is not None
     assert world.viewpoint(**(good | said)) is None
+
+
+def test_a_canvas_wider_than_any_video_can_be_recorded() -> None:
+    recorder = Recorder()
+    for x in (0.0, 1.0):
+        there = World(scale=1.0).viewpoint((1, 0, 0, 0), (x, 0, 0), 0.9, 10_240, 1440)
+        assert there is not None and (there.width, there.height) == (8000, 1125)
+        recorder.add(there, 1.0)
+    assert recorder.line().shape == (32, 3)
+
+
+@pytest.mark.parametrize(
+    "lens", [{"fisheye": True, "fx": 3.0, "fy": 3.0}, {"width": 9000, "fx": 9000.0}]
+)
+def test_pages_begin_before_any_photograph(lens: dict[str, Any]) -> None:
+    """More than a window can hold, of a fisheye's circle, is seen at 90 degrees."""
+    camera = camera_at(ring(5)[2], **lens)
+    look = first_look([camera])
+    np.testing.assert_array_equal(look.c2w, camera.c2w)
+    assert 0.1 < look.fov < 2.0
+    if camera.fisheye:
+        assert look.fov == pytest.approx(np.pi / 2)
 
 
 def test_a_window_sees_all_of_a_photograph() -> None:

@@ -162,7 +162,9 @@ def test_where_one_cannot_listen_is_refused(host: str, port: int, says: str) -> 
 
 def test_viser_missing_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r'pip install "warpnerf\[viewer\]"'):
+    with pytest.raises(
+        InputError, match=r'^the viewer needs viser: pip install "warp.*\[viewer\]"'
+    ):
         open_server("127.0.0.1", 0)
 
 

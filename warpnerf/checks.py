@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import importlib.util
 import math
 from collections.abc import Iterable
 
@@ -63,6 +64,18 @@ def require_shares(field: str, shares: tuple[float, ...]) -> None:
     """Raise InputError unless these are shares of the training, one after another."""
     if list(shares) != sorted(shares) or not all(0 < share < 1 for share in shares):
         raise InputError(f"{field} must be shares between 0 and 1 in rising order, not {shares}.")
+
+
+def require_extra(package: str, extra: str, what: str) -> None:
+    """Raise InputError unless an optional package is installed.
+
+    Args:
+        package: The name that it is imported by.
+        extra: Of warpnerf, that brings it.
+        what: Is impossible without it.
+    """
+    if importlib.util.find_spec(package) is None:
+        raise InputError(f'{what} needs {package}: pip install "warpnerf[{extra}]".')
 
 
 def require_rays(origins: np.ndarray, directions: np.ndarray) -> None:

@@ -50,8 +50,8 @@ def export_command(
         threads: CPU threads; by default one per usable core.
     """
     from warpnerf.exporting.export import FORMATS, checked_ending, export
-    from warpnerf.scenes.load import load_scene
     from warpnerf.training.run import Run
+    from warpnerf.training.run_scene import load_run_scene
 
     run = Run(folder)
     config = run.read_config()
@@ -59,10 +59,7 @@ def export_command(
     field, notes = run.load_field(device, threads)
     for note in notes:
         print(f"warpnerf: note: {note}", file=sys.stderr)
-    masks = config.masks if scene is None else None
-    views = load_scene(
-        scene or config.scene, downscale=config.downscale, masks=masks, images="files"
-    )
+    views = load_run_scene(config, scene)
     n_cameras = len(views.training_cameras)
     grid = " x ".join(map(str, field.grid.size))
     print(f"exporting a grid of {grid} nodes as a {kind}", flush=True)

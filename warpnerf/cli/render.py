@@ -60,8 +60,8 @@ def render_command(
     """
     from warpnerf.media.filming import checked_depths, depth_range, render_stills, render_video
     from warpnerf.media.video import video_file
-    from warpnerf.scenes.load import load_scene
     from warpnerf.training.run import Run
+    from warpnerf.training.run_scene import load_run_scene
 
     if depths is not None:
         checked_depths(depths)
@@ -93,13 +93,13 @@ def render_command(
     elif stills is None:
         from warpnerf.media.camera_path import PathKind, camera_path, natural_path
 
-        views = load_scene(scene or config.scene, downscale=config.downscale, images="files")
+        views = load_run_scene(config, scene)
         kind = natural_path(views) if path == "auto" else cast(PathKind, path)
         n_frames = _n_frames(fps, SECONDS if seconds is None else seconds)
         cameras = camera_path(views, kind, n_frames, size=size, distance=distance)
         what = f"{n_frames} frames, path {kind!r}"
     else:
-        views = load_scene(scene or config.scene, downscale=config.downscale, images="files")
+        views = load_run_scene(config, scene)
         named = _still_cameras(views, stills, size)
         cameras = list(named.values())
         what = f"{len(cameras)} views"

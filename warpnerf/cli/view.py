@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from warpnerf.checks import InputError
+from warpnerf.checks import InputError, require_extra
 
 if TYPE_CHECKING:
     from warpnerf.scenes.scene import Scene
@@ -74,9 +74,7 @@ class PageOptions:
                 if value is not None:
                     raise InputError(f"--{name} is where --view serves its page; give both.")
             return None
-        from warpnerf.viewer.server import require_viser
-
-        require_viser()
+        require_extra("viser", "viewer", "--view")
         return PageOptions(host=host or HOST, port=port)
 
 

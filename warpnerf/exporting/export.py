@@ -52,8 +52,9 @@ def export(
     Args:
         field: What to write.
         path: Of the file, which is replaced, or of a new folder.
-        scene: What the field was trained on: only what its training cameras see is written, in the
-            colours that they see. None: all of the field is; for a page and a folder it is needed.
+        scene: What the field was trained on: only what its training cameras see, where masks do not
+            hide it, is written, in the colours that they see. None: all of the field is; for a page
+            and a folder it is needed.
         unseen: Write what no training camera sees, too.
         level: Of a surface's density, 1 / scene unit; see ``extract_surface``.
         crop: Lower and upper corner of what is written, scene units; None: the field's box, for
@@ -79,12 +80,12 @@ def export(
     surface.check_options(field, level, crop, min_size)  # before what takes long
     if scene is None and ending in ("", ".html"):
         raise InputError(f"{path}: a {FORMATS[ending]} needs the scene of the training; give it.")
-    cameras = [] if scene is None else scene.training_cameras
-    sight = look(field, cameras, on_camera) if cameras else None
+    views = [] if scene is None else [scene.views[index] for index in scene.splits["train"]]
+    sight = look(field, views, on_camera) if views else None
     if ending in SPLATS:
         made = splats.splats_of(field, sight, unseen=unseen, crop=crop)
         if scene is not None and ending == ".html":
-            pieces = page.splats_html(made, cameras, field.background)
+            pieces = page.splats_html(made, scene, field.background)
         else:
             pieces = splats.splats_ply(made)
     elif ending in VOLUMES:
@@ -98,7 +99,7 @@ def export(
             scenes.write_scene(path, scene, found)
             return path
         if ending == ".glb":
-            up = up_direction(cameras) if cameras else None
+            up = None if scene is None else up_direction(scene.training_cameras)
             pieces = mesh.mesh_glb(found, up)
         else:
             write = {".obj": mesh.mesh_obj, ".ply": mesh.mesh_ply, ".points.ply": mesh.points_ply}

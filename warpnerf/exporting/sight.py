@@ -20,6 +20,8 @@ from warpnerf.rendering.field import Field
 from warpnerf.rendering.rays import RayBatch, camera_rays
 from warpnerf.rendering.render import TrainingPass
 from warpnerf.scenes.camera import Camera
+from warpnerf.scenes.scene import View
+from warpnerf.scenes.undistort import seen_pixels
 
 SEEN = 0.1
 """Pixels whose light comes from a node that counts as seen, at least."""
@@ -58,28 +60,34 @@ class Sight:
 
 
 def look(
-    field: Field, cameras: Sequence[Camera], on_camera: Callable[[int], None] | None = None
+    field: Field,
+    views: Sequence[View | Camera],
+    on_camera: Callable[[int], None] | None = None,
 ) -> Sight:
-    """Look through cameras.
+    """Look through cameras, where their photographs' masks leave pixels.
 
     The sums are transposes of rendering, so the adjoint computes them: of a field with the same
     density that is grey all over, before a grey background. Every ray's colour is 0.5 there, and
     dL/drgb of its squared error against the target 0.5 - v / 2 is v. A node's raw colour then gets
-    1/4 of the sum of weight times share times v, with v = 1 or the colour that the field shows.
+    1/4 of the sum of weight times share times v, with v = 1 or the colour that the field shows, and
+    0 in pixels that do not count.
 
     Args:
         field: What is looked at.
-        cameras: From where, at least one.
+        views: From where, at least one; a camera without a photograph sees in all pixels but those
+            around a fisheye's circle.
         on_camera: Called with the number of cameras that are done.
 
     Returns:
         What they see.
     """
+    cameras = [view.camera if isinstance(view, View) else view for view in views]
     workers, grid, rgb = field.workers, field.grid, Rgb()
     device = workers.device
     n_pixels = sum(camera.width * camera.height for camera in cameras)
     factor = max(1, math.ceil(math.sqrt(n_pixels / MAX_RAYS)))
-    looks = [c.downscaled(min(factor, c.width, c.height)) for c in cameras]
+    edges = [min(factor, camera.width, camera.height) for camera in cameras]
+    looks = [camera.downscaled(edge) for camera, edge in zip(cameras, edges, strict=True)]
 
     values = np.zeros((math.prod(grid.size), rgb.n_floats), np.float32)
     values[:, 0] = grid.values.numpy()[:, 0]
@@ -90,9 +98,10 @@ def look(
         TrainingPass(most, rgb, grey, nothing, field.steps, "none", "none", workers)
         for _ in range(2)
     )
-    for done, camera in enumerate(looks, 1):
+    for done, (camera, view, edge) in enumerate(zip(looks, views, edges, strict=True), 1):
         origins, directions = camera_rays(camera, workers)
         shown = field.render(camera).rgb.reshape(-1, 3)
+        counts = _share_that_counts(view, camera, edge).reshape(-1, 1)
         for adjoint, passed_down in ((light, np.ones_like(shown)), (colour, shown)):
             batch = RayBatch(
                 origins=origins,
@@ -100,7 +109,7 @@ def look(
                 offsets=wp.full(1, 0.5, dtype=real, device=device),
                 background=wp.full(1, vec3(GREY, GREY, GREY), dtype=vec3, device=device),
                 content_distance=wp.full(1, 1.0, dtype=real, device=device),
-                target_rgb=wp.array(GREY - 0.5 * passed_down, dtype=vec3, device=device),
+                target_rgb=wp.array(GREY - 0.5 * counts * passed_down, dtype=vec3, device=device),
             )
             adjoint.run(field.free, batch, n_batches=len(shown))  # a sum, not a mean
         if on_camera is not None:
@@ -112,3 +121,15 @@ def look(
         return sums.reshape(*grid.size, -1)
 
     return Sight(light=total(light, slice(1, 2))[..., 0], colour=total(colour, slice(1, 4)))
+
+
+def _share_that_counts(view: View | Camera, camera: Camera, edge: int) -> np.ndarray:
+    """Of the block of a view's pixels that each of a camera's stands for, [H, W] in [0, 1]."""
+    share = np.ones((camera.height, camera.width), np.float32)
+    mask = view.mask if isinstance(view, View) else None
+    if isinstance(view, View) and mask is not None:
+        blocks = mask[: camera.height * edge, : camera.width * edge]
+        blocks = blocks.reshape(camera.height, edge, camera.width, edge)
+        share = blocks.mean(axis=(1, 3), dtype=np.float32)
+    seen = seen_pixels(camera)
+    return share if seen is None else share * seen

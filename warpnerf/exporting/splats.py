@@ -144,12 +144,12 @@ def splats_ply(splats: Splats) -> list[bytes]:
 
 
 def _cells(field: Field, nodes: np.ndarray) -> np.ndarray:
-    """The edges of the cells around nodes as columns, [n, 3, 3] scene units."""
-    edges = [
-        points_of(field.grid, nodes + 0.5 * step) - points_of(field.grid, nodes - 0.5 * step)
-        for step in np.eye(3)
-    ]
-    return np.stack(edges, axis=2)
+    """The edges of the cells around nodes as columns, [n, 3, 3] scene units; some not finite."""
+    grid, half_steps = field.grid, 0.5 * np.eye(3)
+    beyond = np.stack([points_of(grid, nodes + step) for step in half_steps], axis=2)
+    before = np.stack([points_of(grid, nodes - step) for step in half_steps], axis=2)
+    with np.errstate(invalid="ignore"):  # both are infinite at the rim of folded space
+        return np.asarray(beyond - before)
 
 
 def _axes(jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

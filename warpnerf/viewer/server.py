@@ -7,7 +7,6 @@ connects must have asked for this machine by a name of its own, and a page must 
 from __future__ import annotations
 
 import functools
-import importlib.util
 import logging
 import socket
 import warnings
@@ -18,7 +17,7 @@ from ipaddress import ip_address
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from warpnerf.checks import InputError
+from warpnerf.checks import InputError, require_extra
 
 if TYPE_CHECKING:
     import viser
@@ -28,12 +27,6 @@ PORT = 8080
 
 MAX_MESSAGE_BYTES = 1 << 20
 """From a page; all that it has to say are a few numbers."""
-
-
-def require_viser() -> None:
-    """Raise InputError unless viser is installed."""
-    if importlib.util.find_spec("viser") is None:
-        raise InputError('the viewer needs viser: pip install "warpnerf[viewer]".')
 
 
 def open_server(host: str, port: int | None) -> viser.ViserServer:
@@ -46,7 +39,7 @@ def open_server(host: str, port: int | None) -> viser.ViserServer:
     Raises:
         InputError: viser is missing, or host and port cannot be listened at.
     """
-    require_viser()
+    require_extra("viser", "viewer", "the viewer")
     _require_free(host, 0 if port is None else port)
     import viser
     import websockets.asyncio.server

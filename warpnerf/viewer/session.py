@@ -17,18 +17,17 @@ from typing import Any
 
 import numpy as np
 
+from warpnerf.checks import require_extra
 from warpnerf.evaluation.near_field import NEAR_SHARE
-from warpnerf.media.camera_path import look_at, path_lens
-from warpnerf.scenes.scene import Scene, up_direction
+from warpnerf.media.camera_path import look_at
+from warpnerf.scenes.scene import Scene
 from warpnerf.viewer.painter import Painter, Settings, Subject
 from warpnerf.viewer.panel import Panel
 from warpnerf.viewer.screen import Pace, Screen
-from warpnerf.viewer.server import address, close_server, open_server, require_viser
+from warpnerf.viewer.server import address, close_server, open_server
 from warpnerf.viewer.stage import Stage
-from warpnerf.viewer.viewpoint import DISTANCE, Viewpoint, World, fov_to_see
+from warpnerf.viewer.viewpoint import FirstLook, Viewpoint, World, first_look
 
-ASPECT = 4.0 / 3.0
-"""Of a window that has not said its own yet."""
 WARM_UP_SIZE = (120, 90)
 """Pixels."""
 MAX_DEBT = 0.5
@@ -108,23 +107,19 @@ class Session:
         self._turns = 0
         self._last = monotonic()
         self._credit = 0.0
-        world = World(scale=DISTANCE / content_distance)
+        world = World.of(content_distance)
         self._world = world
         near, far = depths or (0.0, 2.5 * content_distance)
         settings = Settings(near=near, far=far, within=NEAR_SHARE * content_distance)
         grid = subjects[0].field().grid
         box = grid.box_min, grid.box_max
-        c2w, fov, up = _first_look(scene, box)
-        require_viser()
-        self._warm_up(Viewpoint(c2w=c2w, fov=fov, width=4, height=3), settings)
+        look = _before(box) if scene is None else first_look(scene.training_cameras)
+        require_extra("viser", "viewer", "the viewer")
+        self._warm_up(Viewpoint(c2w=look.c2w, fov=look.fov, width=4, height=3), settings)
         self.server = open_server(host, port)
         """viser's."""
         with self.server.atomic():
-            _, position = world.pose(c2w)
-            self.server.scene.set_up_direction((float(up[0]), float(up[1]), float(up[2])))
-            start = self.server.initial_camera
-            start.position, start.look_at = position, position - DISTANCE * c2w[:, 2]
-            start.up, start.fov = up, fov
+            world.begin(self.server, look)
             self._stage = Stage(self.server, world, scene)
             self._panel = Panel(
                 self.server,
@@ -265,17 +260,8 @@ class Session:
         self._pages.pop(client.client_id, None)
 
 
-def _first_look(
-    scene: Scene | None, box: tuple[np.ndarray, np.ndarray]
-) -> tuple[np.ndarray, float, np.ndarray]:
-    """Where new pages look from: the first training camera, or before the box.
-
-    Returns:
-        c2w [3, 4] in scene units, vertical field of view in radians, and what is up, [3].
-    """
-    if scene is not None:
-        camera = path_lens(scene.training_cameras[:1], None)
-        return camera.c2w, fov_to_see(camera, ASPECT), up_direction(scene.training_cameras)
+def _before(box: tuple[np.ndarray, np.ndarray]) -> FirstLook:
+    """Before a box, for fields without cameras."""
     middle, extent = 0.5 * (box[0] + box[1]), box[1] - box[0]
     up, before = np.array([0.0, 0.0, 1.0]), np.array([0.0, extent[1], 0.0])
-    return look_at(middle - before, middle, up), math.radians(50.0), up
+    return FirstLook(c2w=look_at(middle - before, middle, up), fov=math.radians(50.0), up=up)

@@ -7,14 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from warpnerf.checks import InputError
+from warpnerf.checks import InputError, require_extra
 from warpnerf.media.filming import depth_range
 from warpnerf.rendering.field import Field
-from warpnerf.scenes.load import load_scene
 from warpnerf.scenes.scene import Scene
-from warpnerf.training.run import Run
+from warpnerf.training.run import Run, RunConfig
+from warpnerf.training.run_scene import load_run_scene
 from warpnerf.viewer.painter import Subject
-from warpnerf.viewer.server import require_viser
 from warpnerf.viewer.session import Session
 
 
@@ -58,9 +57,10 @@ def open_view(
 ) -> Session:
     """The page of ``view``, not served yet. A scene may also be given by its folder or name.
 
-    Photographs that cannot be read are no reason not to look at a field: a note is printed.
+    Photographs that are not where the run had them are no reason not to look at its field: a note
+    is printed.
     """
-    require_viser()
+    require_extra("viser", "viewer", "the viewer")
     if len(shown) not in (1, 2):
         raise InputError(f"name one field or run, or two to compare, not {len(shown)}.")
     subjects, distance = [], None
@@ -77,7 +77,7 @@ def open_view(
         if distance is None:
             distance = config.content_distance
             if not isinstance(scene, Scene):
-                scene = _scene_of(scene or config.scene, config.downscale)
+                scene = _scene_of(config, scene)
     assert not isinstance(scene, str)
     first = subjects[0].field()
     if scene is not None:
@@ -98,10 +98,12 @@ def _subject(name: str, field: Field) -> Subject:
     return Subject(name=name, field=lambda: field)
 
 
-def _scene_of(source: str, downscale: int) -> Scene | None:
-    print(f"reading {source}", flush=True)
+def _scene_of(config: RunConfig, moved: str | None) -> Scene | None:
+    print(f"reading {moved or config.scene}", flush=True)
     try:
-        return load_scene(source, downscale=downscale, images="files")
+        return load_run_scene(config, moved)
     except InputError as error:
+        if moved is not None:
+            raise
         print(f"note: shown without its photographs: {error} Name them by --scene.", flush=True)
         return None

@@ -8,10 +8,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from warpnerf.media.camera_path import MAX_SIDE, path_lens
 from warpnerf.scenes.camera import Camera
+from warpnerf.scenes.scene import up_direction
+
+if TYPE_CHECKING:
+    import viser
 
 DISTANCE = 3.0
 """The content distance in viser's units. Its keys move by two of them in a second, and it shows
@@ -22,6 +28,9 @@ FLIP = np.array([1.0, -1.0, -1.0])
 
 FARTHEST = 1e5
 """From the origin, in viser's units, that a page may look from."""
+
+ASPECT = 4.0 / 3.0
+"""Of a window that has not said its own yet."""
 
 NARROWEST, WIDEST = math.radians(1.0), math.radians(170.0)
 """Fields of view that a page may ask for."""
@@ -36,9 +45,9 @@ class Viewpoint:
     fov: float
     """Vertical field of view, radians."""
     width: int
-    """Of the page's canvas, pixels."""
+    """Of the page's canvas, pixels; at most MAX_SIDE."""
     height: int
-    """Of the page's canvas, pixels."""
+    """Of the page's canvas, pixels; at most MAX_SIDE."""
 
     def camera(self, width: int, height: int) -> Camera:
         """The camera of a picture of any size, which the page stretches over its canvas."""
@@ -54,6 +63,18 @@ class Viewpoint:
         )
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FirstLook:
+    """Where a new page looks from."""
+
+    c2w: np.ndarray
+    """[3, 4] camera to world, OpenGL axes, scene units."""
+    fov: float
+    """Vertical field of view, radians."""
+    up: np.ndarray
+    """[3], what is up."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class World:
     """viser's world: the scene's, scaled about its origin."""
@@ -61,12 +82,26 @@ class World:
     scale: float
     """viser's units in a scene unit."""
 
+    @staticmethod
+    def of(content_distance: float) -> World:
+        """The world of a scene with this content distance, scene units."""
+        return World(scale=DISTANCE / content_distance)
+
     def pose(self, c2w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """A pose c2w [3, 4] as viser has it: quaternion [4] and position [3]."""
         from viser.transforms import SO3
 
         rotation = np.asarray(c2w[:, :3] * FLIP, np.float64)
         return SO3.from_matrix(rotation).wxyz, self.scale * c2w[:, 3]
+
+    def begin(self, server: viser.ViserServer, look: FirstLook) -> None:
+        """Have the pages of a server look from here first."""
+        _, position = self.pose(look.c2w)
+        x, y, z = look.up
+        server.scene.set_up_direction((float(x), float(y), float(z)))
+        start = server.initial_camera
+        start.position, start.look_at = position, position - DISTANCE * look.c2w[:, 2]
+        start.up, start.fov = look.up, look.fov
 
     def viewpoint(
         self,
@@ -92,6 +127,7 @@ class World:
         c2w = np.empty((3, 4))
         c2w[:, :3] = SO3(turn / length).as_matrix() * FLIP
         c2w[:, 3] = place / self.scale
+        width, height = _within_most(width, height)
         return Viewpoint(c2w=c2w, fov=fov, width=width, height=height)
 
 
@@ -104,3 +140,20 @@ def fov_to_see(camera: Camera, aspect: float) -> float:
     """
     half = max(0.5 * camera.height / camera.fy, 0.5 * camera.width / camera.fx / aspect)
     return min(2.0 * math.atan(half), WIDEST)
+
+
+def first_look(cameras: Sequence[Camera]) -> FirstLook:
+    """From where the first of some cameras stands, seeing the middle of its photograph.
+
+    Args:
+        cameras: Those of the training; they tell which way is up.
+    """
+    size = _within_most(cameras[0].width, cameras[0].height)
+    lens = path_lens(cameras[:1], size)
+    return FirstLook(c2w=lens.c2w, fov=fov_to_see(lens, ASPECT), up=up_direction(cameras))
+
+
+def _within_most(width: int, height: int) -> tuple[int, int]:
+    """A size of the same shape, within MAX_SIDE pixels."""
+    shrink = min(1.0, MAX_SIDE / max(width, height))
+    return max(1, round(shrink * width)), max(1, round(shrink * height))

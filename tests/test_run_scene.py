@@ -1,0 +1,82 @@
+"""Every command that looks at a run's photographs again ignores what its training ignored."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from tiny_fields import tiny_field
+from tiny_scenes import write_transforms
+
+from warpnerf.checks import InputError
+from warpnerf.cli.export import export_command
+from warpnerf.cli.render import render_command
+from warpnerf.config import TrainConfig
+from warpnerf.exporting import export as exporting
+from warpnerf.scenes.load import load_scene
+from warpnerf.training.run import Run
+from warpnerf.training.run_scene import load_run_scene
+
+
+def masked_run(folder: Path) -> Path:
+    """A run on six photographs; masks in the scene's folder hide all of one, half of the rest."""
+    write_transforms(folder / "scene", 6)
+    (folder / "scene/hide").mkdir()
+    for number in range(6):
+        mask = np.zeros((6, 8), np.uint8)
+        mask[:, 4:] = 0 if number == 2 else 255
+        Image.fromarray(mask).save(folder / f"scene/hide/{number:03d}.png")
+    masks = folder / "scene/hide"
+    scene = load_scene(folder / "scene", masks=masks)
+    run = Run(folder / "run")
+    distance = scene.content_distance
+    run.create(scene, str(folder / "scene"), 1, distance, TrainConfig(), str(masks))
+    run.save_field(tiny_field())
+    return folder / "run"
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_commands_keep_the_masks_of_the_training(
+    tmp_path: Path, moved: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, place = masked_run(tmp_path), None
+    if moved:
+        (tmp_path / "scene").rename(tmp_path / "elsewhere")
+        place = str(tmp_path / "elsewhere")
+    stills = tmp_path / "stills"
+    assert render_command(run, stills="all", output=stills, scene=place, threads=1) == 0
+    assert len(list(stills.glob("*.png"))) == 5
+
+    looked: list[np.ndarray] = []
+
+    def look(field: Any, views: Any, on_camera: Any) -> None:
+        looked.extend(view.mask for view in views)
+
+    monkeypatch.setattr(exporting, "look", look)
+    assert export_command(run, tmp_path / "a.npz", scene=place, threads=1) == 0
+    assert looked and all(mask[:, 4:].all() and not mask[:, :4].any() for mask in looked)
+
+
+def test_the_viewer_shows_no_photograph_that_is_masked_wholly(tmp_path: Path) -> None:
+    pytest.importorskip("viser")
+    from warpnerf.viewer.view import open_view
+
+    run = masked_run(tmp_path)
+    n = len(load_run_scene(Run(run).read_config()).training_cameras)
+    assert n < len(load_scene(tmp_path / "scene").training_cameras)
+    for scene in (None, str(tmp_path / "scene")):
+        with open_view(
+            [run], scene=scene, host="127.0.0.1", port=0, device="cpu", threads=1
+        ) as session:
+            assert len(session._stage.cameras) == n
+
+
+def test_masks_that_are_gone_are_named(tmp_path: Path) -> None:
+    config = Run(masked_run(tmp_path)).read_config()
+    (tmp_path / "scene/hide").rename(tmp_path / "hidden")
+    for moved in (None, str(tmp_path / "scene")):
+        with pytest.raises(InputError, match="scene/hide: the masks that the run was trained with"):
+            load_run_scene(config, moved)

@@ -1,0 +1,44 @@
+"""The photographs of a run, read once more: reduced, masked and measured as for its training."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from warpnerf.checks import InputError
+from warpnerf.scenes.load import load_scene
+from warpnerf.scenes.scene import Scene
+from warpnerf.training.run import RunConfig
+
+
+def load_run_scene(config: RunConfig, moved: str | None = None) -> Scene:
+    """Read the scene that a run was trained on; images stay in their files.
+
+    Args:
+        config: Of the run.
+        moved: Where the scene is now; None: where it was. Masks that lay inside it are looked for
+            there first.
+
+    Raises:
+        InputError: The scene cannot be read, or the run's masks are gone.
+    """
+    masks = _masks(config, moved)
+    scene = load_scene(
+        moved or config.scene, downscale=config.downscale, masks=masks, images="files"
+    )
+    return config.as_trained(scene)
+
+
+def _masks(config: RunConfig, moved: str | None) -> Path | None:
+    if config.masks is None:
+        return None
+    masks, scene = Path(config.masks), Path(config.scene)
+    if moved is not None and masks.is_relative_to(scene):
+        inside = Path(moved) / masks.relative_to(scene)
+        if inside.is_dir():
+            return inside
+    if not masks.is_dir():
+        raise InputError(
+            f"{masks}: the masks that the run was trained with are gone; put the folder back, or "
+            "a link to where it is now."
+        )
+    return masks
