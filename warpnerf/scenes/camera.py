@@ -143,7 +143,14 @@ class Camera:
         return points * scale[:, None], jacobian
 
     def block_for(self, n_pixels: int) -> int:
-        """Edge of the smallest blocks for which ``downscaled`` has at most so many pixels."""
+        """Edge of the smallest blocks of which ``downscaled`` makes at most so many pixels.
+
+        Args:
+            n_pixels: At least 1.
+
+        Returns:
+            Pixels; no more than the shorter side of the image.
+        """
         edge = math.ceil(math.sqrt(self.width * self.height / n_pixels))
         return max(1, min(edge, self.width, self.height))
 
