@@ -85,7 +85,7 @@ def test_it_is_for_scenes_whose_extent_is_a_guess() -> None:
 
 def test_training_takes_what_was_found(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = guessed_scene()
-    sight = coarse.Sight(
+    sight = coarse.SeenExtent(
         distances=np.arange(1.0, 7.0),
         content_distance=2.5,
         near_content=1.0,

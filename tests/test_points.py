@@ -23,7 +23,7 @@ from warpnerf.config import GridConfig, TrainConfig
 from warpnerf.evaluation.inspection import inspect
 from warpnerf.media.scene_plan import plan_picture
 from warpnerf.scenes.load import load_scene
-from warpnerf.scenes.points import Points, look
+from warpnerf.scenes.points import Points, seen_extent
 from warpnerf.scenes.scene import Scene
 from warpnerf.training.checkpoint import load_checkpoint, save_checkpoint
 from warpnerf.training.train import train
@@ -90,7 +90,7 @@ def test_distances_are_each_camera_s_own() -> None:
     cameras = [camera_at(pose) for r in (2.0, 4.0, 8.0) for pose in ring(3, radius=r, height=0.0)]
     seen = [ball() for _ in cameras]
     seen[4] = ball(5)
-    sight = look(cameras, seen, range(6))
+    sight = seen_extent(cameras, seen, range(6))
     assert sight is not None
     expected = [2.0, 2.0, 2.0, 4.0, 4.0, 4.0, 8.0, 8.0, 8.0]
     expected[4] = sight.content_distance  # sees too few
@@ -104,13 +104,13 @@ def test_distances_are_each_camera_s_own() -> None:
 def test_wrong_points_change_little() -> None:
     cameras = [camera_at(pose) for pose in ring(8)]
     rng = np.random.default_rng(3)
-    clean = look(cameras, [ball() for _ in cameras], range(8))
+    clean = seen_extent(cameras, [ball() for _ in cameras], range(8))
     seen = []
     for camera in cameras:
         close = camera.position + 0.02 * rng.normal(size=(6, 3))
         far = camera.position + camera.forward * rng.uniform(20.0, 2000.0, (40, 1))
         seen.append(np.concatenate([ball(), close, far]))
-    noisy = look(cameras, seen, range(8))
+    noisy = seen_extent(cameras, seen, range(8))
     assert clean is not None and noisy is not None
     assert noisy.content_distance == pytest.approx(clean.content_distance, rel=0.02)
     np.testing.assert_allclose(noisy.box_max, clean.box_max, rtol=0.1)
@@ -121,16 +121,16 @@ def test_a_camera_counts_as_much_as_another() -> None:
     cameras = [camera_at(pose) for pose in ring(4)]
     aside = np.array([5.0, 0.0, 0.0])
     seen = [ball(9000, seed=1), *(ball(100, seed=s) + aside for s in (2, 3, 4))]
-    sight = look(cameras, seen, range(4))
+    sight = seen_extent(cameras, seen, range(4))
     assert sight is not None and sight.box_max[0] > 5.0  # 3 % of the points are there
-    alone = look(cameras, [ball(100), *seen[:1] * 3], range(4))
+    alone = seen_extent(cameras, [ball(100), *seen[:1] * 3], range(4))
     assert alone is not None and alone.box_max[0] < 1.0
 
 
 def test_a_flat_scene_has_a_box_with_depth() -> None:
     cameras = [camera_at(pose) for pose in ring(4)]
     wall = np.random.default_rng(0).uniform(-1.0, 1.0, (500, 3)) * [1.0, 1.0, 0.0]
-    sight = look(cameras, [wall] * 4, range(4))
+    sight = seen_extent(cameras, [wall] * 4, range(4))
     assert sight is not None
     edges = sight.box_max - sight.box_min
     assert edges[:2] == pytest.approx(2.1, rel=0.1) and 0.3 < edges[2] < 0.5
@@ -138,13 +138,13 @@ def test_a_flat_scene_has_a_box_with_depth() -> None:
 
 def test_too_few_points_tell_nothing() -> None:
     cameras = [camera_at(pose) for pose in ring(4)]
-    assert look(cameras, [ball(9)] * 4, range(4)) is None
-    assert look(cameras, [ball(9)] * 2 + [ball(10)] * 2, range(3)) is None
-    assert look(cameras, [ball(9)] * 2 + [ball(10)] * 2, range(4)) is not None
-    assert look(cameras, [np.zeros((20, 3))] * 4, range(4)) is None  # all in one place
+    assert seen_extent(cameras, [ball(9)] * 4, range(4)) is None
+    assert seen_extent(cameras, [ball(9)] * 2 + [ball(10)] * 2, range(3)) is None
+    assert seen_extent(cameras, [ball(9)] * 2 + [ball(10)] * 2, range(4)) is not None
+    assert seen_extent(cameras, [np.zeros((20, 3))] * 4, range(4)) is None  # all in one place
     at_cameras = [np.tile(camera.position, (20, 1)) for camera in cameras]
-    assert look(cameras, at_cameras, range(4)) is None
-    sight = look(cameras, [*at_cameras[:2], ball(), ball()], range(4))
+    assert seen_extent(cameras, at_cameras, range(4)) is None
+    sight = seen_extent(cameras, [*at_cameras[:2], ball(), ball()], range(4))
     assert sight is not None and (sight.distances > 1.0).all()
 
 

@@ -14,7 +14,9 @@ import pytest
 from test_pose import Colmap, listing, photographs
 
 from warpnerf.checks import InputError
-from warpnerf.cli import main as command
+from warpnerf.cli import train as command
+from warpnerf.cli.evaluate import eval_command
+from warpnerf.cli.render import render_command
 from warpnerf.scenes.load import load_scene
 from warpnerf.sfm import pose as module
 from warpnerf.sfm import worker
@@ -57,7 +59,7 @@ def interrupted(*_: object, **__: object) -> None:
 
 def images_of(run: Path) -> int:
     """Photographs of the scene that a run can be measured on."""
-    assert command.eval_command(run, threads=1, split="all") == 0
+    assert eval_command(run, threads=1, split="all") == 0
     return len(load_scene(Run(run).read_config().scene).views)
 
 
@@ -122,7 +124,7 @@ def test_a_run_can_be_moved_with_its_scene(tmp_path: Path, old: Path) -> None:
     moved = old.rename(tmp_path / "moved")
     assert images_of(moved) == 12
     assert command.train_command(resume=moved) == 0
-    assert command.render_command(moved, stills="test", output=tmp_path / "pictures") == 0
+    assert render_command(moved, stills="test", output=tmp_path / "pictures") == 0
 
 
 def test_masks_come_with_the_scene(tmp_path: Path, others: Path) -> None:

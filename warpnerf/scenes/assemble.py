@@ -18,7 +18,7 @@ from warpnerf.scenes.images import exif_orientation, image_shape
 from warpnerf.scenes.lens import Lens
 from warpnerf.scenes.masks import Mask, PackedMask, masks_of_folder, read_mask
 from warpnerf.scenes.photographs import Keeping, Photograph, keep
-from warpnerf.scenes.points import Points, Sight, look
+from warpnerf.scenes.points import Points, SeenExtent, seen_extent
 from warpnerf.scenes.scene import Extent, Scene, View, estimate_extent
 from warpnerf.scenes.undistort import seen_pixels
 
@@ -166,7 +166,7 @@ def assemble(
     sight = None
     if points is not None:
         seen = [points.seen_by(view.name, view.camera) for view in views]
-        sight = look([view.camera for view in views], seen, indices["train"])
+        sight = seen_extent([view.camera for view in views], seen, indices["train"])
         extent = _seen_extent(extent, points, sight, unbounded)
     return Scene(
         name=folder.resolve().name,
@@ -190,7 +190,9 @@ def assemble(
     )
 
 
-def _seen_extent(extent: Extent, points: Points, sight: Sight | None, unbounded: bool) -> Extent:
+def _seen_extent(
+    extent: Extent, points: Points, sight: SeenExtent | None, unbounded: bool
+) -> Extent:
     """The extent by what cameras see; the box of an object stays what the cameras look at."""
     if sight is None:
         note = f"points of {points.source} are not used: too few tell what the cameras see"

@@ -87,7 +87,7 @@ class Points:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Sight:
+class SeenExtent:
     """What cameras see of a scene, as its points tell."""
 
     distances: np.ndarray
@@ -105,12 +105,12 @@ class Sight:
     """[3] upper corner."""
 
 
-def look(
+def seen_extent(
     cameras: Sequence[Camera],
     seen: Sequence[np.ndarray],
     training: Sequence[int],
     outside: float = OUTSIDE,
-) -> Sight | None:
+) -> SeenExtent | None:
     """Find how far from the cameras content is, and where.
 
     All training cameras count as much, however many points they see. All figures are medians and
@@ -149,7 +149,7 @@ def look(
         return None
     # A facade is flat, its box is not.
     margin = np.maximum(MARGIN * edges, 0.5 * (MIN_EDGE * edges.max() - edges))
-    return Sight(
+    return SeenExtent(
         distances=distances,
         content_distance=content_distance,
         near_content=float(_quantiles(distance, weight, (NEAREST,))[0]),
@@ -159,7 +159,7 @@ def look(
     )
 
 
-def seen_scene(scene: Scene, sight: Sight) -> Scene:
+def seen_scene(scene: Scene, sight: SeenExtent) -> Scene:
     """The scene with the extent of what its cameras see, found by training."""
     edges = " x ".join(f"{edge:.3g}" for edge in sight.box_max - sight.box_min)
     return replace(

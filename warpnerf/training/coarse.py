@@ -3,8 +3,8 @@
 Cameras that look outward, or in parallel directions, do not tell, and not every capture brings
 points. So such scenes are trained for a moment, in a box that may be several times too small, with
 all space around it folded in. What half of the light of a ray has met is a point of the scene; what
-points tell, these tell (``warpnerf.scenes.points.look``). A second round begins with the first
-one's box and distance.
+points tell, these tell (``warpnerf.scenes.points.seen_extent``). A second round begins with the box
+and the distance of the first.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from warpnerf.config import GridConfig, TrainConfig
 from warpnerf.rendering.field import Field
 from warpnerf.rendering.rays import camera_rays
-from warpnerf.scenes.points import Sight, look
+from warpnerf.scenes.points import SeenExtent, seen_extent
 from warpnerf.scenes.scene import Scene, View
 from warpnerf.training.state import TrainingState
 from warpnerf.training.trainer import Trainer
@@ -60,7 +60,7 @@ def is_needed(scene: Scene, config: TrainConfig) -> bool:
     return scene.guessed and folded and _steps(config) >= MIN_STEPS
 
 
-def find_sight(scene: Scene, config: TrainConfig) -> tuple[Sight | None, float]:
+def find_sight(scene: Scene, config: TrainConfig) -> tuple[SeenExtent | None, float]:
     """Find out what the cameras of a scene see, by short trainings.
 
     Args:
@@ -99,7 +99,7 @@ def _steps(config: TrainConfig) -> int:
     return min(config.coarse_steps, int(STEPS_SHARE * config.steps))
 
 
-def sight_of(scene: Scene, field: Field) -> Sight | None:
+def sight_of(scene: Scene, field: Field) -> SeenExtent | None:
     """What the cameras of a scene see of a field of it; None where too few see anything."""
     origins, directions, owner = _some_rays(scene.views, field)
     distance = median_distances(field, origins, directions)
@@ -108,7 +108,7 @@ def sight_of(scene: Scene, field: Field) -> Sight | None:
         points[(owner == index) & np.isfinite(distance)].astype(np.float64)
         for index in range(len(scene.views))
     ]
-    return look(scene.cameras, seen, scene.splits["train"], OUTSIDE)
+    return seen_extent(scene.cameras, seen, scene.splits["train"], OUTSIDE)
 
 
 def median_distances(field: Field, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:

@@ -21,7 +21,7 @@ from warpnerf.rendering.rays import PixelSampler
 from warpnerf.rendering.render import Steps, TrainingPass, march_struct
 from warpnerf.runtime.memory import give_back
 from warpnerf.runtime.parallel import Workers
-from warpnerf.scenes.points import Sight, seen_scene
+from warpnerf.scenes.points import SeenExtent, seen_scene
 from warpnerf.scenes.scene import Scene
 from warpnerf.training.optim import RULES, adam_step, add_total_variation, first_states
 from warpnerf.training.state import Progress, TrainingState, scene_digest
@@ -47,7 +47,7 @@ class Trainer:
         config: TrainConfig,
         resume: TrainingState | None = None,
         *,
-        sight: Sight | None = None,
+        sight: SeenExtent | None = None,
         seconds: float = 0.0,
     ) -> None:
         """Set up the first update, or the next one of a training to be resumed.

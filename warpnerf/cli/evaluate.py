@@ -1,0 +1,63 @@
+"""`warpnerf eval`: the figures of a trained run."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from warpnerf.cli.machine import require_writable, write_json
+
+
+def eval_command(
+    folder: tyro.conf.Positional[Path],
+    /,
+    scene: str | None = None,
+    masks: Path | None = None,
+    split: Literal["test", "train", "val", "all"] = "test",
+    lpips: Path | None = None,
+    json: Path | None = None,
+    device: str = "cpu",
+    threads: int | None = None,
+) -> int:
+    """Measure a trained run on a split of its scene, or of other photographs of the same place.
+
+    Args:
+        folder: Output folder of a training run.
+        scene: Other photographs in the same coordinates, reduced as those of the training were.
+        masks: Folder of masks for these photographs; without --scene by default as for training.
+        split: Which views.
+        lpips: Weights of LPIPS, to measure it as well; warpnerf/evaluation/lpips.py describes the
+            file.
+        json: Also write the figures to this file.
+        device: cpu, cuda, cuda:1, ...
+        threads: CPU threads; by default one per usable core.
+    """
+    from warpnerf.evaluation.evaluate import evaluate, require_measurable
+    from warpnerf.scenes.load import load_scene
+    from warpnerf.training.run import Run
+
+    require_writable(json)
+    distance = None
+    if lpips is not None:
+        from warpnerf.evaluation.lpips import Lpips
+
+        distance = Lpips(lpips)
+    run = Run(folder)
+    config = run.read_config()
+    field, notes = run.load_field(device, threads)
+    for note in notes:
+        print(f"warpnerf: note: {note}", file=sys.stderr)
+    folder_of_masks = masks or (config.masks if scene is None else None)
+    views = load_scene(
+        scene or config.scene, downscale=config.downscale, masks=folder_of_masks, images="files"
+    )
+    views = config.as_trained(views)
+    require_measurable(views, split)
+    result = evaluate(field, views, split, lpips=distance)
+    print(result)
+    if json is not None:
+        write_json(json, result.to_json())
+    return 0
