@@ -146,7 +146,7 @@ def test_the_command_says_where_they_are_and_goes_on_anywhere(
     monkeypatch.setattr(photographs, "TELL_EVERY", -1.0)
     assert main([*begin, "--images", "disk"]) == 0
     said = capsys.readouterr().out
-    assert f"MiB in {tmp_path}, removed at the end" in said
+    assert f"MiB in {run}, removed at the end" in said
     assert "read 7 of 8 photographs" in said
     field = (run / "field.safetensors").read_bytes()
     assert main(["train", "--resume", str(run), "--images", "disk"]) == 0
