@@ -32,7 +32,7 @@ ROUNDING = 1e-3
 
 _DAMAGE = (
     *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, OSError, EOFError, ValueError),
-    *(NotImplementedError, RuntimeError),  # of unknown compressions and encrypted archives
+    RuntimeError,  # of unknown compressions and of encrypted archives
 )
 
 MAX_SMALL = 2**26
