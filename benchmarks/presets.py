@@ -1,4 +1,4 @@
-"""What a configuration brings within equal time, against others.
+"""What a configuration brings within equal time, or equal steps, against others.
 
     python benchmarks/presets.py lego_200 fox_q --time-limit 180 --seeds 0 1 \\
         --candidate fast --candidate "quality grid.voxels=4000000 model.specular=12"
@@ -39,14 +39,15 @@ def main() -> None:
     known = "builtin:room, builtin:room-sparse, folders"
     parser.add_argument("scenes", nargs="*", default=["builtin:room"], help=known)
     parser.add_argument("--candidate", action="append", help="a preset, and what is different")
-    parser.add_argument("--time-limit", type=float, default=180.0, help="seconds each")
-    parser.add_argument("--steps", type=int, default=10_000_000, help="at most so many, from 2")
+    parser.add_argument("--time-limit", type=float, help="seconds each, by default 180")
+    parser.add_argument("--steps", type=int, help="equal steps instead of equal time")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--downscale", type=int, default=1)
     args = parser.parse_args()
-    limits = {"steps": args.steps, "time_limit": args.time_limit, "device": args.device}
+    limit = args.time_limit or (None if args.steps else 180.0)
+    fixed = {"steps": args.steps or 10_000_000, "time_limit": limit, "device": args.device}
     candidates = {
-        text: replace(configured(text), **limits) for text in args.candidate or list(PRESETS)
+        text: replace(configured(text), **fixed) for text in args.candidate or list(PRESETS)
     }
     rows = []
     for name in args.scenes:
@@ -68,7 +69,8 @@ def main() -> None:
         record = {
             "benchmark": "presets",
             "machine": machine(args.device, Workers(args.device).count),
-            "time_limit": args.time_limit,
+            "time_limit": limit,
+            "steps": args.steps,
             "downscale": args.downscale,
             "candidates": {text: config_to_json(config) for text, config in candidates.items()},
             "rows": rows,

@@ -247,7 +247,7 @@ def run_case(
     if case.model != "rgb" and missing:
         print(f"  left out: {'; '.join(f'{name}, {reason}' for name, reason in missing.items())}")
     runs = {(n, t): load(work, t, args.device) for n, load in found.items() for t in args.threads}
-    differences = check(runs, AT_KINKS if work.model == "features" else 0.0)
+    differences = check(runs, AT_KINKS if work.model in ("features", "dvgo") else 0.0)
     calls = {key: run.step for key, run in runs.items()}
     several = [t for t in args.threads if t > 1 and 1 in args.threads]
     for t in several:

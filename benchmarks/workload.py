@@ -43,7 +43,7 @@ ALPHA_MIN = 1e-2
 
 Rays = Literal["inside", "random", "patches"]
 Scene = Literal["dense", "sphere"]
-ModelName = Literal["rgb", "sh", "deferred", "features"]
+ModelName = Literal["rgb", "sh", "deferred", "features", "dvgo"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,17 +64,29 @@ class Model:
     """Of each."""
     n_frequencies: int = 0
     """Of the encoding of directions, 3 + 6 n numbers."""
-    threshold: float = 0.0
-    """`features` gives a sample a colour where its weight is above this."""
+    threshold: float | None = None
+    """A network for each sample gives it a colour where its weight is above this."""
+    n_own_colours: int = 0
+    """Features of a sample that are colour, to which its network adds: 3 or none."""
 
 
 MODELS: dict[ModelName, Model] = {
     "rgb": Model(n_features=3, n_values=4),
     "sh": Model(n_features=27, n_values=32, degree=2),
     "deferred": Model(n_features=7, n_values=8, n_inputs=7 + 9, n_frequencies=1),
-    "features": Model(n_features=12, n_values=16, n_inputs=9 + 27, n_frequencies=4, threshold=1e-4),
+    "features": Model(
+        n_features=12,
+        n_values=16,
+        n_inputs=9 + 27,
+        n_frequencies=4,
+        threshold=1e-4,
+        n_own_colours=3,
+    ),
+    "dvgo": Model(
+        n_features=12, n_values=16, n_inputs=12 + 27, width=128, n_frequencies=4, threshold=1e-4
+    ),
 }
-"""As they are by default; `features` is residual."""
+"""Those of warpnerf as they are by default, and `features` as DVGO has it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -117,6 +129,8 @@ class Workload:
 
     def warp_model(self) -> interface.Model:
         """The model as warpnerf takes it."""
+        if self.model == "dvgo":
+            return models.Features(width=128, residual=False)
         return models.model_of(self.model)
 
     def weights(self, workers: Workers) -> wp.array:

@@ -11,7 +11,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 
 import workload
-from candidates import torch_models
+from candidates import torch_adam, torch_models
 
 
 def oracle(work: workload.Workload) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -23,6 +23,7 @@ def oracle(work: workload.Workload) -> tuple[np.ndarray, np.ndarray, np.ndarray,
         "sh": reference.ShHead(2),
         "deferred": reference.DeferredHead(network),
         "features": reference.FeaturesHead(network),
+        "dvgo": reference.FeaturesHead(network, residual=False),
     }
     out = reference.render(
         raw,
@@ -50,7 +51,7 @@ def oracle(work: workload.Workload) -> tuple[np.ndarray, np.ndarray, np.ndarray,
 
 @pytest.mark.parametrize("grid", [15, 16])
 @pytest.mark.parametrize(("scene", "scaled"), [("dense", True), ("sphere", True), ("dense", False)])
-@pytest.mark.parametrize("model", ["sh", "deferred", "features"])
+@pytest.mark.parametrize("model", ["sh", "deferred", "features", "dvgo"])
 def test_torch_computes_what_the_oracle_does(model, scene, scaled, grid):
     work = workload.make_workload("random", grid, 130, 48, scene=scene, scaled=scaled, model=model)
     rgb, gradient, of_network, weights = oracle(work)
@@ -90,3 +91,23 @@ def test_pairs_add_what_rows_do(size):
     assert bool((rows > 0).all())
     torch_models.add_by_pairs(pairs, node[:0], share[:0], adj_raw[:0])
     torch.testing.assert_close(pairs, rows)
+
+
+@pytest.mark.parametrize("way", ["all", "rows"])
+def test_adam_leaves_alone_what_no_ray_has_touched(way):
+    """The others it updates as torch.optim.Adam does."""
+    generator = torch.Generator().manual_seed(0)
+    values = torch.rand(50, 4, generator=generator)
+    expected = values.clone().requires_grad_()
+    theirs = torch.optim.Adam([expected], lr=0.1, betas=(0.9, 0.99))
+    gradient = torch.zeros(50, 4)
+    ours = torch_adam.MaskedAdam([(values, gradient)], 0.1)
+    ours.way = way
+    first = values.clone()
+    for _ in range(3):
+        gradient[:20, :3] = torch.rand(20, 3, generator=generator) + 0.1
+        ours.step()
+        expected.grad = gradient.clone()
+        theirs.step()
+    torch.testing.assert_close(values[:20, :3], expected.detach()[:20, :3])
+    assert torch.equal(values[20:], first[20:]) and torch.equal(values[:, 3], first[:, 3])

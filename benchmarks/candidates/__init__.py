@@ -52,12 +52,15 @@ MODULES_OF_OTHERS = {
 }
 """The same, of models besides rgb."""
 
+MODULES_OF_DVGO = {"warpnerf": "warpnerf_step", "torch": "torch_models"}
+"""The same, of `features` with a network as wide as DVGO's."""
+
 
 def find(device: str, model: ModelName = "rgb") -> tuple[dict[str, Load], dict[str, str]]:
     """What can run a model on a device, and why the others cannot."""
     found: dict[str, Load] = {}
     missing: dict[str, str] = {}
-    modules = MODULES if model == "rgb" else MODULES_OF_OTHERS
+    modules = {"rgb": MODULES, "dvgo": MODULES_OF_DVGO}.get(model, MODULES_OF_OTHERS)
     for name in MODULES:
         module = modules.get(name)
         if module is None:

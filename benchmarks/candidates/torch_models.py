@@ -1,4 +1,4 @@
-"""Eager torch for models with more features than a colour: sh, deferred, features.
+"""Eager torch for models with more features than a colour: sh, deferred, features, dvgo.
 
 Samples are packed. embedding_bag reads the grid without a copy of eight nodes for each sample;
 autograd does what lies between nodes and loss, in parts of the rays; gradients go to the nodes in
@@ -277,7 +277,8 @@ class TorchModels:
         self._corners = (corners @ strides).int().to(device)  # [8]
         self._values = torch.from_numpy(work.values.reshape(-1, work.values.shape[3])).to(device)
         self._gradient = torch.zeros_like(self._values)
-        if work.model == "features":  # most samples need nothing but their density
+        self._apart = MODELS[work.model].threshold is not None
+        if self._apart:  # most samples need nothing but their density
             self._densities = self._values[:, :1].contiguous()
             self._density_gradient = torch.zeros_like(self._densities)
         self.network = [torch.from_numpy(array).to(device) for array in work.network]
@@ -288,13 +289,14 @@ class TorchModels:
             "sh": self._sh,
             "deferred": self._deferred,
             "features": self._features,
+            "dvgo": self._features,
         }[work.model]
 
     def step(self) -> None:
         """Forward, loss and adjoint, part after part."""
         torch.set_num_threads(self.choices.threads)
         self._gradient.zero_()
-        if self._work.model == "features":
+        if self._apart:
             self._density_gradient.zero_()
         for parameter in self.network:
             parameter.grad = None
@@ -385,27 +387,39 @@ class TorchModels:
             self._on, self._densities, self._density_gradient, part.node, part.share, "rows"
         )
         weight, passed = self._weights(density[:, 0], part)
-        seen = (weight.detach() > MODELS["features"].threshold).nonzero()[:, 0]
+        model = MODELS[self._work.model]
+        seen = (weight.detach() > model.threshold).nonzero()[:, 0]
         ray = part.ray[seen]
         counts = torch.bincount(ray, minlength=len(passed))
         first = counts.cumsum(0) - counts
         raw = self._interpolate(part.node[seen], part.share[seen])
-        encoded = view_encoding(part.directions, MODELS["features"].n_frequencies)
+        encoded = view_encoding(part.directions, model.n_frequencies)
         weights, bias = self.network[:2]
-        of_ray = torch.addmm(bias, encoded, weights[9:])
-        # Zeros where a node has its density, its own colour, and nothing.
-        of_sample = F.pad(weights[:9], (0, 0, 4, raw.shape[1] - 13))
+        n_colours = model.n_own_colours
+        n_own = model.n_features - n_colours
+        of_ray = torch.addmm(bias, encoded, weights[n_own:])
+        # Zeros where a node has its density, its own colour, and padding.
+        begin, end = 1 + n_colours, 1 + model.n_features
+        of_sample = F.pad(weights[:n_own], (0, 0, begin, raw.shape[1] - end))
         hidden = torch.addmm(Spread.apply(of_ray, ray, first), raw, of_sample).relu_()
-        own = F.pad(torch.eye(3, device=raw.device), (0, 0, 1, raw.shape[1] - 4))
-        color = torch.sigmoid(torch.addmm(perceptron(hidden, self.network[2:]), raw, own))
+        logits = perceptron(hidden, self.network[2:])
+        if n_colours:
+            own = F.pad(torch.eye(3, device=raw.device), (0, 0, 1, raw.shape[1] - 4))
+            logits = torch.addmm(logits, raw, own)
+        color = torch.sigmoid(logits)
         color = Scale.apply(color, part.factor[seen])
         light = Composite.apply(weight.index_select(0, seen), color, ray, first)
         return light + passed[:, None] * self._background
 
+    def tables(self) -> list[tuple[torch.Tensor, torch.Tensor]]:
+        """What nodes hold, and its gradient: [n_nodes, n] each."""
+        tables = [(self._values, self._gradient)]
+        return [*tables, (self._densities, self._density_gradient)] if self._apart else tables
+
     def gradient(self) -> np.ndarray:
         """[X, Y, Z, n_values]"""
         gradient = self._gradient
-        if self._work.model == "features":
+        if self._apart:
             gradient = torch.cat([self._density_gradient, gradient[:, 1:]], dim=1)
         return gradient.cpu().numpy().reshape(self._work.values.shape)
 

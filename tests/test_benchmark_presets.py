@@ -1,0 +1,46 @@
+"""The benchmarks of configurations and of DVGO's step run, and write complete records."""
+
+import pytest
+from test_benchmarks import is_interval, run
+
+
+def test_presets(tmp_path):
+    other = "fast grid.voxels=1000 model=rgb optim.tv_every=4 grid.grow_at=[0.5]"
+    options = ("builtin:room-sparse", "--downscale", "8", "--steps", "60", "--seeds", "0", "1")
+    options += ("--candidate", "fast grid.voxels=1000", "--candidate", other)
+    record, printed = run("presets.py", tmp_path / "record.json", *options)
+    rows = record["rows"]
+    assert [(row["seed"], row["candidate"]) for row in rows] == [
+        (seed, text) for seed in (0, 1) for text in ("fast grid.voxels=1000", other)
+    ]
+    for row in rows:
+        assert row["steps"] == 60 and 5.0 < row["psnr"] < 40.0 and 5.0 < row["training_psnr"] < 40.0
+    assert record["candidates"][other]["optim"]["tv_every"] == 4
+    assert record["candidates"][other]["grid"]["grow_at"] == [0.5]
+    assert record["candidates"][other]["model"] == {"name": "rgb"}
+    assert record["time_limit"] is None and other in printed
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("slow", "slow"),
+        ("fast grid.voxel=8", "voxel"),
+        ("fast grid", "grid"),
+        ("fast seed.x=1", "x"),
+    ],
+)
+def test_a_candidate_that_there_is_not_is_refused(text, named):
+    import presets
+
+    with pytest.raises(presets.InputError, match=named):
+        presets.configured(text)
+
+
+def test_dvgo_step(tmp_path):
+    options = ("--grid", "10", "--rays", "48", "--rounds", "2", "--threads", "1")
+    record, _ = run("dvgo_step.py", tmp_path / "record.json", *options)
+    assert [row["scene"] for row in record["rows"]] == ["dense", "sphere"]
+    for row in record["rows"]:
+        assert is_interval(row["over_warpnerf"]) and is_interval(row["torch_ms"])
+        assert row["n_samples"] > 0 and row["torch_choices"]["1"]
