@@ -18,6 +18,8 @@ from PIL import Image
 from tiny_fields import assert_same_state
 from tiny_scenes import picture, save, write_transforms
 
+from warpnerf.cli import train
+from warpnerf.config import PRESETS
 from warpnerf.training.checkpoint import load_checkpoint
 from warpnerf.training.run import Run
 
@@ -145,6 +147,19 @@ def test_overwrite_replaces_a_run(tmp_path: Path) -> None:
     assert [json.loads(line)["step"] for line in lines] == [3]
     assert not (tmp_path / "test" / "old.png").exists()
     assert json.loads((tmp_path / "metrics.json").read_text())["images"]
+
+
+def test_a_time_limit_takes_the_place_of_the_presets_steps(tmp_path: Path) -> None:
+    few = replace(PRESETS["fast"], steps=2)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(PRESETS, "fast", few)
+        begun = []
+        patch.setattr(train, "_begin", lambda *a: begun.append(a[5]) or 0)
+        train.train_command("builtin:room", output=tmp_path / "a", time_limit=9.0)
+        train.train_command("builtin:room", output=tmp_path / "a", time_limit=9.0, steps=7)
+        train.train_command("builtin:room", output=tmp_path / "a")
+    assert [config.steps for config in begun] == [train.STEPS_OF_TIMED, 7, 2]
+    assert [config.time_limit for config in begun] == [9.0, 9.0, None]
 
 
 def test_files_that_are_no_run_are_never_touched(tmp_path: Path) -> None:

@@ -28,6 +28,9 @@ if TYPE_CHECKING:
     from warpnerf.training.trainer import Trainer
     from warpnerf.viewer.session import Session
 
+STEPS_OF_TIMED = 10**9
+"""Steps of a training that its time limit ends."""
+
 
 def train_command(
     scene: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[SCENE]")] = None,
@@ -69,8 +72,9 @@ def train_command(
             that is the same from all sides).
         model_options: Of the model, such as specular=8 width=64 (deferred), features=12
             residual=false threshold=0.0001 (features), degree=2 (sh).
-        steps: Batches of rays to train on.
-        time_limit: Seconds of training; the schedule is squeezed to fit.
+        steps: Batches of rays to train on; by default as many as the preset says, or as the time
+            limit allows.
+        time_limit: Seconds of training; the schedule is fitted to them.
         scaling: How a sample's gradient depends on its distance from the camera.
         content_distance: Where gradients reach full strength, in the scene's units; per-camera: of
             each camera what it sees, where the scene brings points.
@@ -128,6 +132,8 @@ def train_command(
             "train wants a SCENE and --output DIR for a new run, or --resume DIR to go on with one."
         )
     config = changed(PRESETS[preset or "fast"])
+    if time_limit is not None and steps is None:
+        config = dataclasses.replace(config, steps=STEPS_OF_TIMED)
     factor = 1 if downscale is None else downscale
     return _begin(scene, output, factor, masks, images, config, overwrite, page)
 
