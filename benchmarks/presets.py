@@ -42,6 +42,7 @@ def main() -> None:
     parser.add_argument("--time-limit", type=float, help="seconds each, by default 180")
     parser.add_argument("--steps", type=int, help="equal steps instead of equal time")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--test-views", type=int, help="at most so many, spread; by default all")
     parser.add_argument("--downscale", type=int, default=1)
     args = parser.parse_args()
     limit = args.time_limit or (None if args.steps else 180.0)
@@ -52,6 +53,11 @@ def main() -> None:
     rows = []
     for name in args.scenes:
         scene = wn.load_scene(path_of(name), downscale=args.downscale)
+        looked_at = {
+            "test": some(scene.splits["test"], args.test_views or len(scene.views)),
+            "training": some(scene.splits["train"], TRAINING_VIEWS),
+        }
+        scene = replace(scene, splits={**scene.splits, **looked_at})
         for seed in args.seeds:
             for candidate, found in race(scene, candidates, seed).items():
                 rows.append({"scene": name, "seed": seed, "candidate": candidate, **found})
@@ -72,11 +78,17 @@ def main() -> None:
             "time_limit": limit,
             "steps": args.steps,
             "downscale": args.downscale,
+            "test_views": args.test_views,
             "candidates": {text: config_to_json(config) for text, config in candidates.items()},
             "rows": rows,
         }
         path = write_record(record, args.output, "presets", args.device)
     print(f"\nrecord: {path}")
+
+
+def some(indices: tuple[int, ...], n: int) -> tuple[int, ...]:
+    """At most n of them, spread."""
+    return indices[:: max(1, -(-len(indices) // n))]
 
 
 FIGURES = ("psnr", "ssim", "training_psnr", "steps", "samples_per_ray", "seconds")
@@ -92,8 +104,6 @@ def race(scene: wn.Scene, candidates: dict[str, TrainConfig], seed: int) -> dict
         text: coarse.begin(scene, replace(config, seed=seed)) for text, config in candidates.items()
     }
     seconds = take_turns(trainers, lambda _, __: None)
-    some = scene.splits["train"][:: -(-len(scene.splits["train"]) // TRAINING_VIEWS)]
-    seen = replace(scene, splits={**scene.splits, "test": scene.splits["test"], "some": some})
     found = {}
     for text in candidates:
         trainer = trainers.pop(text)  # and its memory
@@ -102,7 +112,7 @@ def race(scene: wn.Scene, candidates: dict[str, TrainConfig], seed: int) -> dict
         found[text] = {
             "psnr": mean["psnr"],
             "ssim": mean["ssim"],
-            "training_psnr": wn.evaluate(field, seen, split="some").mean["psnr"],
+            "training_psnr": wn.evaluate(field, scene, split="training").mean["psnr"],
             "steps": trainer.steps_done,
             "samples_per_ray": trainer.report().samples_per_ray,
             "seconds": seconds[text],
