@@ -65,7 +65,7 @@ class PageClient:
     def look_from(self, c2w: np.ndarray, **changes: Any) -> None:
         self.say(camera_message(c2w, **changes))
 
-    def wait(self, what: Any, seconds: float = 30.0) -> None:
+    def wait(self, what: Any, seconds: float = 120.0) -> None:
         """Until a condition on this client, or on anything else, holds."""
         end = time.monotonic() + seconds
         with self._news:

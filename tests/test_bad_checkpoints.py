@@ -45,7 +45,7 @@ def refused(command: str, checkpoint: Path) -> str:
         [sys.executable, "-m", "warpnerf", *COMMANDS[command], str(folder)],
         capture_output=True,
         text=True,
-        timeout=10,
+        timeout=120,
     )
     assert process.returncode == 2, process.stderr
     assert "Traceback" not in process.stdout + process.stderr
@@ -157,7 +157,7 @@ def test_71_disk_full_while_training(tmp_path: Path) -> None:
         [sys.executable, "-c", LIMITED, "train", *scene, *options],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=240,
     )
     assert process.returncode == 2, process.stderr
     assert "Traceback" not in process.stdout + process.stderr

@@ -35,7 +35,7 @@ def start(*arguments: str | Path) -> subprocess.Popen[str]:
 
 def run(*arguments: str | Path) -> tuple[int, str, str]:
     process = start(*arguments)
-    out, err = process.communicate(timeout=120)
+    out, err = process.communicate(timeout=240)
     return process.returncode, out, err
 
 
@@ -222,7 +222,7 @@ def begun(folder: Path, *signals: int) -> tuple[int, str, str]:
                 break
         for number in signals:
             process.send_signal(number)
-        out, err = process.communicate(timeout=60)
+        out, err = process.communicate(timeout=240)
     finally:
         process.kill()
     return process.returncode, out, err
@@ -372,7 +372,7 @@ def test_what_is_not_finite_ends_the_run(tmp_path: Path, bad_step: int, kept: st
         [sys.executable, "-c", SPOIL, str(bad_step), *arguments],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=240,
     )
     assert process.returncode == 1
     assert f"not finite after step {bad_step}" in process.stderr
@@ -397,7 +397,7 @@ def test_a_training_that_nobody_reads_goes_on(tmp_path: Path) -> None:
     assert process.stdout.readline().startswith("reading")
     process.stdout.close()
     err = process.stderr.read()
-    assert process.wait(timeout=120) == 0, err
+    assert process.wait(timeout=240) == 0, err
     assert "Traceback" not in err and "Broken pipe" not in err
     assert (tmp_path / "run" / "metrics.json").exists()
 

@@ -89,7 +89,7 @@ def test_bad_input_is_refused_and_nothing_is_written(
 
 def test_what_is_no_run_ends_with_a_sentence(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "warpnerf", "export", str(tmp_path), str(tmp_path / "a.ply")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=240)
     assert done.returncode == 2
     assert done.stderr.strip().endswith("config.json does not exist; name the folder of a run.")
 

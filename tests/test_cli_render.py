@@ -143,7 +143,7 @@ def test_bad_options_are_refused_and_nothing_is_written(
 
 def test_what_is_no_run_ends_with_a_sentence(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "warpnerf", "render", str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=240)
     assert done.returncode == 2
     assert done.stderr.strip().endswith("config.json does not exist; name the folder of a run.")
     assert list(tmp_path.iterdir()) == []
@@ -163,7 +163,7 @@ def test_ctrl_c_leaves_nothing_behind(run_folder: Path, tmp_path: Path) -> None:
         assert process.poll() is None
     time.sleep(0.1)
     process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=240)
     assert process.returncode == 130
     assert "Traceback" not in err
     assert list(tmp_path.iterdir()) == []

@@ -17,7 +17,7 @@ HEAVY = "{'warp', 'torch', 'imageio', 'PIL', 'safetensors', 'tyro', 'rich', 'num
 
 def in_fresh_python(code: str) -> str:
     result = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=240, check=True
     )
     return result.stdout.strip()
 

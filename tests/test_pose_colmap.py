@@ -40,7 +40,9 @@ warpnerf.sfm.worker.subprocess.Popen = Killed
 """Python that has COLMAP's process killed as soon as it is there."""
 
 N = 12
-FOCAL = 260.0
+WIDTH, HEIGHT, FOCAL = 480, 360, 390.0
+"""Of the photographs. In 320 x 240 with one ray a pixel, errors of the focal length turn cameras by
+2 degrees, more or less with COLMAP's threads and seed; in these it is half a degree."""
 
 
 def true_pose(k: int) -> np.ndarray:
@@ -66,7 +68,7 @@ def write_photographs(
             cy=height / 2,
             c2w=c2w,
         )
-        Image.fromarray(photograph(camera, 1)[0]).save(folder / f"{k:02}.png")
+        Image.fromarray(photograph(camera)[0]).save(folder / f"{k:02}.png")
     return folder
 
 
@@ -74,7 +76,7 @@ def write_photographs(
 def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("room") / "photos"
     poses = [true_pose(k) for k in range(N)]
-    return write_photographs(folder, poses, width=320, height=240, focal=FOCAL)
+    return write_photographs(folder, poses, width=WIDTH, height=HEIGHT, focal=FOCAL)
 
 
 def errors(scene: Scene) -> tuple[float, float]:
@@ -165,7 +167,7 @@ def test_a_photograph_of_something_else_is_left_out_and_named(tmp_path: Path, ph
     (tmp_path / "photos").mkdir()
     for path in photos.iterdir():
         (tmp_path / "photos" / path.name).write_bytes(path.read_bytes())
-    Image.new("RGB", (320, 240), (90, 120, 90)).save(tmp_path / "photos" / "wall.png")
+    Image.new("RGB", (WIDTH, HEIGHT), (90, 120, 90)).save(tmp_path / "photos" / "wall.png")
     posing = pose(tmp_path / "photos", tmp_path / "scene")
     assert posing.registered == N
     assert posing.missing["wall.png"].startswith("only 0 features: blurred")
@@ -184,7 +186,7 @@ def test_noise_is_no_scene(tmp_path: Path) -> None:
 def test_nothing_is_found_where_a_mask_is_black(tmp_path: Path, photos: Path) -> None:
     (tmp_path / "masks").mkdir()
     for path in photos.iterdir():
-        Image.new("L", (320, 240), 0).save(tmp_path / "masks" / path.name)
+        Image.new("L", (WIDTH, HEIGHT), 0).save(tmp_path / "masks" / path.name)
     with pytest.raises(InputError, match=r"12 of them show too little \(first: 00.png, 0 features"):
         pose(photos, tmp_path / "scene", PoseConfig(masks=tmp_path / "masks"))
 

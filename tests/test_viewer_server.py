@@ -69,11 +69,11 @@ def test_a_request_names_one_host() -> None:
 
 def test_the_page_is_served_to_those_who_ask_by_name(server: Any) -> None:
     page = address(server)
-    with urllib.request.urlopen(page, timeout=20) as answer:
+    with urllib.request.urlopen(page, timeout=120) as answer:
         assert answer.status == 200 and b"<html" in answer.read(1000)
     request = urllib.request.Request(page, headers={"Host": "evil.example"})
     with pytest.raises(urllib.error.HTTPError) as refused:
-        urllib.request.urlopen(request, timeout=20)
+        urllib.request.urlopen(request, timeout=120)
     assert refused.value.code == 403
 
 
@@ -104,7 +104,7 @@ def test_garbage_ends_that_connection_only(
         other.send(garbage)
         with pytest.raises(ConnectionClosed):
             while True:
-                other.recv(timeout=20)
+                other.recv(timeout=120)
     with PageClient(server.get_port()) as page:
         page.wait(lambda page: page.messages)
     assert "Traceback" not in capfd.readouterr().err

@@ -12,8 +12,8 @@ from typing import Any
 
 from tiny_scenes import save, write_transforms
 
-LIMIT = 10.0
-"""Seconds."""
+LIMIT = 240.0
+"""Seconds after which a command counts as hung, on a busy machine that compiles kernels too."""
 
 Change = Callable[[dict[str, Any]], object]
 
