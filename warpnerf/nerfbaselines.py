@@ -24,9 +24,15 @@ from warpnerf.training.coarse import begin
 from warpnerf.training.state import TrainingState
 from warpnerf.training.trainer import Trainer
 
-LENSES = ("pinhole", "opencv", "opencv_fisheye", "full_opencv")
-"""The lenses of nerfbaselines, by the number that its cameras hold."""
-READ_LENSES = ("pinhole", "opencv", "opencv_fisheye")
+COEFFICIENTS_OF = {
+    "pinhole": (),
+    "opencv": ("k1", "k2", "p1", "p2"),
+    "opencv_fisheye": ("k1", "k2", "k3", "k4"),
+    "full_opencv": ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"),
+}
+"""What lenses of nerfbaselines are bent by."""
+LENSES = tuple(COEFFICIENTS_OF)
+"""By the number that its cameras hold."""
 
 CHECKPOINT = "checkpoint.safetensors"
 
@@ -92,7 +98,7 @@ class WarpnerfMethod:
         return {
             "method_id": "warpnerf",
             "required_features": frozenset(("color",)),
-            "supported_camera_models": frozenset(READ_LENSES),
+            "supported_camera_models": frozenset(LENSES),
             "supported_outputs": ("color", "depth", "accumulation"),
             "can_resume_training": True,
         }
@@ -259,24 +265,23 @@ def camera_of(camera: Any) -> Camera:
 
     Args:
         camera: Its pose [3, 4] camera to world in OpenCV axes, fx, fy, cx, cy in pixels, and
-            distortion parameters in the order k1, k2, p1, p2, k3, k4.
+            the first of the distortion parameters k1, k2, p1, p2, k3, k4, k5, k6, or all.
 
     Raises:
         InputError: The lens is of a kind that is not read.
     """
-    lens = LENSES[int(camera.camera_models)]
-    if lens not in READ_LENSES:
+    number = int(camera.camera_models)
+    if not 0 <= number < len(LENSES):
         raise InputError(
-            f"lenses of the kind {lens} are not read; undistort the photographs to one of "
-            f"{', '.join(READ_LENSES)}."
+            f"a lens of the kind {number} is not read; undistort the photographs to one of "
+            f"{', '.join(LENSES)}."
         )
+    lens = LENSES[number]
     fx, fy, cx, cy = (float(value) for value in camera.intrinsics)
-    k1, k2, p1, p2, k3, k4 = (float(value) for value in _six(camera.distortion_parameters))
-    bent: dict[str, Any] = {}
-    if lens == "opencv":
-        bent = {"k1": k1, "k2": k2, "p1": p1, "p2": p2}
-    if lens == "opencv_fisheye":
-        bent = {"k1": k1, "k2": k2, "k3": k3, "k4": k4, "fisheye": True}
+    given = np.asarray(camera.distortion_parameters, np.float64)
+    order = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+    values = dict(zip(order, map(float, given), strict=False))
+    bent: dict[str, Any] = {name: values.get(name, 0.0) for name in COEFFICIENTS_OF[lens]}
     c2w = np.array(camera.poses, np.float64)[:3, :4]
     c2w[:, 1:3] *= -1.0  # from OpenCV's axes to OpenGL's
     width, height = (int(value) for value in camera.image_sizes)
@@ -288,13 +293,9 @@ def camera_of(camera: Any) -> Camera:
         cx=cx,
         cy=cy,
         c2w=c2w,
+        fisheye=lens == "opencv_fisheye",
         **bent,
     )
-
-
-def _six(parameters: np.ndarray) -> np.ndarray:
-    """The first six of distortion parameters, zeros for those that are left out."""
-    return np.pad(np.asarray(parameters, np.float64), (0, 6))[:6]
 
 
 def _names(paths: Sequence[str], root: str) -> list[str]:
@@ -312,7 +313,7 @@ register(
         },
         "presets": {name: {"preset": name} for name in PRESETS},
         "required_features": ["color"],
-        "supported_camera_models": list(READ_LENSES),
+        "supported_camera_models": list(LENSES),
         "supported_outputs": ["color", "depth", "accumulation"],
     }
 )
