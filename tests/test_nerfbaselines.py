@@ -153,6 +153,25 @@ def test_masks_are_kept(method: Any, dataset: dict[str, Any]) -> None:
     assert np.array_equal(views[1].mask, masks[1] > 0)
 
 
+def test_points_of_the_dataset_give_box_and_content_distance(
+    method: Any, dataset: dict[str, Any]
+) -> None:
+    """Of the same points as warpnerf reads them; not of points that the cameras do not see."""
+    points = np.random.default_rng(0).normal(0.0, 0.15, (300, 3))
+    without = method.scene_of(dataset)
+    assert without.content_distances is None and without.points is None
+    found = method.scene_of({**dataset, "points3D_xyz": points.astype(np.float32)})
+    away = [np.median(np.linalg.norm(points - c.position, axis=1)) for c in found.cameras]
+    np.testing.assert_allclose(found.content_distances, away, rtol=1e-5)
+    assert found.content_distance == pytest.approx(np.median(away))
+    assert found.content_distance != without.content_distance
+    assert "points of the dataset" in found.notes[0] and len(found.points) == 300
+    elsewhere = points + np.array([0.0, 0.0, 40.0])
+    for unseen in (elsewhere, np.concatenate([points, elsewhere[:30]]), points[:0], points * 1e300):
+        kept = method.scene_of({**dataset, "points3D_xyz": unseen})
+        assert kept.notes == without.notes and kept.content_distances is None
+
+
 def test_options(method: Any) -> None:
     config = method.configured({**SHORT, "preset": "quality"}, np.array([255, 0, 51], np.uint8))
     assert config.steps == 12 and config.grid.voxels == 4096 and config.model.name == "rgb"

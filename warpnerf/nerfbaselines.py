@@ -17,6 +17,7 @@ from nerfbaselines import register
 from warpnerf.checks import InputError
 from warpnerf.config import PRESETS, TrainConfig
 from warpnerf.scenes.camera import Camera
+from warpnerf.scenes.points import Points, extent_by_points, usable
 from warpnerf.scenes.scene import Scene, View, estimate_extent
 from warpnerf.scenes.undistort import seen_pixels
 from warpnerf.training.checkpoint import load_checkpoint, save_checkpoint
@@ -33,6 +34,13 @@ COEFFICIENTS_OF = {
 """What lenses of nerfbaselines are bent by."""
 LENSES = tuple(COEFFICIENTS_OF)
 """By the number that its cameras hold."""
+
+FEATURES = ("color", "points3D_xyz")
+"""What datasets are asked for; points are left out by those that have none."""
+
+MIN_IN_PICTURES = 0.95
+"""Share of a dataset's points that at least two of its cameras must have in their pictures. Matched
+points are; those of a model that is not the dataset's lie anywhere, and its loaders do not look."""
 
 CHECKPOINT = "checkpoint.safetensors"
 
@@ -97,7 +105,7 @@ class WarpnerfMethod:
         """What the method takes and gives."""
         return {
             "method_id": "warpnerf",
-            "required_features": frozenset(("color",)),
+            "required_features": frozenset(FEATURES),
             "supported_camera_models": frozenset(LENSES),
             "supported_outputs": ("color", "depth", "accumulation"),
             "can_resume_training": True,
@@ -223,6 +231,8 @@ def configured(overrides: dict[str, Any], background: np.ndarray | None) -> Trai
 def scene_of(dataset: Any) -> Scene:
     """A scene of the training photographs of a dataset.
 
+    Box and content distance are those of its points, where it has some that its cameras see.
+
     Args:
         dataset: ``nerfbaselines.Dataset`` with its images loaded.
 
@@ -246,18 +256,38 @@ def scene_of(dataset: Any) -> Scene:
     views = [views[i] for i in order]
     see_through = [v.image.shape[2] == 4 and bool((v.image[..., 3] < 255).any()) for v in views]
     unbounded = sum(see_through) < len(views) / 2
-    extent = estimate_extent([view.camera for view in views], unbounded=unbounded)
+    cameras = [view.camera for view in views]
+    extent, sight = estimate_extent(cameras, unbounded=unbounded), None
+    training = range(len(views))
+    points = _points(dataset.get("points3D_xyz"), cameras)
+    if points is not None:
+        extent, sight = extent_by_points(extent, points, views, training, unbounded)
     return Scene(
         name=str(dataset["metadata"].get("scene") or "dataset"),
         views=views,
-        splits={"train": tuple(range(len(views))), "test": ()},
+        splits={"train": tuple(training), "test": ()},
         box_min=extent.box_min,
         box_max=extent.box_max,
         unbounded=unbounded,
         content_distance=extent.content_distance,
-        guessed=extent.guessed,
+        content_distances=None if sight is None else sight.distances,
+        guessed=extent.guessed and sight is None,
+        near_content=None if sight is None else sight.near_content,
+        points=None if sight is None or points is None else points.sample,
         notes=extent.notes,
     )
+
+
+def _points(positions: Any, cameras: Sequence[Camera]) -> Points | None:
+    """The points of a dataset, [n, 3], if there are some and they are where its cameras look."""
+    if positions is None:
+        return None
+    given = np.asarray(positions, np.float64).reshape(-1, 3)
+    points = Points(positions=given[usable(given)], tracks=None, source="the dataset")
+    if not len(points.positions):
+        return None
+    in_pictures = np.sum([points.in_picture(camera) for camera in cameras], axis=0)
+    return points if np.mean(in_pictures >= 2) >= MIN_IN_PICTURES else None
 
 
 def camera_of(camera: Any) -> Camera:
@@ -312,7 +342,7 @@ register(
             "gradients are scaled by distance, so that fewer floaters grow near the cameras.",
         },
         "presets": {name: {"preset": name} for name in PRESETS},
-        "required_features": ["color"],
+        "required_features": list(FEATURES),
         "supported_camera_models": list(LENSES),
         "supported_outputs": ["color", "depth", "accumulation"],
     }
