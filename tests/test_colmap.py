@@ -26,7 +26,7 @@ PARAMETERS = {
     "SIMPLE_RADIAL": (10.0, 4.25, 2.75, -0.05),
     "RADIAL": (10.0, 4.25, 2.75, -0.05, 0.01),
     "OPENCV": (10.0, 11.0, 4.25, 2.75, -0.05, 0.01, 0.002, -0.001),
-    "FULL_OPENCV": (10.0, 11.0, 4.25, 2.75, -0.05, 0.01, 0.002, -0.001, 0.003, 0.0, 0.0, 0.0),
+    "FULL_OPENCV": (10.0, 11.0, 4.25, 2.75, -0.05, 0.01, 0.002, -0.001, 0.003, 0.02, -0.01, 0.004),
     "OPENCV_FISHEYE": (10.0, 11.0, 4.25, 2.75, -0.05, 0.01, 0.002, -0.001),
     "SIMPLE_RADIAL_FISHEYE": (10.0, 4.25, 2.75, -0.05),
     "RADIAL_FISHEYE": (10.0, 4.25, 2.75, -0.05, 0.01),
@@ -139,6 +139,7 @@ def test_every_lens(tmp_path: Path, model: str, text: bool) -> None:
     assert (camera.cx, camera.cy) == rest[:2]
     assert camera.fisheye == ("FISHEYE" in model)
     names = ("k1", "k2", "k3", "k4") if camera.fisheye else ("k1", "k2", "p1", "p2", "k3")
+    names = (*names, "k4", "k5", "k6") if model == "FULL_OPENCV" else names
     found = tuple(getattr(camera, name) for name in names)
     given = rest[2 : 2 + len(names)]
     assert found == (*given, *[0.0] * (len(names) - len(given)))

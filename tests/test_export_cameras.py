@@ -65,10 +65,11 @@ def assert_same(read: Scene, scene: Scene) -> None:
     [
         {"k1": 0.05, "k2": -0.02, "p1": 0.003, "p2": -0.001},
         {"k1": 0.05, "k3": 0.01},
+        {"k1": 0.3, "p1": 0.001, "k4": 0.2, "k5": 0.01, "k6": 0.002},
         {"fisheye": True, "k1": 0.02, "k2": 0.01, "k3": -0.005, "k4": 0.002},
         {"masked": True},
     ],
-    ids=["bent", "k3", "fisheye", "masked"],
+    ids=["bent", "k3", "rational", "fisheye", "masked"],
 )
 def test_the_folder_is_the_scene(tmp_path: Path, lens: dict[str, Any]) -> None:
     scene = ball_scene(**lens)

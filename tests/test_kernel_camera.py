@@ -22,6 +22,25 @@ LENSES: list[dict[str, float]] = [
     # At the corners, nearly as much as can be undone.
     {"k1": -0.54, "k2": 0.04, "k3": 0.1, "p1": 0.01, "p2": 0.01},
 ]
+# OpenCV's rational lens, of which projectPoints alone is the oracle: a depth camera's, one whose
+# divisor falls below a half at the corners, one that bends by it alone, one that needs short
+# strides, and a wide one.
+RATIONAL: list[dict[str, float]] = [
+    {
+        "k1": 0.35,
+        "k2": -2.1,
+        "k3": 1.2,
+        "p1": 3e-4,
+        "p2": -2e-4,
+        "k4": 0.25,
+        "k5": -1.95,
+        "k6": 1.15,
+    },
+    {"k1": 0.1, "k4": -0.9, "p1": 2e-3},
+    {"k4": 0.15, "k5": 0.03, "k6": 0.01},
+    {"k4": 2.48, "k5": -1.45, "k6": 0.08, "p1": -0.0081, "p2": -0.0008},
+    {"k1": 12.0, "k2": 4.0, "k3": 0.2, "k4": 12.3, "k5": 8.0, "k6": 1.5},
+]
 # Where Newton's method alone goes astray, the oracle's too.
 TWISTED = {"k1": 1.6, "k2": -1.9, "k3": -0.6, "p1": -0.005, "p2": 0.006}
 # k1 to k4; the first sees 49 degrees to a corner, the second 86, the third 126.
@@ -50,6 +69,8 @@ def view(kernels: Kernels, c2w: Any, lens: dict[str, float], **changes: Any) -> 
     view.principal = types.vec2(CX, CY)
     view.radial = types.vec3(*(lens.get(k, 0.0) for k in ("k1", "k2", "k3")))
     view.tangential = types.vec2(lens.get("p1", 0.0), lens.get("p2", 0.0))
+    view.divisor = types.vec3(*(lens.get(k, 0.0) for k in ("k4", "k5", "k6")))
+    view.rational = int(any(lens.get(k) for k in ("k4", "k5", "k6")))
     view.width = WIDTH
     view.first_pixel = 0
     for name, value in changes.items():
@@ -84,13 +105,13 @@ def test_rays_against_the_oracle(lens: dict[str, float], kernels64: Kernels) -> 
         assert np.abs(plain - expected[1]).max() > 1e-3
 
 
-@pytest.mark.parametrize("lens", [*LENSES, TWISTED], ids=str)
+@pytest.mark.parametrize("lens", [*LENSES, TWISTED, *RATIONAL], ids=str)
 def test_rays_against_opencv(lens: dict[str, float], kernels64: Kernels) -> None:
     """projectPoints brings a point on each ray back to the pixel centre."""
     c2w = pose(9)
     in_camera = rays(kernels64, c2w, lens)[1].reshape(-1, 3) @ c2w[:, :3]
     matrix = np.array([[FX, 0, CX], [0, FY, CY], [0, 0, 1]])
-    vector = np.array([lens.get(k, 0.0) for k in ("k1", "k2", "p1", "p2", "k3")])
+    vector = np.array([lens.get(k, 0.0) for k in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")])
     points = 3.0 * in_camera * [1.0, -1.0, -1.0]
     back = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, vector)[0].reshape(-1, 2)
     v, u = np.divmod(np.arange(WIDTH * HEIGHT), WIDTH)
@@ -102,6 +123,27 @@ def test_float32_rays(kernels32: Kernels) -> None:
         directions = rays(kernels32, pose(3), lens)[1]
         np.testing.assert_allclose(directions, expected_rays(pose(3), lens)[1], rtol=0, atol=1e-6)
         np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1.0, atol=3e-7)
+
+
+def test_float32_rays_of_rational_lenses(kernels32: Kernels, kernels64: Kernels) -> None:
+    for lens in RATIONAL:
+        found, expected = (rays(kernels, pose(3), lens)[1] for kernels in (kernels32, kernels64))
+        np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6)
+        assert np.abs(expected - rays(kernels64, pose(3), {})[1]).max() > 0.01
+
+
+def test_a_divisor_of_nothing_changes_nothing(kernels64: Kernels) -> None:
+    """The same lens as a rational one: another way to the same point."""
+    n, camera = WIDTH * HEIGHT, kernels64.module("space.camera")
+    for lens in LENSES[1:]:
+        as_rational = view(kernels64, pose(4), lens, rational=1)
+        origins, found = (
+            kernels64.zeros(n, kernels64.types.vec3),
+            kernels64.zeros(n, kernels64.types.vec3),
+        )
+        kernels64.workers.launch(camera.camera_rays, n, as_rational, origins, found)
+        expected = rays(kernels64, pose(4), lens)[1].reshape(-1, 3)
+        np.testing.assert_allclose(found.numpy(), expected, rtol=0, atol=1e-13)
 
 
 def fisheye_view(kernels: Kernels, number: int) -> Any:

@@ -72,10 +72,18 @@ def test_known_models_are_accepted(model: str) -> None:
         (LensFields(fl_x=10.0, cx=np.nan), r"\.cx: nan is not a finite number"),
         (LensFields(fl_x=10.0, cy=1e5), r"\.cy: means a principal point at 100000 pixels"),
         (LensFields(fl_x=10.0, k2=np.inf), r"\.k2: inf is not a finite number"),
-        (LensFields(fl_x=10.0, k4=0.1), r"\.k4: is not modelled unless it is 0; undistort"),
+        (
+            LensFields(fl_x=10.0, k4=0.1),
+            r"\.k4: is read as OpenCV's .* camera_model is \"FULL_OPENCV",
+        ),
+        (LensFields(fl_x=10.0, camera_model="OPENCV", k6=0.1), r"\.k6: is read as OpenCV's"),
+        (LensFields(fl_x=4.0, camera_model="FULL_OPENCV", k4=9.0), r"\.k4 = 9 folds over within"),
         (LensFields(fl_x=10.0, camera_model="FISHEYE624"), r"\.camera_model: 'FISHEYE624' is none"),
-        (LensFields(fl_x=10.0, is_fisheye=True, p1=0.1), r"\.p1: a fisheye lens has no tangential"),
-        (LensFields(fl_x=10.0, is_fisheye=True, k5=0.1), r"\.k5: is not modelled unless it is 0"),
+        (
+            LensFields(fl_x=10.0, is_fisheye=True, p1=0.1),
+            r"\.p1: a fisheye lens has none; calibrate",
+        ),
+        (LensFields(fl_x=10.0, is_fisheye=True, k5=0.1), r"\.k5: a fisheye lens has none"),
         (
             LensFields(camera_angle_x=1.0, is_fisheye=True),
             r"\.camera_angle_x: does not give a fisheye lens's focal length; add fl_x",
@@ -112,11 +120,24 @@ def test_fisheye_lenses_are_recognised(frame: LensFields, whole: LensFields) -> 
     assert not camera(LensFields(is_fisheye=False, fl_x=1.0), LensFields(is_fisheye=True)).fisheye
 
 
+@pytest.mark.parametrize(
+    ("frame", "whole"),
+    [
+        (LensFields(camera_model="FULL_OPENCV"), LensFields(camera_model="OPENCV")),
+        (LensFields(), LensFields(camera_model="FULL_OPENCV")),
+    ],
+)
+def test_rational_lenses_are_recognised(frame: LensFields, whole: LensFields) -> None:
+    keys = {"k1": 0.3, "k4": 0.2, "k5": 0.01, "k6": -0.02}
+    result = camera(frame, msgspec.structs.replace(whole, fl_x=10.0, **keys))
+    assert result.rational and {key: getattr(result, key) for key in keys} == keys
+    assert not camera(LensFields(camera_model="FULL_OPENCV", fl_x=10.0, k1=0.1)).rational
+
+
 def test_cameras_take_coefficients_of_their_lens_only() -> None:
-    with pytest.raises(InputError, match=r"Camera\.p2 must be 0 for a fisheye lens"):
-        camera_at(np.eye(4), fisheye=True, p2=0.1)
-    with pytest.raises(InputError, match=r"Camera\.k4 must be 0 for a lens that is no fisheye"):
-        camera_at(np.eye(4), k4=0.1)
+    for name in ("p2", "k5", "k6"):
+        with pytest.raises(InputError, match=rf"Camera\.{name} must be 0 for a fisheye lens"):
+            camera_at(np.eye(4), fisheye=True, **{name: 0.1})
 
 
 def fisheye(focal: float, *k: float, size: int = 100) -> Camera:
@@ -141,11 +162,12 @@ def test_fisheye_distortion_agrees_with_opencv() -> None:
         np.testing.assert_allclose(jacobian[:, :, axis], slope, rtol=0, atol=1e-7)
 
 
-@pytest.mark.parametrize("kind", ["pinhole", "distorted", "fisheye", "wide"])
+@pytest.mark.parametrize("kind", ["pinhole", "distorted", "rational", "fisheye", "wide"])
 def test_directions_are_where_pixels_look(kind: str) -> None:
     lens = {
         "pinhole": camera_at(np.eye(4), fy=11.0),
         "distorted": random_lens(1),
+        "rational": random_lens(1, rational=True),
         "fisheye": fisheye(60.0, 0.08, -0.03, 0.01, -0.001),
         "wide": fisheye(25.0),
     }[kind]
@@ -175,16 +197,22 @@ def test_corners_that_a_fisheye_does_not_see_are_known() -> None:
     assert not has_invertible_distortion(fisheye(6.0))
 
 
-def random_lens(seed: int) -> Camera:
-    k1, k2, k3, p1, p2 = np.random.default_rng(seed).normal(0.0, [0.1, 0.05, 0.02, 0.01, 0.01])
-    return camera_at(np.eye(4), k1=k1, k2=k2, k3=k3, p1=p1, p2=p2)
+def random_lens(seed: int, rational: bool = False) -> Camera:
+    rng = np.random.default_rng(seed)
+    k1, k2, k3, p1, p2 = rng.normal(0.0, [0.1, 0.05, 0.02, 0.01, 0.01])
+    divisor = dict(zip(("k4", "k5", "k6"), rng.normal(0.0, [0.2, 0.1, 0.05]), strict=True))
+    bent = {"k1": k1, "k2": k2, "k3": k3, "p1": p1, "p2": p2} | (divisor if rational else {})
+    return camera_at(np.eye(4), **bent)
 
 
+@pytest.mark.parametrize("rational", [False, True])
 @pytest.mark.parametrize("seed", range(5))
-def test_distortion_agrees_with_opencv(seed: int) -> None:
-    lens = random_lens(seed)
+def test_distortion_agrees_with_opencv(seed: int, rational: bool) -> None:
+    lens = random_lens(seed, rational)
     points = np.random.default_rng(seed).uniform(-0.5, 0.5, (20, 2))
-    coefficients = np.array([lens.k1, lens.k2, lens.p1, lens.p2, lens.k3])
+    coefficients = np.array(
+        [lens.k1, lens.k2, lens.p1, lens.p2, *(lens.k3, lens.k4, lens.k5, lens.k6)]
+    )
     expected, _ = cv2.projectPoints(
         np.concatenate([points, np.ones((20, 1))], axis=1),
         *(np.zeros(3), np.zeros(3), np.eye(3), coefficients),
@@ -218,6 +246,16 @@ def test_fold_that_a_higher_coefficient_turns_back_is_found() -> None:
         np.eye(4), width=10, height=10, cx=5.0, cy=5.0, fx=5.0, fy=5.0, k1=-1.0, k2=0.4
     )
     assert not has_invertible_distortion(lens)
+
+
+def test_the_fold_of_a_rational_lens_is_found() -> None:
+    # r / (1 + k4 r^2) is largest at r = k4^-1/2, where it is half of that; the corner is at 0.7071.
+    square = {"width": 10, "height": 10, "cx": 5.0, "cy": 5.0, "fx": 10.0, "fy": 10.0}
+    for k4, foldless in ((0.2, True), (0.4, True), (0.6, False), (3.0, False)):
+        assert (0.5 * k4**-0.5 > np.hypot(0.5, 0.5)) == foldless
+        assert has_invertible_distortion(camera_at(np.eye(4), **square, k4=k4)) == foldless
+    # A pole on the way is never reached: distorted radii rise to infinity before it.
+    assert has_invertible_distortion(camera_at(np.eye(4), **square, k4=-3.0))
 
 
 def test_distortion_of_real_lenses_is_accepted() -> None:

@@ -2,7 +2,7 @@
 
 import importlib
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -42,7 +42,9 @@ def cameras_of(cameras: list[Camera], model: int = 1) -> Cameras:
         poses=np.array([opencv(c) for c in cameras], np.float32),
         intrinsics=np.array([(c.fx, c.fy, c.cx, c.cy) for c in cameras], np.float32),
         camera_models=np.full(len(cameras), model, np.int32),
-        distortion_parameters=np.array([(c.k1, c.k2, c.p1, c.p2, c.k3, c.k4) for c in cameras]),
+        distortion_parameters=np.array(
+            [(c.k1, c.k2, c.p1, c.p2, c.k3, c.k4, c.k5, c.k6) for c in cameras]
+        ),
         image_sizes=np.array([(c.width, c.height) for c in cameras], np.int32),
     )
 
@@ -99,8 +101,11 @@ def test_distortion_stands_in_opencvs_order(method: Any) -> None:
                   k3=0.002, k4=0.001, fisheye=True)  # fmt: skip
     camera = method.camera_of(cameras_of([wide], model=2)[0])
     assert camera.fisheye and camera.radial == wide.radial
-    with pytest.raises(wn.InputError, match="full_opencv are not read"):
-        method.camera_of(cameras_of([bent], model=3)[0])
+    full = replace(bent, k3=0.05, k4=0.06, k5=0.07, k6=0.08)
+    camera = method.camera_of(cameras_of([full], model=3)[0])
+    assert (camera.radial, camera.k5, camera.k6, camera.p2) == (full.radial, 0.07, 0.08, 0.4)
+    with pytest.raises(wn.InputError, match="a lens of the kind 4 is not read"):
+        method.camera_of(cameras_of([bent], model=4)[0])
 
 
 def test_train_save_go_on_and_render(method: Any, dataset: dict[str, Any], tmp_path: Path) -> None:
@@ -146,6 +151,25 @@ def test_masks_are_kept(method: Any, dataset: dict[str, Any]) -> None:
     views = method.scene_of({**dataset, "masks": masks}).views
     assert [view.name for view in views] == ["000.png", "001.png", "003.png", "004.png", "005.png"]
     assert np.array_equal(views[1].mask, masks[1] > 0)
+
+
+def test_points_of_the_dataset_give_box_and_content_distance(
+    method: Any, dataset: dict[str, Any]
+) -> None:
+    """Of the same points as warpnerf reads them; not of points that the cameras do not see."""
+    points = np.random.default_rng(0).normal(0.0, 0.15, (300, 3))
+    without = method.scene_of(dataset)
+    assert without.content_distances is None and without.points is None
+    found = method.scene_of({**dataset, "points3D_xyz": points.astype(np.float32)})
+    away = [np.median(np.linalg.norm(points - c.position, axis=1)) for c in found.cameras]
+    np.testing.assert_allclose(found.content_distances, away, rtol=1e-5)
+    assert found.content_distance == pytest.approx(np.median(away))
+    assert found.content_distance != without.content_distance
+    assert "points of the dataset" in found.notes[0] and len(found.points) == 300
+    elsewhere = points + np.array([0.0, 0.0, 40.0])
+    for unseen in (elsewhere, np.concatenate([points, elsewhere[:30]]), points[:0], points * 1e300):
+        kept = method.scene_of({**dataset, "points3D_xyz": unseen})
+        assert kept.notes == without.notes and kept.content_distances is None
 
 
 def test_options(method: Any) -> None:

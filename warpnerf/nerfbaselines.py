@@ -17,6 +17,7 @@ from nerfbaselines import register
 from warpnerf.checks import InputError
 from warpnerf.config import PRESETS, TrainConfig
 from warpnerf.scenes.camera import Camera
+from warpnerf.scenes.points import Points, extent_by_points, usable
 from warpnerf.scenes.scene import Scene, View, estimate_extent
 from warpnerf.scenes.undistort import seen_pixels
 from warpnerf.training.checkpoint import load_checkpoint, save_checkpoint
@@ -24,9 +25,22 @@ from warpnerf.training.coarse import begin
 from warpnerf.training.state import TrainingState
 from warpnerf.training.trainer import Trainer
 
-LENSES = ("pinhole", "opencv", "opencv_fisheye", "full_opencv")
-"""The lenses of nerfbaselines, by the number that its cameras hold."""
-READ_LENSES = ("pinhole", "opencv", "opencv_fisheye")
+COEFFICIENTS_OF = {
+    "pinhole": (),
+    "opencv": ("k1", "k2", "p1", "p2"),
+    "opencv_fisheye": ("k1", "k2", "k3", "k4"),
+    "full_opencv": ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"),
+}
+"""What lenses of nerfbaselines are bent by."""
+LENSES = tuple(COEFFICIENTS_OF)
+"""By the number that its cameras hold."""
+
+FEATURES = ("color", "points3D_xyz")
+"""What datasets are asked for; points are left out by those that have none."""
+
+MIN_IN_PICTURES = 0.95
+"""Share of a dataset's points that at least two of its cameras must have in their pictures. Matched
+points are; those of a model that is not the dataset's lie anywhere, and its loaders do not look."""
 
 CHECKPOINT = "checkpoint.safetensors"
 
@@ -91,8 +105,8 @@ class WarpnerfMethod:
         """What the method takes and gives."""
         return {
             "method_id": "warpnerf",
-            "required_features": frozenset(("color",)),
-            "supported_camera_models": frozenset(READ_LENSES),
+            "required_features": frozenset(FEATURES),
+            "supported_camera_models": frozenset(LENSES),
             "supported_outputs": ("color", "depth", "accumulation"),
             "can_resume_training": True,
         }
@@ -217,6 +231,8 @@ def configured(overrides: dict[str, Any], background: np.ndarray | None) -> Trai
 def scene_of(dataset: Any) -> Scene:
     """A scene of the training photographs of a dataset.
 
+    Box and content distance are those of its points, where it has some that its cameras see.
+
     Args:
         dataset: ``nerfbaselines.Dataset`` with its images loaded.
 
@@ -240,18 +256,38 @@ def scene_of(dataset: Any) -> Scene:
     views = [views[i] for i in order]
     see_through = [v.image.shape[2] == 4 and bool((v.image[..., 3] < 255).any()) for v in views]
     unbounded = sum(see_through) < len(views) / 2
-    extent = estimate_extent([view.camera for view in views], unbounded=unbounded)
+    cameras = [view.camera for view in views]
+    extent, sight = estimate_extent(cameras, unbounded=unbounded), None
+    training = range(len(views))
+    points = _points(dataset.get("points3D_xyz"), cameras)
+    if points is not None:
+        extent, sight = extent_by_points(extent, points, views, training, unbounded)
     return Scene(
         name=str(dataset["metadata"].get("scene") or "dataset"),
         views=views,
-        splits={"train": tuple(range(len(views))), "test": ()},
+        splits={"train": tuple(training), "test": ()},
         box_min=extent.box_min,
         box_max=extent.box_max,
         unbounded=unbounded,
         content_distance=extent.content_distance,
-        guessed=extent.guessed,
+        content_distances=None if sight is None else sight.distances,
+        guessed=extent.guessed and sight is None,
+        near_content=None if sight is None else sight.near_content,
+        points=None if sight is None or points is None else points.sample,
         notes=extent.notes,
     )
+
+
+def _points(positions: Any, cameras: Sequence[Camera]) -> Points | None:
+    """The points of a dataset, [n, 3], if there are some and they are where its cameras look."""
+    if positions is None:
+        return None
+    given = np.asarray(positions, np.float64).reshape(-1, 3)
+    points = Points(positions=given[usable(given)], tracks=None, source="the dataset")
+    if not len(points.positions):
+        return None
+    in_pictures = np.sum([points.in_picture(camera) for camera in cameras], axis=0)
+    return points if np.mean(in_pictures >= 2) >= MIN_IN_PICTURES else None
 
 
 def camera_of(camera: Any) -> Camera:
@@ -259,24 +295,23 @@ def camera_of(camera: Any) -> Camera:
 
     Args:
         camera: Its pose [3, 4] camera to world in OpenCV axes, fx, fy, cx, cy in pixels, and
-            distortion parameters in the order k1, k2, p1, p2, k3, k4.
+            the first of the distortion parameters k1, k2, p1, p2, k3, k4, k5, k6, or all.
 
     Raises:
         InputError: The lens is of a kind that is not read.
     """
-    lens = LENSES[int(camera.camera_models)]
-    if lens not in READ_LENSES:
+    number = int(camera.camera_models)
+    if not 0 <= number < len(LENSES):
         raise InputError(
-            f"lenses of the kind {lens} are not read; undistort the photographs to one of "
-            f"{', '.join(READ_LENSES)}."
+            f"a lens of the kind {number} is not read; undistort the photographs to one of "
+            f"{', '.join(LENSES)}."
         )
+    lens = LENSES[number]
     fx, fy, cx, cy = (float(value) for value in camera.intrinsics)
-    k1, k2, p1, p2, k3, k4 = (float(value) for value in _six(camera.distortion_parameters))
-    bent: dict[str, Any] = {}
-    if lens == "opencv":
-        bent = {"k1": k1, "k2": k2, "p1": p1, "p2": p2}
-    if lens == "opencv_fisheye":
-        bent = {"k1": k1, "k2": k2, "k3": k3, "k4": k4, "fisheye": True}
+    given = np.asarray(camera.distortion_parameters, np.float64)
+    order = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+    values = dict(zip(order, map(float, given), strict=False))
+    bent: dict[str, Any] = {name: values.get(name, 0.0) for name in COEFFICIENTS_OF[lens]}
     c2w = np.array(camera.poses, np.float64)[:3, :4]
     c2w[:, 1:3] *= -1.0  # from OpenCV's axes to OpenGL's
     width, height = (int(value) for value in camera.image_sizes)
@@ -288,13 +323,9 @@ def camera_of(camera: Any) -> Camera:
         cx=cx,
         cy=cy,
         c2w=c2w,
+        fisheye=lens == "opencv_fisheye",
         **bent,
     )
-
-
-def _six(parameters: np.ndarray) -> np.ndarray:
-    """The first six of distortion parameters, zeros for those that are left out."""
-    return np.pad(np.asarray(parameters, np.float64), (0, 6))[:6]
 
 
 def _names(paths: Sequence[str], root: str) -> list[str]:
@@ -311,8 +342,8 @@ register(
             "gradients are scaled by distance, so that fewer floaters grow near the cameras.",
         },
         "presets": {name: {"preset": name} for name in PRESETS},
-        "required_features": ["color"],
-        "supported_camera_models": list(READ_LENSES),
+        "required_features": list(FEATURES),
+        "supported_camera_models": list(LENSES),
         "supported_outputs": ["color", "depth", "accumulation"],
     }
 )

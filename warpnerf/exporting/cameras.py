@@ -9,11 +9,9 @@ masks/               white where pixels count, where any photograph has a mask
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -23,6 +21,7 @@ from warpnerf.exporting.surface import Surface
 from warpnerf.media.pictures import picture_files
 from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.scene import Scene
+from warpnerf.scenes.transforms_text import PosedFile, transforms_text
 
 MAX_POINTS = 100_000
 """Points that are written, at most: enough to begin splats from."""
@@ -80,39 +79,25 @@ def thinned(surface: Surface) -> Surface:
 
 
 def transforms_json(scene: Scene, files: dict[str, str]) -> str:
-    """The text of transforms.json: poses camera to world in OpenGL axes, as everywhere here.
+    """The text of transforms.json.
 
     Args:
         scene: Its views and splits.
         files: Names of the photographs in images/, by the names of the views.
     """
-    frames = []
-    for view in scene.views:
-        camera, file = view.camera, files[view.name]
-        bent = ("k1", "k2", "k3", "k4") if camera.fisheye else ("k1", "k2", "k3", "p1", "p2")
-        lens = {name: getattr(camera, name) for name in ("cx", "cy", *bent)}
-        mask = {"mask_path": f"masks/{file}"} if _masked(scene) else {}
-        frames.append(
-            {
-                "file_path": f"images/{file}",
-                **mask,
-                "camera_model": "OPENCV_FISHEYE" if camera.fisheye else "OPENCV",
-                "fl_x": camera.fx,
-                "fl_y": camera.fy,
-                **lens,
-                "w": camera.width,
-                "h": camera.height,
-                "transform_matrix": [*camera.c2w.tolist(), [0.0, 0.0, 0.0, 1.0]],
-            }
+    names = [files[view.name] for view in scene.views]
+    posed = [
+        PosedFile(
+            path=f"images/{name}",
+            camera=view.camera,
+            mask=f"masks/{name}" if _masked(scene) else None,
         )
-    # nerfstudio wants one lens model for all, at the top; here, frames may differ.
-    model = frames[0]["camera_model"]
-    tree: dict[str, Any] = {"camera_model": model, "ply_file_path": "points.ply"}
-    for split, indices in scene.splits.items():
-        if indices:
-            names = [f"images/{files[scene.views[index].name]}" for index in indices]
-            tree[f"{split}_filenames"] = names
-    return json.dumps(tree | {"frames": frames}, indent=1) + "\n"
+        for name, view in zip(names, scene.views, strict=True)
+    ]
+    splits = {
+        split: [posed[index].path for index in indices] for split, indices in scene.splits.items()
+    }
+    return transforms_text(posed, "points.ply", splits)
 
 
 def colmap_text(scene: Scene, files: dict[str, str], points: Surface) -> dict[str, str]:
@@ -161,8 +146,9 @@ def _lens(camera: Camera) -> str:
     bent = [camera.k1, camera.k2, camera.p1, camera.p2]
     if camera.fisheye:
         model, numbers = "OPENCV_FISHEYE", [*numbers, *camera.radial]
-    elif camera.k3 != 0.0:
-        model, numbers = "FULL_OPENCV", [*numbers, *bent, camera.k3, 0.0, 0.0, 0.0]
+    elif camera.k3 != 0.0 or camera.rational:
+        divisor = [camera.k4, camera.k5, camera.k6]
+        model, numbers = "FULL_OPENCV", [*numbers, *bent, camera.k3, *divisor]
     elif any(bent):
         model, numbers = "OPENCV", [*numbers, *bent]
     text = " ".join(f"{x:.17g}" for x in numbers)

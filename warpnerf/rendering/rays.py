@@ -86,6 +86,9 @@ def view_struct(camera: Camera) -> kernels.View:
         view.fisheye = 1
         view.k4 = camera.k4
         view.angle_max = largest_angle(camera.radial)
+    elif camera.rational:
+        view.rational = 1
+        view.divisor = vec3(camera.k4, camera.k5, camera.k6)
     view.width = camera.width
     return view
 

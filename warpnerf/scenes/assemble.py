@@ -18,8 +18,8 @@ from warpnerf.scenes.images import exif_orientation, image_shape
 from warpnerf.scenes.lens import Lens
 from warpnerf.scenes.masks import Mask, PackedMask, masks_of_folder, read_mask
 from warpnerf.scenes.photographs import Keeping, Photograph, keep
-from warpnerf.scenes.points import Points, SeenExtent, seen_extent
-from warpnerf.scenes.scene import Extent, Scene, View, estimate_extent
+from warpnerf.scenes.points import Points, extent_by_points
+from warpnerf.scenes.scene import Scene, View, estimate_extent
 from warpnerf.scenes.undistort import seen_pixels
 
 LITTLE = 0.1
@@ -165,9 +165,7 @@ def assemble(
         raise InputError(f"{file}: $.frames[].transform_matrix: {error}") from None
     sight = None
     if points is not None:
-        seen = [points.seen_by(view.name, view.camera) for view in views]
-        sight = seen_extent([view.camera for view in views], seen, indices["train"])
-        extent = _seen_extent(extent, points, sight, unbounded)
+        extent, sight = extent_by_points(extent, points, views, indices["train"], unbounded)
     return Scene(
         name=folder.resolve().name,
         views=views,
@@ -188,27 +186,6 @@ def assemble(
             ),
         ),
     )
-
-
-def _seen_extent(
-    extent: Extent, points: Points, sight: SeenExtent | None, unbounded: bool
-) -> Extent:
-    """The extent by what cameras see; the box of an object stays what the cameras look at."""
-    if sight is None:
-        note = f"points of {points.source} are not used: too few tell what the cameras see"
-        return replace(extent, notes=(*extent.notes, note))
-    distance = (
-        f"content distance {sight.content_distance:.3g}: median distance of the points of "
-        f"{points.source} that a training camera sees"
-    )
-    extent = replace(
-        extent, content_distance=sight.content_distance, notes=(distance, extent.notes[1])
-    )
-    if not (unbounded or extent.guessed):
-        return extent
-    edges = " x ".join(f"{edge:.3g}" for edge in sight.box_max - sight.box_min)
-    box = f"box of edges {edges}: where these points are, but for outliers and what is far behind"
-    return replace(extent, box_min=sight.box_min, box_max=sight.box_max, notes=(distance, box))
 
 
 def complete_splits(

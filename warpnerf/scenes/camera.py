@@ -21,8 +21,9 @@ class Camera:
 
     With (x, y) = (X/Z, Y/Z) in OpenCV axes and r^2 = x^2 + y^2, a point lands on the pixel
 
-        x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2),   u = fx x' + cx
-        y' = y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y,   v = fy y' + cy
+        R  = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)
+        x' = x R + 2 p1 x y + p2 (r^2 + 2 x^2),   u = fx x' + cx
+        y' = y R + p1 (r^2 + 2 y^2) + 2 p2 x y,   v = fy y' + cy
 
     and through a fisheye lens, with its angle theta to the optical axis, up to 180 degrees,
 
@@ -54,9 +55,13 @@ class Camera:
     p2: float = 0.0
     """Tangential distortion, not of a fisheye lens."""
     k4: float = 0.0
-    """Radial distortion of a fisheye lens, theta^8."""
+    """Radial distortion: r^2 of the divisor, or theta^8 of a fisheye lens."""
     fisheye: bool = False
     """Whether it is a fisheye lens."""
+    k5: float = 0.0
+    """Radial distortion, r^4 of the divisor; not of a fisheye lens."""
+    k6: float = 0.0
+    """Radial distortion, r^6 of the divisor; not of a fisheye lens."""
 
     def __post_init__(self) -> None:
         """Refuse what makes no rays."""
@@ -73,13 +78,12 @@ class Camera:
         require_at_least("Camera.height", self.height, 1)
         require_positive("Camera.fx", self.fx)
         require_positive("Camera.fy", self.fy)
-        for name in ("cx", "cy", "k1", "k2", "k3", "p1", "p2", "k4"):
+        for name in ("cx", "cy", "k1", "k2", "k3", "p1", "p2", "k4", "k5", "k6"):
             if not math.isfinite(getattr(self, name)):
                 raise InputError(f"Camera.{name} must be finite, not {getattr(self, name)}.")
-        for name in ("p1", "p2") if self.fisheye else ("k4",):
-            if getattr(self, name) != 0.0:
-                kind = "a fisheye lens" if self.fisheye else "a lens that is no fisheye"
-                raise InputError(f"Camera.{name} must be 0 for {kind}.")
+        for name in ("p1", "p2", "k5", "k6"):
+            if self.fisheye and getattr(self, name) != 0.0:
+                raise InputError(f"Camera.{name} must be 0 for a fisheye lens.")
         if not isinstance(self.c2w, np.ndarray) or self.c2w.shape != (3, 4):
             raise InputError(
                 f"Camera.c2w must be an array [3, 4], not {list(np.shape(self.c2w))}; leave out a "
@@ -103,6 +107,11 @@ class Camera:
         """k1, k2, k3, k4."""
         return self.k1, self.k2, self.k3, self.k4
 
+    @property
+    def rational(self) -> bool:
+        """Whether radial distortion is a quotient of two polynomials."""
+        return not self.fisheye and any((self.k4, self.k5, self.k6))
+
     def distort(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Distort points on the plane Z = 1, as in the equation of the class.
 
@@ -118,6 +127,11 @@ class Camera:
         r2 = x * x + y * y
         radial = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
         slope = 2.0 * (self.k1 + r2 * (2.0 * self.k2 + r2 * 3.0 * self.k3))  # d radial / d(r^2/2)
+        if self.rational:
+            divisor = 1.0 + r2 * (self.k4 + r2 * (self.k5 + r2 * self.k6))
+            radial = radial / divisor
+            rise = 2.0 * (self.k4 + r2 * (2.0 * self.k5 + r2 * 3.0 * self.k6))
+            slope = (slope - radial * rise) / divisor
         distorted = np.stack(
             [
                 x * radial + 2.0 * self.p1 * x * y + self.p2 * (r2 + 2.0 * x * x),

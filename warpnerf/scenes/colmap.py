@@ -44,7 +44,7 @@ PARAMETERS = {
     "SIMPLE_RADIAL": ("fl", "cx", "cy", "k1"),
     "RADIAL": ("fl", "cx", "cy", "k1", "k2"),
     "OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"),
-    "FULL_OPENCV": (*("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),),
+    "FULL_OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     "OPENCV_FISHEYE": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4"),
     "SIMPLE_RADIAL_FISHEYE": ("fl", "cx", "cy", "k1"),
     "RADIAL_FISHEYE": ("fl", "cx", "cy", "k1", "k2"),
@@ -280,13 +280,7 @@ def _lens(file: Path, number: int, camera: _Camera, photograph: Path, reduced: b
     for name, value in zip(names, camera.parameters, strict=True):
         if not math.isfinite(value):
             raise InputError(f"{file}: {place}: {name} is not a finite number; export it again.")
-        if camera.model == "FULL_OPENCV" and name in ("k4", "k5", "k6"):
-            if value != 0.0:
-                raise InputError(
-                    f"{file}: {place}: {name} is not modelled unless it is 0; undistort the images "
-                    "to a pinhole camera (colmap image_undistorter)."
-                )
-        elif name == "fl":
+        if name == "fl":
             values["fl_x"] = values["fl_y"] = value
         else:
             values[name] = value

@@ -15,7 +15,13 @@ from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.undistort import COEFFICIENTS, has_invertible_distortion
 
 FISHEYE = "OPENCV_FISHEYE"
-CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", FISHEYE)
+RATIONAL = "FULL_OPENCV"
+"""The lens whose k4, k5 and k6 are those of a divisor. nerfstudio takes the k4 of other lenses for
+another thing: the factor of r^8."""
+CAMERA_MODELS = (
+    *("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"),
+    *(RATIONAL, FISHEYE),
+)
 
 FOCAL_KEYS = ("fl_x", "camera_angle_x", "fl_y", "camera_angle_y")
 
@@ -24,7 +30,7 @@ FOCAL_KEYS = ("fl_x", "camera_angle_x", "fl_y", "camera_angle_y")
 KEY_GROUPS = (
     FOCAL_KEYS[:2],
     FOCAL_KEYS[2:],
-    *((key,) for key in ("cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2")),
+    *((key,) for key in ("cx", "cy", "w", "h", *COEFFICIENTS)),
 )
 
 MIN_FOCAL = 0.02
@@ -37,7 +43,6 @@ MAX_OFF_CENTRE = 50.0
 """Largest distance of the principal point from the middle, in sizes of the image."""
 
 UNSUPPORTED_LENSES = ("ftheta_p0", "latlong", "equirectangular", "orthographic")
-UNSUPPORTED_COEFFICIENTS = ("k5", "k6")
 ADVICE = "undistort the images to a pinhole camera (colmap image_undistorter)"
 
 
@@ -183,10 +188,10 @@ def read_lens(file: Path, levels: Sequence[tuple[str, LensFields]]) -> Lens:
             f"{file}: {levels[0][0]}: has no focal length; add fl_x (pixels) or camera_angle_x "
             "(radians)."
         )
-    if not fisheye and values.get("k4"):
-        raise InputError(f"{file}: {fields['k4']}: is not modelled unless it is 0; {ADVICE}.")
     if fisheye:
         _check_fisheye(file, values, fields)
+    elif next((level.camera_model for _, level in levels if level.camera_model), "") != RATIONAL:
+        _refuse_divisor(file, values, fields)
     return Lens(file=file, values=values, fields=fields, fisheye=fisheye)
 
 
@@ -197,12 +202,21 @@ def _is_fisheye(level: LensFields) -> bool | None:
     return level.camera_model == FISHEYE or bool(level.is_fisheye)
 
 
-def _check_fisheye(file: Path, values: Mapping[str, float], fields: Mapping[str, str]) -> None:
-    for key in ("p1", "p2"):
+def _refuse_divisor(file: Path, values: Mapping[str, float], fields: Mapping[str, str]) -> None:
+    for key in ("k4", "k5", "k6"):
         if values.get(key):
             raise InputError(
-                f"{file}: {fields[key]}: a fisheye lens has no tangential distortion; calibrate "
-                "the lens as OPENCV_FISHEYE, with k1 to k4 only."
+                f"{file}: {fields[key]}: is read as OpenCV's of a rational lens, and only where "
+                f'camera_model is "{RATIONAL}"; write that if it is one, else {ADVICE}.'
+            )
+
+
+def _check_fisheye(file: Path, values: Mapping[str, float], fields: Mapping[str, str]) -> None:
+    for key in ("p1", "p2", "k5", "k6"):
+        if values.get(key):
+            raise InputError(
+                f"{file}: {fields[key]}: a fisheye lens has none; calibrate the lens as {FISHEYE}, "
+                "with k1 to k4 only."
             )
     for key in ("camera_angle_x", "camera_angle_y"):
         if key in values:
@@ -229,9 +243,6 @@ def _refuse_unsupported(file: Path, place: str, level: LensFields) -> None:
     for key in UNSUPPORTED_LENSES:
         if getattr(level, key):
             raise InputError(f"{file}: {place}.{key}: that lens is not modelled; {ADVICE}.")
-    for key in UNSUPPORTED_COEFFICIENTS:
-        if getattr(level, key):
-            raise InputError(f"{file}: {place}.{key}: is not modelled unless it is 0; {ADVICE}.")
     if level.camera_model is not None and level.camera_model not in CAMERA_MODELS:
         raise InputError(
             f"{file}: {place}.camera_model: {level.camera_model[:40]!r} is none of "

@@ -9,7 +9,7 @@ import numpy as np
 
 from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.poses import MAX_COORDINATE
-from warpnerf.scenes.scene import Scene
+from warpnerf.scenes.scene import Extent, Scene, View
 
 MAX_PROJECTED = 5000
 """Points without tracks that are looked for in each photograph; of more every n-th is taken."""
@@ -68,7 +68,15 @@ class Points:
             indices = self.tracks.get(name, np.empty(0, np.int64))
             points = self.positions[_spread(indices, MAX_SEEN)]
             return points[(points - camera.position) @ camera.forward > 0.0]
-        points = _spread(self.positions, MAX_PROJECTED)
+        return self.sample[self.in_picture(camera)]
+
+    def in_picture(self, camera: Camera) -> np.ndarray:
+        """Which points of ``sample`` fall into a camera's picture, [n] bool.
+
+        Args:
+            camera: The camera; its distortion is left out of account.
+        """
+        points = self.sample
         x, y, z = ((points - camera.position) @ camera.c2w[:, :3]).T
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             if camera.fisheye:  # as far from the middle as the angle to the axis is large
@@ -78,7 +86,7 @@ class Points:
                 scale = -1.0 / z
             u, v = camera.cx + camera.fx * x * scale, camera.cy - camera.fy * y * scale
         inside = (u >= 0.0) & (u < camera.width) & (v >= 0.0) & (v < camera.height)
-        return points[inside & (z < 0.0)]
+        return np.asarray(inside & (z < 0.0))
 
     @property
     def sample(self) -> np.ndarray:
@@ -157,6 +165,47 @@ def seen_extent(
         box_min=low - margin,
         box_max=high + margin,
     )
+
+
+def extent_by_points(
+    extent: Extent,
+    points: Points,
+    views: Sequence[View],
+    training: Sequence[int],
+    unbounded: bool,
+) -> tuple[Extent, SeenExtent | None]:
+    """The extent by what cameras see; the box of an object stays what the cameras look at.
+
+    Args:
+        extent: As the cameras alone tell.
+        points: Of the scene.
+        views: All.
+        training: Indices of those that are trained on.
+        unbounded: Whether the scene is more than an object.
+
+    Returns:
+        The extent, with notes that say what it is of, and what the points tell; None where too few
+        tell something.
+    """
+    cameras = [view.camera for view in views]
+    seen = [points.seen_by(view.name, view.camera) for view in views]
+    sight = seen_extent(cameras, seen, training)
+    if sight is None:
+        note = f"points of {points.source} are not used: too few tell what the cameras see"
+        return replace(extent, notes=(*extent.notes, note)), None
+    distance = (
+        f"content distance {sight.content_distance:.3g}: median distance of the points of "
+        f"{points.source} that a training camera sees"
+    )
+    extent = replace(
+        extent, content_distance=sight.content_distance, notes=(distance, extent.notes[1])
+    )
+    if not (unbounded or extent.guessed):
+        return extent, sight
+    edges = " x ".join(f"{edge:.3g}" for edge in sight.box_max - sight.box_min)
+    box = f"box of edges {edges}: where these points are, but for outliers and what is far behind"
+    extent = replace(extent, box_min=sight.box_min, box_max=sight.box_max, notes=(distance, box))
+    return extent, sight
 
 
 def seen_scene(scene: Scene, sight: SeenExtent) -> Scene:

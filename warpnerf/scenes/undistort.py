@@ -10,7 +10,7 @@ import numpy as np
 from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.fisheye import angle_of, distorted_angle, largest_angle
 
-COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
+COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 """Of a lens, by their names."""
 
 _LENS = ("width", "height", "fx", "fy", "cx", "cy", *COEFFICIENTS, "fisheye")

@@ -13,10 +13,12 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from PIL import Image
 
 from warpnerf.checks import InputError
 from warpnerf.runtime.memory import usable_cores
+from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.contents import (
     NEEDED,
     VIDEOS,
@@ -25,7 +27,10 @@ from warpnerf.scenes.contents import (
     what_is_there,
 )
 from warpnerf.scenes.files import exists, printable
+from warpnerf.scenes.lens import FISHEYE
 from warpnerf.scenes.masks import read_mask
+from warpnerf.scenes.transforms_text import PosedFile, transforms_text
+from warpnerf.scenes.undistort import COEFFICIENTS
 from warpnerf.sfm import scene_files
 from warpnerf.sfm.config import Lenses, PoseConfig
 from warpnerf.sfm.frames import sharp_frames
@@ -312,11 +317,15 @@ def _write(
 ) -> None:
     """Write transforms.json and pose.json."""
     placed = [p for p in photographs if p.path.name in found["registered"]]
-    text = scene_files.transforms_text(
-        poses={in_scene[p.path]: found["registered"][p.path.name] for p in placed},
-        cameras={in_scene[p.path]: found["cameras"][p.path.name] for p in placed},
-        masks={in_scene[p.path]: in_scene[p.mask.path] for p in placed if p.mask},
-    )
+    files = [
+        PosedFile(
+            path=in_scene[p.path],
+            camera=_camera(found["cameras"][p.path.name], found["registered"][p.path.name]),
+            mask=in_scene[p.mask.path] if p.mask else None,
+        )
+        for p in placed
+    ]
+    text = transforms_text(sorted(files, key=lambda file: file.path), scene_files.POINTS)
     (prepared / scene_files.TRANSFORMS).write_text(text, encoding="utf-8")
     written = [
         path.relative_to(prepared).as_posix() for path in prepared.rglob("*") if path.is_file()
@@ -334,4 +343,19 @@ def _write(
     }
     (prepared / scene_files.SUMMARY).write_text(
         json.dumps(content, indent=1) + "\n", encoding="utf-8"
+    )
+
+
+def _camera(lens: dict[str, Any], pose: list[list[float]]) -> Camera:
+    """A camera as the process of COLMAP reports it: its lens under the names of the files."""
+    return Camera(
+        width=lens["w"],
+        height=lens["h"],
+        fx=lens["fl_x"],
+        fy=lens["fl_y"],
+        cx=lens["cx"],
+        cy=lens["cy"],
+        c2w=np.array(pose),
+        fisheye=lens["model"] == FISHEYE,
+        **{name: lens.get(name, 0.0) for name in COEFFICIENTS},
     )

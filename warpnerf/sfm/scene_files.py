@@ -10,9 +10,7 @@ pose.json                      what was found, what it was made of, and which fi
 
 from __future__ import annotations
 
-import json
 import shutil
-from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -33,9 +31,6 @@ IN_RUN = "scene"
 """Folder of a run that was given photographs without poses, for the scene made of them."""
 NEXT_IN_RUN = "next/scene"
 """Where that scene is until the run begins: until then the folder may hold another run."""
-
-LENS_KEYS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2")
-FISHEYE = "OPENCV_FISHEYE"
 
 
 class Record(msgspec.Struct):
@@ -77,37 +72,6 @@ def require_free(folder: Path, source: Path, overwrite: bool) -> None:
     own = source.resolve().is_relative_to(folder.resolve())
     if not own and any(folder.iterdir()):
         raise InputError(f"--output {folder} holds other files; name a new folder.")
-
-
-def transforms_text(
-    poses: Mapping[str, Sequence[Sequence[float]]],
-    cameras: Mapping[str, Mapping[str, Any]],
-    masks: Mapping[str, str],
-) -> str:
-    """The content of transforms.json.
-
-    Args:
-        poses: Camera to world, [3, 4], OpenGL axes, by the file path of each photograph.
-        cameras: Model, size, focal lengths, centre and distortion by the same, in pixels; all of
-            them fisheye lenses, or none.
-        masks: File paths of masks by the same, where there are any.
-    """
-    fisheye = all(camera["model"] == FISHEYE for camera in cameras.values())
-    keys = (*LENS_KEYS, *(("k3", "k4") if fisheye else ("p1", "p2")))
-    lenses = {path: {key: cameras[path].get(key, 0.0) for key in keys} for path in poses}
-    different = {json.dumps(lens) for lens in lenses.values()}
-    frames = []
-    for path, pose in sorted(poses.items()):
-        frame: dict[str, Any] = {"file_path": path}
-        if len(different) > 1:
-            frame |= lenses[path]
-        if path in masks:
-            frame["mask_path"] = masks[path]
-        frames.append(frame | {"transform_matrix": [*pose, [0.0, 0.0, 0.0, 1.0]]})
-    shared = json.loads(different.pop()) if len(different) == 1 else {}
-    content: dict[str, Any] = {"camera_model": FISHEYE if fisheye else "OPENCV"}
-    content |= {**shared, "ply_file_path": POINTS, "frames": frames}
-    return json.dumps(content, indent=1) + "\n"
 
 
 def move_into(prepared: Path, folder: Path) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 
 from warpnerf.scenes.contents import NEEDED
 from warpnerf.scenes.files import printable
+from warpnerf.scenes.undistort import COEFFICIENTS
 from warpnerf.sfm.photographs import Photograph
 
 WELL_COVERED = 10
@@ -143,9 +144,7 @@ def _lenses(cameras: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     lenses = list({tuple(camera.items()): camera for camera in cameras.values()}.values())
     for lens in lenses[:SHOWN]:
         focal = sorted({f"{lens[key]:.1f}" for key in ("fl_x", "fl_y")})
-        distortion = [
-            f"{k} {lens[k]:.4f}" for k in ("k1", "k2", "k3", "k4", "p1", "p2") if lens.get(k)
-        ]
+        distortion = [f"{k} {lens[k]:.4f}" for k in COEFFICIENTS if lens.get(k)]
         yield (
             f"lens {lens['model']} for {lens['w']} x {lens['h']}: focal length "
             f"{', '.join(focal)} pixels" + "".join(f", {text}" for text in distortion)

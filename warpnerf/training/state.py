@@ -135,6 +135,7 @@ def scene_digest(scene: Scene) -> str:
         lens = (camera.fx, camera.fy, camera.cx, camera.cy)
         distortion = [camera.k1, camera.k2, camera.k3, camera.p1, camera.p2]
         distortion += [camera.k4, 1.0] if camera.fisheye else []
+        distortion += [camera.k4, camera.k5, camera.k6] if camera.rational else []
         numbers = (
             np.round(lens, 3),
             np.round([*distortion, *camera.c2w[:, :3].ravel()], 5),

@@ -31,6 +31,8 @@ class View:
     principal: vec2  # cx, cy, pixels
     radial: vec3  # k1, k2, k3
     tangential: vec2  # p1, p2
+    divisor: vec3  # k4, k5, k6 of a rational lens
+    rational: int  # 1: what moves a point in the plane z = 1 is divided by 1 + k4 r^2 + ...
     fisheye: int  # 1: radial and k4 distort the angle to the axis; 0: the point in the plane z = 1
     k4: real  # of a fisheye lens
     angle_max: real  # of a fisheye lens: up to where the distorted angle rises, radians
@@ -42,12 +44,27 @@ class View:
 
 
 @wp.func
+def radial_factor(view: View, r2: real):
+    """What radial distortion multiplies a point by, r2 from the axis, and its derivative by r2."""
+    two = real(2.0)
+    three = real(3.0)
+    factor = real(1.0) + r2 * (view.radial[0] + r2 * (view.radial[1] + r2 * view.radial[2]))
+    slope = view.radial[0] + r2 * (two * view.radial[1] + r2 * three * view.radial[2])
+    if view.rational == 1:
+        k = view.divisor
+        inverse = real(1.0) / (real(1.0) + r2 * (k[0] + r2 * (k[1] + r2 * k[2])))
+        factor = factor * inverse
+        slope = inverse * (slope - factor * (k[0] + r2 * (two * k[1] + r2 * three * k[2])))
+    return factor, slope
+
+
+@wp.func
 def distort(view: View, p: vec2) -> vec2:
     """OpenCV's radial and tangential distortion of a point in the plane z = 1."""
     x = p[0]
     y = p[1]
     r2 = x * x + y * y
-    radial = real(1.0) + r2 * (view.radial[0] + r2 * (view.radial[1] + r2 * view.radial[2]))
+    radial, _slope = radial_factor(view, r2)
     p1 = view.tangential[0]
     p2 = view.tangential[1]
     two = real(2.0)
@@ -59,7 +76,10 @@ def distort(view: View, p: vec2) -> vec2:
 
 @wp.func
 def strain(view: View, r2: real) -> real:
-    """A bound on how far distort's Jacobian is from the identity, up to r2 from the axis."""
+    """A bound on how far distort's Jacobian is from the identity, up to r2 from the axis.
+
+    Not of rational lenses.
+    """
     radial = view.radial
     tangential = wp.abs(view.tangential[0]) + wp.abs(view.tangential[1])
     third = real(5.0) * wp.abs(radial[1]) + r2 * real(7.0) * wp.abs(radial[2])
@@ -73,19 +93,25 @@ def undistort(view: View, distorted: vec2) -> vec2:
     Where a lens changes little, p starts at the target. Else the target moves out from the
     principal point in eight strides of one step each, for which p is first moved straight on as
     far. Steps follow until p is close to where it ends, and four more. Where a lens folds over, and
-    nothing is found, it ends wherever 40 steps lead.
+    nothing is found, it ends wherever 40 steps lead. A rational lens has 32 strides, and p stays
+    where it is before each: what is divided by may be close to 0 straight on.
     """
+    stride = real(0.125)
+    most = int(40)  # steps
+    if view.rational == 1:
+        stride = real(0.03125)
+        most = 72
     p = vec2()
     two = real(2.0)
     share = real(0.0)  # of its way that the target has come
-    if strain(view, real(1.6) * wp.length_sq(distorted)) < real(0.5):
+    if view.rational == 0 and strain(view, real(1.6) * wp.length_sq(distorted)) < real(0.5):
         p = distorted
         share = real(1.0)
     left = int(4)  # steps to take once p is close: each doubles the digits
-    for _ in range(40):
+    for _ in range(most):
         if share < real(1.0):
-            further = share + real(0.125)
-            if share > real(0.0):
+            further = share + stride
+            if share > real(0.0) and view.rational == 0:
                 p = p * (further / share)
             share = further
         elif wp.length_sq(distort(view, p) - distorted) < real(1.0e-6):
@@ -93,8 +119,7 @@ def undistort(view: View, distorted: vec2) -> vec2:
         x = p[0]
         y = p[1]
         r2 = x * x + y * y
-        radial = real(1.0) + r2 * (view.radial[0] + r2 * (view.radial[1] + r2 * view.radial[2]))
-        slope = view.radial[0] + r2 * (two * view.radial[1] + r2 * real(3.0) * view.radial[2])
+        radial, slope = radial_factor(view, r2)
         p1 = view.tangential[0]
         p2 = view.tangential[1]
         # The Jacobian of distort, which is symmetric.
@@ -162,7 +187,8 @@ def pixel_direction(view: View, u: real, v: real) -> vec3:
     p = vec2((u - view.principal[0]) / view.focal[0], (v - view.principal[1]) / view.focal[1])
     if view.fisheye == 1:
         return wp.normalize(view.rotation * fisheye_direction(view, p))
-    if wp.length_sq(view.radial) + wp.length_sq(view.tangential) > real(0.0):
+    bent = wp.length_sq(view.radial) + wp.length_sq(view.tangential)
+    if bent > real(0.0) or view.rational == 1:
         p = undistort(view, p)
     return wp.normalize(view.rotation * vec3(p[0], -p[1], real(-1.0)))
 
