@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from warpnerf.checks import InputError
+from warpnerf.cli.loss_options import chosen_losses
 from warpnerf.cli.machine import FAILED
 from warpnerf.cli.model_options import chosen_model
 from warpnerf.cli.pose import with_poses
@@ -37,6 +38,7 @@ def train_command(
     preset: Literal["fast", "quality"] | None = None,
     model: str | None = None,
     model_options: tuple[str, ...] = (),
+    loss: tuple[str, ...] = (),
     steps: int | None = None,
     time_limit: float | None = None,
     scaling: Scaling | None = None,
@@ -69,6 +71,9 @@ def train_command(
             that is the same from all sides).
         model_options: Of the model, such as specular=8 width=64 (deferred), features=12
             residual=false threshold=0.0001 (features), degree=2 (sh).
+        loss: What is minimised besides, and how: photometric=huber huber_delta=0.1, and weights of
+            distortion=0.01, entropy=0.001, sample_colour=0.1 (not for deferred), near_clip=0.01
+            near_clip_distance=0.2.
         steps: Batches of rays to train on.
         time_limit: Seconds of training; the schedule is squeezed to fit.
         scaling: How a sample's gradient depends on its distance from the camera.
@@ -106,6 +111,7 @@ def train_command(
     def changed(config: TrainConfig) -> TrainConfig:
         config = dataclasses.replace(config, **given)
         config = dataclasses.replace(config, model=chosen_model(config.model, model, model_options))
+        config = dataclasses.replace(config, loss=chosen_losses(config.loss, loss))
         if voxels is not None:
             grid = dataclasses.replace(config.grid, voxels=voxels)
             config = dataclasses.replace(config, grid=grid)
@@ -128,6 +134,10 @@ def train_command(
             "train wants a SCENE and --output DIR for a new run, or --resume DIR to go on with one."
         )
     config = changed(PRESETS[preset or "fast"])
+    if config.loss.kinds:  # before photographs are posed or read; loads Warp
+        from warpnerf.rendering.losses import parts_with
+
+        parts_with(config.model, "float32", config.loss)
     factor = 1 if downscale is None else downscale
     return _begin(scene, output, factor, masks, images, config, overwrite, page)
 
