@@ -16,6 +16,7 @@ from warpnerf.model.grid import box_struct, density_struct, free_struct, grid_st
 from warpnerf.model.interface import Model
 from warpnerf.model.models import Rgb
 from warpnerf.rendering.adjoint import AdjointLaunch, gradient_struct
+from warpnerf.rendering.losses import PLAIN, Minimised
 from warpnerf.rendering.rays import rays_struct
 from warpnerf.rendering.render import (
     Steps,
@@ -62,6 +63,7 @@ class Problem:
     free: NDArray[np.uint8] = field(default_factory=none_free)  # [MX, MY, MZ] distances, cells
     model: Model = field(default_factory=Rgb)
     weights: Float64 = field(default_factory=lambda: np.zeros(0))  # [n_weights]
+    minimised: Minimised = PLAIN
 
     @property
     def n_rays(self) -> int:
@@ -183,6 +185,7 @@ class Kernels:
             density=self.density(p),
             weights=self.array(p.weights),
             workers=workers or self.workers,
+            minimised=p.minimised,
         )
 
     def rays(self, p: Problem) -> Any:
@@ -198,7 +201,15 @@ class Kernels:
         )
 
     def variant(self, p: Problem, scaling: str = "none", jacobian: str = "none") -> Any:
-        return variant_of(p.model, self.precision, p.contraction, scaling, jacobian, self.packed)
+        return variant_of(
+            p.model,
+            self.precision,
+            p.contraction,
+            scaling,
+            jacobian,
+            self.packed,
+            p.minimised.config,
+        )
 
     def scratch(self, variant: Any, capacity: int, workers: Workers | None = None) -> Any:
         """Room to keep so many packs of each worker."""
@@ -311,7 +322,7 @@ class Kernels:
             n_samples,
         )
         found = found_gradient(gradient).reshape(p.raw.shape)
-        return error.numpy() + loss.numpy(), found, gradient.weights.numpy().sum(axis=0)
+        return loss.numpy(), found, gradient.weights.numpy().sum(axis=0)
 
 
 def found_gradient(gradient: Any) -> Float64:

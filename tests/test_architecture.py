@@ -195,8 +195,9 @@ def adjoints(source: str) -> list[tuple[str, bool]]:
     """All adjoints in a module, and whether each stands directly below its forward function.
 
     Vector forms and native functions are functions like others: adj_x_pack stands below x_pack.
-    Overloads follow each other, and x_slope may stand between x and adj_x. Functions inside
-    functions are looked at, too, except inside an adjoint.
+    Overloads follow each other, and so does adj_x_with_y, which does what adj_x does and more.
+    x_slope may stand between x and adj_x. Functions inside functions are looked at, too, except
+    inside an adjoint.
     """
     found: list[tuple[str, bool]] = []
 
@@ -208,14 +209,15 @@ def adjoints(source: str) -> list[tuple[str, bool]]:
             if not isinstance(child, ast.FunctionDef):
                 look(child)
                 continue
-            forward = forward_of(child.name, names)
+            name = child.name.partition("_with_")[0]
+            forward = forward_of(name, names)
             if forward is None:
                 look(child)
-            elif above[-1:] != [child.name]:
+            elif above[-1:] != [name]:
                 before = above[:-1] if above[-1:] == [f"{forward}_slope"] else above
-                found.append((child.name, before[-1:] == [forward]))
-            if above[-1:] != [child.name]:
-                above.append(child.name)
+                found.append((name, before[-1:] == [forward]))
+            if above[-1:] != [name]:
+                above.append(name)
 
     look(ast.parse(source))
     return found
@@ -232,6 +234,7 @@ def test_a_misplaced_adjoint_is_seen() -> None:
     assert right("x", "adj_x", "x_pack", "adj_x_pack", "pack_x", "pack_adj_x") == [True] * 3
     assert right("x", "x_slope", "adj_x") == right("x", "x", "adj_x", "adj_x") == [True]
     assert right("x_forward_kernel", "x_backward_kernel") == right("forward", "backward") == [True]
+    assert right("x", "adj_x", "adj_x_with_y") == [True] and right("x", "adj_y_with_x") == [False]
     assert right("x", "y", "adj_x") == right("adj_x", "x") == right("adj_x") == [False]
     assert right("x", "x_pack", "adj_x", "adj_x_pack") == [False, False]
     assert right("pack_x", "y", "pack_adj_x") == [False]

@@ -125,8 +125,8 @@ def near_two(weights: Any, t: Any, dt: float) -> float:
 
 
 def apart(weights: Any, t: Any, dt: float) -> float:
-    pairs = np.abs(t[:, None] - t) * weights[:, None] * weights
-    return 2.0 * float(pairs.sum() + (weights**2 * dt / 3.0).sum())
+    pairs = (t[:, None] - t) ** 2 * weights[:, None] * weights
+    return 2.0 * float(pairs.sum())
 
 
 def test_given_distances_of_equal_steps_are_those_of_the_march(kernels64: Kernels) -> None:

@@ -40,7 +40,7 @@ def test_a_training_loads_no_other_kernels(
     trainer = Trainer(small_scene(), config)
     assert not trainer.workers._loaded  # a scene is described before anything is compiled
     where = trainer.workers.device
-    needed = training_kernels(model, contraction, scaling, "none", where)
+    needed = training_kernels(model, contraction, scaling, "none", where, config.loss)
     trainer.update()
     assert trainer.workers._loaded == set(needed)
     trainer.run()

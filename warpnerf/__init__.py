@@ -14,7 +14,14 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from warpnerf.checks import InputError
-    from warpnerf.config import PRESETS, GridConfig, MarchConfig, OptimConfig, TrainConfig
+    from warpnerf.config import (
+        PRESETS,
+        GridConfig,
+        LossConfig,
+        MarchConfig,
+        OptimConfig,
+        TrainConfig,
+    )
     from warpnerf.evaluation.evaluate import Evaluation, evaluate
     from warpnerf.evaluation.inspection import Inspection, inspect
     from warpnerf.exporting.export import export
@@ -57,6 +64,7 @@ _HOMES = {
     "InputError": "checks",
     "PRESETS": "config",
     "GridConfig": "config",
+    "LossConfig": "config",
     "MarchConfig": "config",
     "OptimConfig": "config",
     "TrainConfig": "config",
@@ -108,6 +116,7 @@ __all__ = [  # noqa: RUF022 (grouped by home, as above)
     "InputError",
     "PRESETS",
     "GridConfig",
+    "LossConfig",
     "MarchConfig",
     "OptimConfig",
     "TrainConfig",

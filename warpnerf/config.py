@@ -180,6 +180,53 @@ class OptimConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class LossConfig:
+    """What training minimises: the mean over rays of the photometric loss, which is a sum over the
+    three channels, and of the others, each times its weight. A weight of 0 leaves a loss out.
+
+    Systems that take the mean over the channels give a third of these weights.
+    """
+
+    photometric: Literal["squared", "huber"] = "squared"
+    """How a ray's colour is held against its pixel. huber: as squared up to huber_delta in a
+    channel, from there on a line."""
+    huber_delta: float = 0.1
+    """Where that line begins, of colours in [0, 1]."""
+    distortion: float = 0.0
+    """Weight of the distortion loss: matter of a ray comes together. Distances count as
+    t / (D + t), with D the scene's content distance."""
+    entropy: float = 0.0
+    """Weight of the entropy of the remaining light: a ray ends in matter, or meets none."""
+    sample_colour: float = 0.0
+    """Weight of the squared errors of the colours of single samples. For models that have such:
+    all but deferred."""
+    near_clip: float = 0.0
+    """Weight of the sum of raw densities nearer to the camera than near_clip_distance, as DVGO
+    pushes them down; for comparison."""
+    near_clip_distance: float = 0.0
+    """How near that is, scene units."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be minimised."""
+        require_one_of("loss.photometric", self.photometric, ("squared", "huber"))
+        require_positive("loss.huber_delta", self.huber_delta)
+        for name in ("distortion", "entropy", "sample_colour", "near_clip", "near_clip_distance"):
+            require_at_least(f"loss.{name}", getattr(self, name), 0.0)
+        if self.near_clip > 0.0 and self.near_clip_distance == 0.0:
+            raise InputError(
+                "loss.near_clip needs loss.near_clip_distance, the distance up to which raw "
+                "densities are pushed down; give both, or leave near_clip at 0."
+            )
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Which losses there are besides the squared error; kernels are compiled for them."""
+        huber = ("huber",) if self.photometric == "huber" else ()
+        weighed = ("distortion", "entropy", "sample_colour", "near_clip")
+        return huber + tuple(name for name in weighed if getattr(self, name) > 0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
 class TrainConfig:
     """One training run."""
 
@@ -228,6 +275,8 @@ class TrainConfig:
     """How rays are stepped."""
     optim: OptimConfig = field(default_factory=OptimConfig)
     """Adam, its schedule, and regularisation."""
+    loss: LossConfig = field(default_factory=LossConfig)
+    """What is minimised."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot be trained with."""

@@ -20,6 +20,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import heads
+import losses
 import packed
 import plain
 import scatter
@@ -31,7 +32,14 @@ COPIED = ("kernels", "warpnerf", "tests")
 TIME_LIMIT = 300.0
 """Seconds for the tests of one mutant; one that runs longer never ends, and is noticed as well."""
 
-MUTANTS = (*plain.MUTANTS, *packed.MUTANTS, *scatter.MUTANTS, *schedule.MUTANTS, *heads.MUTANTS)
+MUTANTS = (
+    *plain.MUTANTS,
+    *packed.MUTANTS,
+    *scatter.MUTANTS,
+    *schedule.MUTANTS,
+    *heads.MUTANTS,
+    *losses.MUTANTS,
+)
 
 
 def copy_to(folder: Path) -> None:

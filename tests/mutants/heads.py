@@ -19,7 +19,6 @@ CAPACITY = "test_heads_packed.py::test_capacity_changes_nothing[deferred-1-32-2-
 CAPACITY_F = "test_heads_packed.py::test_capacity_changes_nothing[features-4-32-2-12-True]"
 OWN = "test_heads_packed.py::test_each_worker_has_a_gradient_of_its_own[deferred-1-32-2-4]"
 NAN = "test_heads_packed.py::test_what_is_not_a_number_shows"
-LOSS = "test_seams.py::test_gradient_on_the_cpu[two losses]"
 VIEW = "test_heads_parts.py::test_harmonics_and_encoded_directions[float64-1e-14]"
 LINEAR = "test_heads_parts.py::test_harmonics_before_the_sigmoid_are_linear"
 _SCALING = "test_heads_scaling.py"
@@ -57,18 +56,6 @@ MUTANTS = [
            "out[6 + 6 * k + axis] = signed_cosine[m]", "out[6 + 6 * k + axis] = signed_sine[m]", PF),
     Mutant("vectors: pi less exact", "heads/view.py",
            "        r = fma(n, all(-4.83751297e-4f), r);\n", "", PF),
-    # ray losses in packs
-    Mutant("loss: of lanes that are no samples", "volume/walk_packs.py",
-           "            if packs[slot].visited[lane] != 0:\n                weight = packs[slot].weight[lane]\n                state",
-           "            if packs[slot].visited[lane] == 0:\n                weight = packs[slot].weight[lane]\n                state", LOSS),
-    Mutant("loss: sums do not grow", "volume/walk_packs.py",
-           "                state = add_loss(state, weight, t, dt)\n", "", LOSS),
-    Mutant("loss: its factor", "volume/walk_packs.py",
-           "adj[lane] = adj_loss_value * adj_loss(", "adj[lane] = adj_loss(", LOSS),
-    Mutant("loss: not behind", "volume/walk_packs.py",
-           "            behind += adj_loss_value * weighted(rows[row].loss)\n", "", LOSS),
-    Mutant("loss: no slope", "volume/pack.py",
-           "adj_weight += load(pack.adj_weight);", "", LOSS),
     # sh.py
     Mutant("sign of x", "heads/sh.py", "out[3] = -real(Y1) * x", "out[3] = real(Y1) * x", VIEW),
     Mutant("y and x swapped", "heads/sh.py",
@@ -110,7 +97,7 @@ MUTANTS = [
            "", PSH),
     # rgb.py, as deferred uses it
     Mutant("packs, adjoint: channels not scaled", "heads/rgb.py",
-           "scale * (weight * rows", "(weight * rows", PD),
+           "scale * (weight * ADJ", "(weight * ADJ", PD),
     Mutant("packs, adjoint: padding of channels", "heads/rgb.py",
            "for (int f = 1 + CHANNELS; f < FLOATS; ++f) store(pack.adj_raw.data[f], all(0.0f));",
            "", PD16),
@@ -189,7 +176,7 @@ MUTANTS = [
     Mutant("view's gradient of the last sample", "volume/walk.py",
            "adj_view += adj_sample_view", "adj_view = adj_sample_view", F),
     Mutant("sample's gradient not scaled", "volume/walk.py",
-           "scale * (weight * adj_channels)", "(weight * adj_channels)", F),
+           "scale * (weight * adj_own)", "(weight * adj_own)", F),
     # features.py
     Mutant("residual: green for blue", "heads/features.py",
            "vec3(raw[1], raw[2], raw[3])", "vec3(raw[1], raw[2], raw[2])", F),

@@ -19,7 +19,7 @@ MUTANTS = [
     Mutant("adj_composite: density's slope dropped", "volume/pack.py",
            "load(pack.sigma_slope) * adj_sigma", "adj_sigma", ANY),
     Mutant("adj_decode: blue's for green's", "heads/rgb.py",
-           "adj_channels.c[c])", "adj_channels.c[c == 1 ? 2 : c])", ANY),
+           "adj_channels.c[c]\"", "adj_channels.c[c == 1 ? 2 : c]\"", ANY),
     Mutant("add_own: what is no sample adds", "fields/dense.py",
            "            if (!(visited >> n & 1)) continue;\n", "", ANY),
     Mutant("add_own: what is no sample adds to the lower plane", "fields/dense.py",

@@ -33,6 +33,13 @@ from .heads import (
     spherical_harmonics,
     view_encoding,
 )
+from .losses import (
+    distortion_loss,
+    entropy_loss,
+    huber_loss,
+    near_clip_loss,
+    sample_colour_loss,
+)
 from .numeric import central_difference, relative_error
 from .render import (
     GradientScaler,
@@ -65,12 +72,16 @@ __all__ = [
     "contract",
     "distance_scale",
     "distort",
+    "distortion_loss",
+    "entropy_loss",
     "fisheye_rays",
     "grid_coordinates",
+    "huber_loss",
     "integrate",
     "jacobian_determinant",
     "jacobian_determinant_autograd",
     "mlp",
+    "near_clip_loss",
     "normalized_coordinates",
     "occupied",
     "photometric_loss",
@@ -78,6 +89,7 @@ __all__ = [
     "random_network",
     "relative_error",
     "render",
+    "sample_colour_loss",
     "sample_distances",
     "softplus",
     "spherical_harmonics",

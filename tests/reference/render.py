@@ -36,6 +36,12 @@ class Rendering(NamedTuple):
     """Distance of each candidate [n_rays, n_steps], scene units."""
     kept: Tensor
     """Whether a candidate was integrated [n_rays, n_steps], bool."""
+    colors: Tensor
+    """What each sample has of what is composited [n_rays, n_steps, C]."""
+    dt: Tensor
+    """Length of each candidate's step [n_steps] or [n_rays, n_steps], scene units."""
+    raw_density: Tensor | None = None
+    """Of each candidate, before activation [n_rays, n_steps]; from `render` only."""
 
     @property
     def n_samples(self) -> Tensor:
@@ -252,6 +258,8 @@ def integrate(
         weights=weights,
         t=t,
         kept=kept,
+        colors=colors,
+        dt=dt,
     )
 
 
@@ -349,7 +357,9 @@ def render(
     det = jacobian_determinant(normalized_coordinates(points, corner_min, corner_max), norm, border)
     scale = distance_scale(t, content_distance, scaling, det, jacobian)
     scale = torch.where(valid, scale, torch.zeros_like(scale))  # dropped samples have no gradient
+    raw_density, _ = GradientScaler.apply(values[..., 0], colors, scale)
     sigma, colors = GradientScaler.apply(sigma, colors, scale)
 
     over = like_raw(background)
-    return integrate(sigma, colors, t, dt, over, valid, transmittance_min, head, directions)
+    out = integrate(sigma, colors, t, dt, over, valid, transmittance_min, head, directions)
+    return out._replace(raw_density=raw_density)

@@ -11,8 +11,11 @@ from warpnerf.model.interface import Load, Model
 
 @cache
 def around_two(load: Load, factor: float) -> Any:
-    """factor sum_i w_i (t_i - 2)^2: matter is drawn to a distance of 2."""
-    real = load("base.types").real
+    """factor sum_i w_i (t_i - 2)^2: matter is drawn to a distance of 2.
+
+    The factor is known when kernels are compiled.
+    """
+    real, Nothing = load("base.types").real, load("base.types").Nothing
 
     @wp.struct
     class Total:
@@ -23,71 +26,84 @@ def around_two(load: Load, factor: float) -> Any:
         return real(factor) * (t - real(2.0)) * (t - real(2.0))
 
     @wp.func
-    def add(state: Total, weight: real, t: real, dt: real) -> Total:
+    def add(
+        params: Nothing, state: Total, weight: real, t: real, dt: real, raw_density: real
+    ) -> Total:
         out = Total()
         out.sum = state.sum + weight * cost(t)
         return out
 
     @wp.func
-    def value(total: Total) -> real:
+    def value(params: Nothing, total: Total, transmittance: real) -> real:
         return total.sum
 
     @wp.func
-    def adj_weight(total: Total, before: Total, weight: real, t: real, dt: real) -> real:
+    def weighted(params: Nothing, total: Total) -> real:
+        return total.sum
+
+    @wp.func
+    def adj_weight(
+        params: Nothing, total: Total, before: Total, weight: real, t: real, dt: real
+    ) -> real:
         return cost(t)
 
     @wp.func
-    def bound(total: Total, t_end: real) -> real:
+    def bound(params: Nothing, total: Total, t_end: real) -> real:
         return wp.max(cost(real(0.0)), cost(t_end))
 
-    return load("base.parts").RayLoss(Total, add, value, value, adj_weight, bound)
+    return load("base.parts").RayLoss(Nothing, Total, add, value, weighted, adj_weight, bound)
 
 
 @cache
-def distortion(load: Load, factor: float) -> Any:
-    """factor sum_ij w_i w_j |t_i - t_j| + factor / 3 sum_i w_i^2 dt_i: weights come together.
+def spread(load: Load) -> Any:
+    """factor sum_ij w_i w_j (t_i - t_j)^2: weights come together.
 
-    Source: Barron et al. 2022 (mip-NeRF 360), eq. 15, with sums over the samples before as in Sun
-    et al. 2022: L = sum_i w_i^2 dt_i / 3 + 2 w_i (t_i W_i - M_i).
+    By sums of weight, weight times t and weight times t^2, a loss of degree two in the weights. The
+    factor is known when kernels run.
     """
     real = load("base.types").real
 
     @wp.struct
+    class Factor:
+        factor: real
+
+    @wp.struct
     class Sums:
-        loss: real
-        weight: real  # W
-        moment: real  # M, of weight times t
+        weight: real
+        moment: real  # of weight times t
+        square: real  # of weight times t^2
 
     @wp.func
-    def add(state: Sums, weight: real, t: real, dt: real) -> Sums:
+    def add(
+        params: Factor, state: Sums, weight: real, t: real, dt: real, raw_density: real
+    ) -> Sums:
         out = Sums()
-        spread = weight * weight * dt / real(3.0)
-        apart = real(2.0) * weight * (t * state.weight - state.moment)
-        out.loss = state.loss + real(factor) * (spread + apart)
         out.weight = state.weight + weight
         out.moment = state.moment + weight * t
+        out.square = state.square + weight * t * t
         return out
 
     @wp.func
-    def value(total: Sums) -> real:
-        return total.loss
+    def value(params: Factor, total: Sums, transmittance: real) -> real:
+        both = total.weight * total.square - total.moment * total.moment
+        return real(2.0) * params.factor * both
 
     @wp.func
-    def weighted(total: Sums) -> real:
-        return real(2.0) * total.loss  # of degree two in the weights
+    def weighted(params: Factor, total: Sums) -> real:
+        return real(2.0) * value(params, total, real(0.0))
 
     @wp.func
-    def adj_weight(total: Sums, before: Sums, weight: real, t: real, dt: real) -> real:
-        nearer = real(2.0) * before.weight + weight - total.weight
-        moments = real(2.0) * before.moment + weight * t - total.moment
-        apart = real(2.0) * (t * nearer - moments)
-        return real(factor) * (apart + real(2.0) / real(3.0) * weight * dt)
+    def adj_weight(
+        params: Factor, total: Sums, before: Sums, weight: real, t: real, dt: real
+    ) -> real:
+        both = total.square - real(2.0) * t * total.moment + t * t * total.weight
+        return real(2.0) * params.factor * both
 
     @wp.func
-    def bound(total: Sums, t_end: real) -> real:
-        return real(3.0) * real(factor) * t_end
+    def bound(params: Factor, total: Sums, t_end: real) -> real:
+        return real(2.0) * params.factor * t_end * t_end
 
-    return load("base.parts").RayLoss(Sums, add, value, weighted, adj_weight, bound)
+    return load("base.parts").RayLoss(Factor, Sums, add, value, weighted, adj_weight, bound)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,10 +125,18 @@ class WithLosses(Model):
         if self.near_two:
             losses.append(around_two(load, self.near_two))
         if self.together:
-            losses.append(distortion(load, self.together))
+            losses.append(spread(load))
         loss = losses[0] if len(losses) == 1 else load("volume.ray_loss").sum_of(*losses)
         return load("launch.assembly").Parts(
             encoding=load("fields.dense").dense(self.n_floats),
             head=load("heads.rgb").rgb(),
-            loss=loss,
+            losses=load("volume.loss").PLAIN._replace(on_ray=loss),
         )
+
+    def loss_params(self, load: Load) -> Any:
+        params = super().loss_params(load)
+        if self.near_two and self.together:
+            params.b.factor = self.together
+        elif self.together:
+            params.factor = self.together
+        return params

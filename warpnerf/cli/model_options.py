@@ -29,26 +29,42 @@ def chosen_model(begin: Model, name: str | None, options: Sequence[str]) -> Mode
     if name is not None:
         require_one_of("--model", name, tuple(MODELS))
     model = begin if name in (None, begin.name) else model_of(str(name))
-    known = {f.name: getattr(model, f.name) for f in fields(model)}  # type: ignore[arg-type]
+    what = f"no option of the model {model.name}; it has"
+    return replace(model, **values_of("--model-options", what, model, options))  # type: ignore[type-var]
+
+
+def values_of(flag: str, otherwise: str, begin: Any, options: Sequence[str]) -> dict[str, Any]:
+    """Fields of a configuration and the values that options give them.
+
+    Args:
+        flag: What lists the options.
+        otherwise: What an option is that names no field, and the words before those there are.
+        begin: The configuration, a dataclass of numbers, words and bools.
+        options: A field and its value each, such as "width=64".
+
+    Returns:
+        By field.
+
+    Raises:
+        InputError: There is no such field, it is given twice, or a value does not fit.
+    """
+    known = {f.name: getattr(begin, f.name) for f in fields(begin)}
     given: dict[str, Any] = {}
     for option in options:
         field, equals, text = option.partition("=")
         if not equals or field not in known:
             listed = ", ".join(f"{key}={value}" for key, value in known.items()) or "none"
-            raise InputError(
-                f"--model-options: {option!r} is no option of the model {model.name}; it has "
-                f"{listed}."
-            )
+            raise InputError(f"{flag}: {option!r} is {otherwise} {listed}.")
         if field in given:
-            raise InputError(f"--model-options: {field} is given twice; keep one of them.")
-        given[field] = _parsed(field, text, type(known[field]))
-    return replace(model, **given)  # type: ignore[type-var]
+            raise InputError(f"{flag}: {field} is given twice; keep one of them.")
+        given[field] = _parsed(flag, field, text, type(known[field]))
+    return given
 
 
-def _parsed(field: str, text: str, kind: type) -> Any:
+def _parsed(flag: str, field: str, text: str, kind: type) -> Any:
     words = {"true": True, "false": False}
     try:
         return words[text.lower()] if kind is bool else kind(text)
     except (ValueError, KeyError):
         wanted = {bool: "true or false", int: "a whole number", float: "a number"}[kind]
-        raise InputError(f"--model-options: {field} must be {wanted}, not {text!r}.") from None
+        raise InputError(f"{flag}: {field} must be {wanted}, not {text!r}.") from None

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from warpnerf.checks import InputError
+from warpnerf.cli.loss_options import chosen_losses
 from warpnerf.cli.machine import FAILED
 from warpnerf.cli.model_options import chosen_model
 from warpnerf.cli.pose import with_poses
@@ -40,6 +41,7 @@ def train_command(
     preset: Literal["fast", "quality"] | None = None,
     model: str | None = None,
     model_options: tuple[str, ...] = (),
+    loss: tuple[str, ...] = (),
     steps: int | None = None,
     time_limit: float | None = None,
     scaling: Scaling | None = None,
@@ -75,6 +77,11 @@ def train_command(
         steps: Batches of rays to train on; by default as many as the preset says, or as the time
             limit allows.
         time_limit: Seconds of training; the schedule is fitted to them.
+        loss: What is minimised besides, and how: photometric=huber huber_delta=0.1, and weights of
+            distortion=0.01, entropy=0.001, sample_colour=0.1 (not for deferred), near_clip=0.01
+            near_clip_distance=0.2.
+        steps: Batches of rays to train on.
+        time_limit: Seconds of training; the schedule is squeezed to fit.
         scaling: How a sample's gradient depends on its distance from the camera.
         content_distance: Where gradients reach full strength, in the scene's units; per-camera: of
             each camera what it sees, where the scene brings points.
@@ -110,6 +117,7 @@ def train_command(
     def changed(config: TrainConfig) -> TrainConfig:
         config = dataclasses.replace(config, **given)
         config = dataclasses.replace(config, model=chosen_model(config.model, model, model_options))
+        config = dataclasses.replace(config, loss=chosen_losses(config.loss, loss))
         if voxels is not None:
             grid = dataclasses.replace(config.grid, voxels=voxels)
             config = dataclasses.replace(config, grid=grid)
@@ -134,6 +142,10 @@ def train_command(
     config = changed(PRESETS[preset or "fast"])
     if time_limit is not None and steps is None:
         config = dataclasses.replace(config, steps=STEPS_OF_TIMED)
+    if config.loss.kinds:  # before photographs are posed or read; loads Warp
+        from warpnerf.rendering.losses import parts_with
+
+        parts_with(config.model, "float32", config.loss)
     factor = 1 if downscale is None else downscale
     return _begin(scene, output, factor, masks, images, config, overwrite, page)
 

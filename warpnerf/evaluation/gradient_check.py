@@ -240,7 +240,7 @@ class ProblemKernels:
             loss,
             n_samples,
         )
-        return error.numpy() + loss.numpy(), _found(gradient, problem)
+        return loss.numpy(), _found(gradient, problem)
 
     def gather(self, values: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Values [X, Y, Z, n] at points [m, 3] in folded coordinates: [m, n]."""

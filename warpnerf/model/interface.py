@@ -110,6 +110,17 @@ class Model(ABC):
         """
         return steps.struct(load("sampling.steps"))
 
+    def loss_params(self, load: Load) -> Any:
+        """The numbers of the loss on the ray that the model itself has, if it has one.
+
+        Args:
+            load: The kernels' modules.
+
+        Returns:
+            The struct ``Params`` of that loss.
+        """
+        return self.parts(load).losses.on_ray.Params()
+
     def most_steps(self, steps: Any, length: float) -> int:
         """How many steps a ray can take, at most: workers make room for as many.
 

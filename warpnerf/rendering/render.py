@@ -13,10 +13,11 @@ from warpnerf_kernels.launch import assembly
 from warpnerf_kernels.sampling import steps as sampling
 from warpnerf_kernels.volume import gradscale
 
-from warpnerf.config import Contraction, Jacobian, Scaling
+from warpnerf.config import Contraction, Jacobian, LossConfig, Scaling
 from warpnerf.model.grid import CONTRACTIONS, FreeCells, VoxelGrid
-from warpnerf.model.interface import Model, loader, parts_of
+from warpnerf.model.interface import Model, loader
 from warpnerf.rendering.adjoint import AdjointLaunch, Gradients
+from warpnerf.rendering.losses import PLAIN, Minimised, loss_struct, parts_with
 from warpnerf.rendering.rays import RayBatch, rays_struct
 from warpnerf.runtime.parallel import Workers
 
@@ -103,6 +104,7 @@ def variant_of(
     scaling: Scaling,
     jacobian: Jacobian,
     packed: bool,
+    losses: LossConfig = PLAIN.config,
 ) -> Any:
     """What to compile for a model.
 
@@ -113,11 +115,12 @@ def variant_of(
         scaling: Of gradients.
         jacobian: Its term.
         packed: Sixteen samples at a time, where all parts of the model have such a form.
+        losses: What a training launch minimises; it is compiled for those of a weight above 0.
 
     Returns:
         ``warpnerf_kernels.launch.assembly.Variant`` in that precision.
     """
-    parts = parts_of(model, precision)
+    parts = parts_with(model, precision, losses)
     return loader(precision)("launch.assembly").Variant(
         parts,
         CONTRACTIONS[contraction],
@@ -138,6 +141,7 @@ def scene_struct(
     density: Any,
     weights: wp.array,
     workers: Workers,
+    minimised: Minimised = PLAIN,
 ) -> Any:
     """What rays are marched through, as kernels take it.
 
@@ -151,14 +155,17 @@ def scene_struct(
         density: A kernel's Density.
         weights: [n_weights] of the head.
         workers: Those that will be launched.
+        minimised: By a training launch.
 
     Returns:
         A kernel's Scene.
     """
     load = loader(precision)
-    scene = load("launch.assembly").scene_type(parts_of(model, precision))()
+    parts = parts_with(model, precision, minimised.config)
+    scene = load("launch.assembly").scene_type(parts)()
     scene.box, scene.free, scene.field, scene.density = box, free, grid, density
     scene.march = march_struct(model, precision, steps, workers)
+    scene.loss = loss_struct(model, precision, minimised)
     layout = model.layout(load)
     if layout is not None:
         head = load("heads.mlp").Weights()
@@ -296,8 +303,7 @@ class TrainingPass:
 
     That is one launch, or as many as AdjointLaunch takes.
 
-    Loss: sum over batches of the mean over a batch's rays of the squared error, summed over the
-    channels, and of the model's ray loss.
+    Loss: sum over batches of the mean over a batch's rays of what is minimised.
     """
 
     def __init__(
@@ -310,11 +316,18 @@ class TrainingPass:
         scaling: Scaling,
         jacobian: Jacobian,
         workers: Workers,
+        minimised: Minimised = PLAIN,
     ) -> None:
         """Allocate what up to n_rays at a time through a grid need, by such steps."""
         device = workers.device
         variant = variant_of(
-            model, "float32", grid.contraction, scaling, jacobian, packed=not device.is_cuda
+            model,
+            "float32",
+            grid.contraction,
+            scaling,
+            jacobian,
+            packed=not device.is_cuda,
+            losses=minimised.config,
         )
         self.launch = AdjointLaunch(
             assembly.render_train_kernel(variant),
@@ -336,13 +349,14 @@ class TrainingPass:
             density=grid.density,
             weights=weights,
             workers=workers,
+            minimised=minimised,
         )
         self.n_rays = n_rays
         """Rays of the last run; before the first, those that there is room for."""
         self.error = wp.zeros(n_rays, dtype=real, device=device)
         """Squared error of each of these, then room."""
         self.loss = wp.zeros(n_rays, dtype=real, device=device)
-        """The model's loss on each of these, 0 where it has none."""
+        """What is minimised of each of these, then room."""
         self.n_samples = wp.zeros(n_rays, dtype=wp.int32, device=device)
         """Visited steps of each of these, then room."""
         self.gradients = Gradients.zeros(model, math.prod(grid.size), workers)

@@ -17,6 +17,7 @@ from warpnerf.model.grid import FreeCells, VoxelGrid, grid_size, require_memory
 from warpnerf.model.interface import Model, parts_of
 from warpnerf.model.parameters import Parameter, first_weights, parameters_of
 from warpnerf.rendering.field import Field
+from warpnerf.rendering.losses import Minimised
 from warpnerf.rendering.rays import PixelSampler
 from warpnerf.rendering.render import Steps, TrainingPass, march_struct
 from warpnerf.runtime.memory import give_back
@@ -219,7 +220,7 @@ class Trainer:
             return self._progress
         n_rays = self._pass.n_rays
         error = float(self._pass.error.numpy()[:n_rays].mean())
-        loss = error + float(self._pass.loss.numpy()[:n_rays].mean())
+        loss = float(self._pass.loss.numpy()[:n_rays].mean())
         if not math.isfinite(loss):
             raise self._not_finite("the loss is")
         self._progress = Progress(
@@ -365,6 +366,7 @@ class Trainer:
             self.config.scaling,
             self.config.jacobian,
             self.workers,
+            Minimised(config=self.config.loss, content_distance=self.content_distance),
         )
 
     def _kernels(self) -> list[wp.Kernel]:
@@ -374,6 +376,7 @@ class Trainer:
             self.config.scaling,
             self.config.jacobian,
             self.workers.device,
+            self.config.loss,
         )
 
     def _grow(self, fraction: float) -> None:

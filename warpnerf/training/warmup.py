@@ -14,8 +14,9 @@ from warpnerf_kernels.optim import adam, total_variation
 from warpnerf_kernels.sampling import occupancy
 from warpnerf_kernels.space import camera
 
-from warpnerf.config import PRESETS, Contraction, Jacobian, Scaling
+from warpnerf.config import PRESETS, Contraction, Jacobian, LossConfig, Scaling
 from warpnerf.model.interface import Model
+from warpnerf.rendering.losses import PLAIN
 from warpnerf.rendering.render import variant_of
 from warpnerf.runtime import kernel_cache
 from warpnerf.runtime.parallel import Workers
@@ -34,14 +35,19 @@ class Warmed:
 
 
 def training_kernels(
-    model: Model, contraction: Contraction, scaling: Scaling, jacobian: Jacobian, device: wp.Device
+    model: Model,
+    contraction: Contraction,
+    scaling: Scaling,
+    jacobian: Jacobian,
+    device: wp.Device,
+    losses: LossConfig,
 ) -> list[wp.Kernel]:
     """The kernels of a training from its first step to its last; at least one for each module.
 
     Kernels that share a module with one of these are compiled along with it.
     """
     n_floats, packed = model.n_floats, not device.is_cuda
-    variant = variant_of(model, "float32", contraction, scaling, jacobian, packed)
+    variant = variant_of(model, "float32", contraction, scaling, jacobian, packed, losses)
     return [
         camera.sample_pixels,
         assembly.render_train_kernel(variant),
@@ -88,11 +94,12 @@ def warm_up(
     for contraction in _contractions():
         for kernel in rendering_kernels(model, contraction, workers.device):
             wanted.setdefault(kernel.module, (_words(kernel, contraction), kernel))
-        for jacobian in dict.fromkeys(preset.jacobian for preset in PRESETS.values()):
+        for jacobian, losses in dict.fromkeys((p.jacobian, p.loss) for p in PRESETS.values()):
             for scaling in get_args(Scaling):
-                kernels = training_kernels(model, contraction, scaling, jacobian, workers.device)
-                for kernel in kernels:
-                    words = _words(kernel, contraction, scaling)
+                for kernel in training_kernels(
+                    model, contraction, scaling, jacobian, workers.device, losses
+                ):
+                    words = _words(kernel, contraction, scaling, losses)
                     wanted.setdefault(kernel.module, (words, kernel))
     done = []
     for name, kernel in wanted.values():
@@ -114,10 +121,16 @@ def _contractions() -> list[Contraction]:
     return list(found)
 
 
-def _words(kernel: wp.Kernel, contraction: Contraction, scaling: Scaling | None = None) -> str:
+def _words(
+    kernel: wp.Kernel,
+    contraction: Contraction,
+    scaling: Scaling | None = None,
+    losses: LossConfig = PLAIN.config,
+) -> str:
     """A kernel's name, and what it is compiled for where it has a module to itself."""
     name = str(kernel.key).rpartition("__")[2].replace("_", " ")
     if not name.startswith("render"):
         return name
     space = "" if contraction == "none" else ", space folded in"
-    return name + space + (f", scaling {scaling}" if scaling else "")
+    kinds = "".join(f", {kind}" for kind in losses.kinds)
+    return name + space + (f", scaling {scaling}" if scaling else "") + kinds

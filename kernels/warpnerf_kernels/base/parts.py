@@ -118,6 +118,10 @@ class HeadVectors(NamedTuple):
     """Packs of a ray that are decoded together, at most."""
     batch: int = 1
     """Rays whose rows are shaded together."""
+    adj_decode_pack_with_colours: Any = None
+    """adj_decode_pack where the loss is on samples as well: what flows back to a sample's colour is
+    the row's adj_channels, and its sample_slope times the colour's difference from target_rgb. For
+    heads of samples."""
 
 
 class Head(NamedTuple):
@@ -157,22 +161,71 @@ class Head(NamedTuple):
         return self._replace(**{"vectors": None, **changes})
 
 
-class RayLoss(NamedTuple):
-    """A loss over a ray's samples: any function of their weights and of where they lie.
+class RayLossVectors(NamedTuple):
+    """The vector form of a loss on the ray: sixteen samples at a time. Steps that are no samples
+    have a weight of 0; what a loss adds for them is not looked at."""
 
-    Its derivative needs of the rest of the ray what ``State`` holds after all samples. Sums build
-    on each other, so the vector walk calls the same functions, one sample after the other.
+    add_pack: Any
+    """Of add: (params, state, packs, slot) -> state with a pack's samples."""
+    adj_add_pack: Any
+    """Of adj_weight and adj_density: (params, total, before, adj_value, packs, slot) adds, times
+    adj_value, to the pack's adj_weight, and if the loss has adj_density to its adj_density. Returns
+    the state with the pack's samples."""
+    pack_fields: tuple[tuple[str, Any], ...] = ()
+    """Fields of a pack that are its own: names and types."""
+
+
+class RayLoss(NamedTuple):
+    """A loss over a ray's samples: a function of their weights, of where they lie, of the light
+    that passes them all, and of raw densities.
+
+    Its derivative needs of the rest of the ray what ``State`` holds after all samples.
     """
 
+    Params: Any
+    """Struct of numbers that are known when kernels run: factors, units."""
     State: Any
-    """Struct of sums over the samples so far."""
+    """Struct of sums over the samples so far, zeros before the first."""
     add: Any
-    """(state, weight, t, dt) -> state with one more sample."""
+    """(params, state, weight, t, dt, raw_density) -> state with one more sample."""
     value: Any
-    """(state) -> the loss, from all samples."""
+    """(params, state, transmittance) -> the loss, from all samples and the light that passes."""
     weighted: Any
-    """(state) -> sum over all samples of weight times dL/dweight."""
+    """(params, state) -> sum over all samples of weight times dL/dweight."""
     adj_weight: Any
-    """(total, before, weight, t, dt) -> dL/dweight, from all samples and those before."""
+    """(params, total, before, weight, t, dt) -> dL/dweight, from all samples and those before."""
     bound: Any
-    """(total, t_end) -> no |dL/dweight| exceeds it."""
+    """(params, total, t_end) -> no |dL/dweight| exceeds it."""
+    adj_transmittance: Any = None
+    """(params, transmittance) -> dL/dtransmittance of what passes all samples; None: 0."""
+    adj_density: Any = None
+    """(params, t) -> dL/draw density of a sample, besides what its weight hands on; None: 0."""
+    vectors: RayLossVectors | None = None
+    """The vector form. Without one, packs call the scalar functions, one sample after the other."""
+
+    def but(self, **changes: Any) -> "RayLoss":
+        """The same with other functions; see above."""
+        return self._replace(**{"vectors": None, **changes})
+
+
+class Photometric(NamedTuple):
+    """What a rendered ray's colour is held against its pixel by."""
+
+    Params: Any
+    """Struct of numbers that are known when kernels run."""
+    value: Any
+    """(params, rgb, target_rgb) -> the loss."""
+    adj_value: Any
+    """(params, rgb, target_rgb, adj_value) -> what flows back to rgb."""
+
+
+class Losses(NamedTuple):
+    """What a training launch minimises: the mean over rays of the sum of these."""
+
+    photometric: Photometric
+    """Of the ray's colour."""
+    on_ray: RayLoss
+    """Of its samples' weights; several are one by ``volume.ray_loss.sum_of``."""
+    on_samples: bool = False
+    """Whether colours of single samples are held against the pixel as well: volume.sample_loss.
+    For heads of samples, whose channels are colours."""

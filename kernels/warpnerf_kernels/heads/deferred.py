@@ -167,6 +167,7 @@ def deferred(n_channels: int, n_frequencies: int, width: int, n_hidden: int) -> 
             prepare_row=prepare_row,
             shade_rows=shade_rows,
             adj_shade_rows=adj_shade_rows,
+            adj_decode_pack_with_colours=None,
             row_fields=(
                 ("inputs", padded),
                 ("adj_inputs", padded),

@@ -115,7 +115,7 @@ for (int p = slot; p < slot + n; ++p) {
     float by_lane[3][LANES];
     for (int c = 0; c < 3; ++c) {
         const vec channel = load(pack.channel.data[c]);  // 0 where there is no colour
-        const vec adj = channel * (1.0f - channel) * (share * own.adj_channels.c[c]);
+        const vec adj = channel * (1.0f - channel) * (share * ADJ_CHANNEL);
         put(by_lane[c], adj);
         if (RESIDUAL) store(pack.adj_raw.data[1 + c], adj);
     }
@@ -231,6 +231,8 @@ def features(
         f"constexpr float WEIGHT_MIN = {weight_min!r}f;"
     )
 
+    adj_decode_text, adj_text_with_colours = plain.with_colours(ADJ_DECODE_PACK)
+
     @wp.func_native(words + PREPARE_ROW)
     def prepare_row(weights: Weights, rows: wp.array(dtype=Any), row: int): ...
 
@@ -249,8 +251,20 @@ def features(
         n: int,
     ): ...
 
-    @wp.func_native(words + ADJ_DECODE_PACK)
+    @wp.func_native(words + adj_decode_text)
     def adj_decode_pack(
+        weights: Weights,
+        rows: wp.array(dtype=Any),
+        row: int,
+        packs: wp.array(dtype=Any),
+        slot: int,
+        n: int,
+        worker: int,
+        gradient: Any,
+    ): ...
+
+    @wp.func_native(words + adj_text_with_colours)
+    def adj_decode_pack_with_colours(
         weights: Weights,
         rows: wp.array(dtype=Any),
         row: int,
@@ -277,6 +291,7 @@ def features(
             adj_prepare_row=adj_prepare_row,
             decode_pack=decode_pack,
             adj_decode_pack=adj_decode_pack,
+            adj_decode_pack_with_colours=adj_decode_pack_with_colours,
             pack_fields=(("hidden", wp.types.matrix((LANES, layout.units), wp.float32)),),
             row_fields=(
                 ("view", units),

@@ -52,6 +52,38 @@ def decode_of(n_channels: int) -> tuple[wp.Function, wp.Function]:
     return decode, adj_decode
 
 
+TO_CHANNEL = "rows.data[row].adj_channels.c[c]"
+TO_COLOUR = (
+    f"({TO_CHANNEL} + rows.data[row].sample_slope * (channel - rows.data[row].target_rgb.c[c]))"
+)
+
+
+def with_colours(text: str) -> tuple[str, str]:
+    """An adjoint of decode_pack in C++, without and with a loss on colours of samples.
+
+    What the text calls ADJ_CHANNEL flows back to a sample's channel c, whose value is `channel`.
+    """
+    return text.replace("ADJ_CHANNEL", TO_CHANNEL), text.replace("ADJ_CHANNEL", TO_COLOUR)
+
+
+ADJ_DECODE, ADJ_DECODE_COLOURS = with_colours(
+    VECTORS
+    + r"""
+auto& pack = packs.data[slot];
+constexpr int CHANNELS = sizeof(pack.channel) / sizeof(vec);
+constexpr int FLOATS = sizeof(pack.raw) / sizeof(vec);
+const vec weight = load(pack.weight), scale = load(pack.scale);
+#pragma clang loop unroll(full)
+for (int c = 0; c < CHANNELS; ++c) {
+    const vec channel = load(pack.channel.data[c]);
+    const vec adj_channel = scale * (weight * ADJ_CHANNEL);
+    store(pack.adj_raw.data[1 + c], channel * (1.0f - channel) * adj_channel);
+}
+for (int f = 1 + CHANNELS; f < FLOATS; ++f) store(pack.adj_raw.data[f], all(0.0f));
+"""
+)
+
+
 @wp.func_native(
     VECTORS
     + r"""
@@ -70,22 +102,7 @@ def decode_pack(
     ...
 
 
-@wp.func_native(
-    VECTORS
-    + r"""
-auto& pack = packs.data[slot];
-constexpr int CHANNELS = sizeof(pack.channel) / sizeof(vec);
-constexpr int FLOATS = sizeof(pack.raw) / sizeof(vec);
-const vec weight = load(pack.weight), scale = load(pack.scale);
-#pragma clang loop unroll(full)
-for (int c = 0; c < CHANNELS; ++c) {
-    const vec channel = load(pack.channel.data[c]);
-    const vec adj_channel = scale * (weight * rows.data[row].adj_channels.c[c]);
-    store(pack.adj_raw.data[1 + c], channel * (1.0f - channel) * adj_channel);
-}
-for (int f = 1 + CHANNELS; f < FLOATS; ++f) store(pack.adj_raw.data[f], all(0.0f));
-"""
-)
+@wp.func_native(ADJ_DECODE)
 def adj_decode_pack(
     params: Any,
     rows: wp.array(dtype=Any),
@@ -97,6 +114,21 @@ def adj_decode_pack(
     gradient: Any,
 ):
     """adj_decode for the samples of a pack."""
+    ...
+
+
+@wp.func_native(ADJ_DECODE_COLOURS)
+def adj_decode_pack_with_colours(
+    params: Any,
+    rows: wp.array(dtype=Any),
+    row: int,
+    packs: wp.array(dtype=Any),
+    slot: int,
+    n: int,  # 1
+    worker: int,
+    gradient: Any,
+):
+    """adj_decode for the samples of a pack, with a loss on their colours."""
     ...
 
 
@@ -168,5 +200,6 @@ def rgb() -> Head:
             adj_decode_pack=adj_decode_pack,
             shade_rows=shade_rows,
             adj_shade_rows=adj_shade_rows,
+            adj_decode_pack_with_colours=adj_decode_pack_with_colours,
         ),
     )

@@ -89,6 +89,24 @@ def adj_decode(params: Any, view: Any, raw: Any, channels: vec3, adj_channels: v
     return adj_raw, view - view
 
 
+ADJ_DECODE, ADJ_DECODE_COLOURS = plain.with_colours(
+    VECTORS
+    + r"""
+auto& pack = packs.data[slot];
+const auto& view = rows.data[row].view;
+constexpr int BASIS = sizeof(view) / sizeof(float);
+constexpr int FLOATS = sizeof(pack.raw) / sizeof(vec);
+const vec share = load(pack.scale) * load(pack.weight);
+for (int c = 0; c < 3; ++c) {
+    const vec channel = load(pack.channel.data[c]);
+    const vec adj = channel * (1.0f - channel) * (share * ADJ_CHANNEL);
+    for (int k = 0; k < BASIS; ++k) store(pack.adj_raw.data[1 + 3 * k + c], view.c[k] * adj);
+}
+for (int f = 1 + 3 * BASIS; f < FLOATS; ++f) store(pack.adj_raw.data[f], all(0.0f));
+"""
+)
+
+
 @wp.func_native(
     VECTORS
     + r"""
@@ -111,22 +129,7 @@ def decode_pack(
     ...
 
 
-@wp.func_native(
-    VECTORS
-    + r"""
-auto& pack = packs.data[slot];
-const auto& view = rows.data[row].view;
-constexpr int BASIS = sizeof(view) / sizeof(float);
-constexpr int FLOATS = sizeof(pack.raw) / sizeof(vec);
-const vec share = load(pack.scale) * load(pack.weight);
-for (int c = 0; c < 3; ++c) {
-    const vec channel = load(pack.channel.data[c]);
-    const vec adj = channel * (1.0f - channel) * (share * rows.data[row].adj_channels.c[c]);
-    for (int k = 0; k < BASIS; ++k) store(pack.adj_raw.data[1 + 3 * k + c], view.c[k] * adj);
-}
-for (int f = 1 + 3 * BASIS; f < FLOATS; ++f) store(pack.adj_raw.data[f], all(0.0f));
-"""
-)
+@wp.func_native(ADJ_DECODE)
 def adj_decode_pack(
     params: Any,
     rows: wp.array(dtype=Any),
@@ -138,6 +141,21 @@ def adj_decode_pack(
     gradient: Any,
 ):
     """adj_decode for the samples of a pack."""
+    ...
+
+
+@wp.func_native(ADJ_DECODE_COLOURS)
+def adj_decode_pack_with_colours(
+    params: Any,
+    rows: wp.array(dtype=Any),
+    row: int,
+    packs: wp.array(dtype=Any),
+    slot: int,
+    n: int,  # 1
+    worker: int,
+    gradient: Any,
+):
+    """adj_decode for the samples of a pack, with a loss on their colours."""
     ...
 
 
@@ -161,6 +179,7 @@ def sh(degree: int) -> Head:
             prepare_row=prepare_row,
             decode_pack=decode_pack,
             adj_decode_pack=adj_decode_pack,
+            adj_decode_pack_with_colours=adj_decode_pack_with_colours,
             row_fields=(("view", View),),
         ),
     )

@@ -11,8 +11,9 @@ import warp as wp
 from ..base.types import real, vec3
 from ..cpu.scatter import delivery, leave_none
 from ..cpu.schedule import ray_schedule
-from ..volume.loss import adj_squared_error, squared_error
+from ..volume.loss import squared_error
 from ..volume.ray_loss import NONE
+from ..volume.sample_loss import sample_loss
 from ..volume.scene import Rays, ray_value
 from ..volume.walk_packs import walk_packs
 from .variant import Variant, ray_of_parts, scene_type, scratch_type, seen_type, sink_type
@@ -55,7 +56,7 @@ def forward(variant: Variant) -> wp.Kernel:
         scratch_type(variant),
     )
     ray_of = ray_of_parts(parts)
-    integrate = walk_packs(parts.sampler, parts.encoding, parts.head, parts.loss).integrate
+    integrate = walk_packs(parts.sampler, parts.encoding, parts.head, parts.losses).integrate
     shade_rows, n_packs = parts.head.vectors.shade_rows, parts.head.vectors.n_packs
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -112,8 +113,11 @@ def backward(variant: Variant) -> wp.Kernel:
     Sink = sink_type(variant)
     ray_of = ray_of_parts(parts)
     take_rays, deliver = ray_taker(variant), delivery(parts.encoding)
-    adj_integrate = walk_packs(parts.sampler, parts.encoding, parts.head, parts.loss).adj_integrate
-    has_loss, State = parts.loss is not NONE, parts.loss.State
+    adj_integrate = walk_packs(
+        parts.sampler, parts.encoding, parts.head, parts.losses
+    ).adj_integrate
+    on_ray, on_samples = parts.losses.on_ray, parts.losses.on_samples
+    has_loss, State = on_ray is not NONE, on_ray.State
     prepare_row = parts.head.vectors.prepare_row
     n_packs = parts.head.vectors.n_packs
     shade_rows, adj_shade_rows = parts.head.vectors.shade_rows, parts.head.vectors.adj_shade_rows
@@ -149,6 +153,8 @@ def backward(variant: Variant) -> wp.Kernel:
                 scratch.rows[row + r].adj_rgb = adj_rgb[i]
                 if wp.static(has_loss):  # whose part in the gradient is none here
                     scratch.rows[row + r].loss = State()
+                if wp.static(on_samples):  # likewise
+                    scratch.rows[row + r].target_rgb = vec3()
             shade_rows(scene.head, scratch.rows, row, n)
             adj_shade_rows(scene.head, scratch.rows, row, n, worker, out_gradient.gradient)
             for r in range(n):
@@ -186,9 +192,11 @@ def train(variant: Variant) -> wp.Kernel:
     Sink = sink_type(variant)
     ray_of = ray_of_parts(parts)
     take_rays, deliver = ray_taker(variant), delivery(parts.encoding)
-    walked = walk_packs(parts.sampler, parts.encoding, parts.head, parts.loss)
+    walked = walk_packs(parts.sampler, parts.encoding, parts.head, parts.losses)
     integrate, adj_integrate = walked.integrate, walked.adj_integrate
-    has_loss, loss_value = parts.loss is not NONE, parts.loss.value
+    photometric, on_ray, on_samples = parts.losses
+    photometric_value, adj_photometric = photometric.value, photometric.adj_value
+    has_loss, ray_loss = on_ray is not NONE, on_ray.value
     shade_rows, adj_shade_rows = parts.head.vectors.shade_rows, parts.head.vectors.adj_shade_rows
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -201,7 +209,7 @@ def train(variant: Variant) -> wp.Kernel:
         loss_weight: real,  # of one ray
         scratch: Scratch,
         out_error: wp.array(dtype=real),  # [n_rays] squared error
-        out_loss: wp.array(dtype=real),  # [n_rays] of the samples; not written where there is none
+        out_loss: wp.array(dtype=real),  # [n_rays]
         out_n_samples: wp.array(dtype=wp.int32),  # [n_rays]
         out_gradient: Sink,  # added to
     ):
@@ -231,10 +239,26 @@ def train(variant: Variant) -> wp.Kernel:
                     rays.background, i
                 )
                 out_error[i] = squared_error(rgb, target_rgb[i])
+                loss = photometric_value(scene.loss.photometric, rgb, target_rgb[i])
                 if wp.static(has_loss):
-                    out_loss[i] = loss_value(scratch.rows[row + r].loss)
+                    loss += ray_loss(
+                        scene.loss.on_ray,
+                        scratch.rows[row + r].loss,
+                        scratch.rows[row + r].transmittance,
+                    )
+                if wp.static(on_samples):
+                    scratch.rows[row + r].target_rgb = target_rgb[i]
+                    loss += sample_loss(
+                        scene.loss.on_samples,
+                        scratch.rows[row + r].of_samples,
+                        scratch.rows[row + r].channels,
+                        target_rgb[i],
+                    )
+                out_loss[i] = loss
                 out_n_samples[i] = scratch.rows[row + r].n_samples
-                scratch.rows[row + r].adj_rgb = adj_squared_error(rgb, target_rgb[i], loss_weight)
+                scratch.rows[row + r].adj_rgb = adj_photometric(
+                    scene.loss.photometric, rgb, target_rgb[i], loss_weight
+                )
             adj_shade_rows(scene.head, scratch.rows, row, n, worker, out_gradient.gradient)
             for r in range(n):
                 i = chunk.rays[worker, begin + r]

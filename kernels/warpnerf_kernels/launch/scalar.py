@@ -8,8 +8,8 @@ from functools import cache
 import warp as wp
 
 from ..base.types import gradient_type, real, vec3
-from ..volume.loss import adj_squared_error, squared_error
-from ..volume.ray_loss import NONE
+from ..volume.loss import squared_error
+from ..volume.sample_loss import sample_loss
 from ..volume.scene import Rays, ray_value
 from ..volume.walk import walk
 from .variant import Nowhere, Variant, ray_of_parts, scene_type, seen_type
@@ -21,7 +21,7 @@ def forward(variant: Variant) -> wp.Kernel:
     parts, contraction = variant.parts, variant.contraction
     Scene, Seen = scene_type(parts), seen_type(parts.head.n_channels)
     ray_of = ray_of_parts(parts)
-    integrate = walk(parts.sampler, parts.encoding, parts.head, parts.loss).integrate
+    integrate = walk(parts.sampler, parts.encoding, parts.head, parts.losses).integrate
     shade = parts.head.shade
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -59,7 +59,7 @@ def backward(variant: Variant) -> wp.Kernel:
     Scene, Seen = scene_type(parts), seen_type(parts.head.n_channels)
     Gradient = gradient_type(parts.encoding.n_floats)
     ray_of = ray_of_parts(parts)
-    walked = walk(parts.sampler, parts.encoding, parts.head, parts.loss)
+    walked = walk(parts.sampler, parts.encoding, parts.head, parts.losses)
     adj_integrate, Integral = walked.adj_integrate, walked.Integral
     adj_shade = parts.head.adj_shade
 
@@ -100,6 +100,7 @@ def backward(variant: Variant) -> wp.Kernel:
             adj_transmittance - adj_shaded_opacity,
             adj_depth[i],
             real(0.0),
+            vec3(),
             ray_value(rays.content_distance, i),
             contraction,
             scaling,
@@ -118,10 +119,12 @@ def train(variant: Variant) -> wp.Kernel:
     Scene = scene_type(parts)
     Gradient = gradient_type(parts.encoding.n_floats)
     ray_of = ray_of_parts(parts)
-    walked = walk(parts.sampler, parts.encoding, parts.head, parts.loss)
+    walked = walk(parts.sampler, parts.encoding, parts.head, parts.losses)
     integrate, adj_integrate = walked.integrate, walked.adj_integrate
     shade, adj_shade = parts.head.shade, parts.head.adj_shade
-    has_loss, loss_value = parts.loss is not NONE, parts.loss.value
+    photometric, on_ray, on_samples = parts.losses
+    photometric_value, adj_photometric = photometric.value, photometric.adj_value
+    ray_loss = on_ray.value
 
     @wp.kernel(module="unique", enable_backward=False)
     def render_train(
@@ -133,7 +136,7 @@ def train(variant: Variant) -> wp.Kernel:
         loss_weight: real,  # of one ray
         scratch: Nowhere,
         out_error: wp.array(dtype=real),  # [n_rays] squared error
-        out_loss: wp.array(dtype=real),  # [n_rays] of the samples; not written where there is none
+        out_loss: wp.array(dtype=real),  # [n_rays]
         out_n_samples: wp.array(dtype=wp.int32),  # [n_rays]
         out_gradient: Gradient,  # added to
     ):
@@ -149,10 +152,14 @@ def train(variant: Variant) -> wp.Kernel:
         rgb = shade(scene.head, ray.direction, total.channels, opacity)
         rgb += total.transmittance * behind_all
         out_error[i] = squared_error(rgb, target_rgb[i])
-        if wp.static(has_loss):
-            out_loss[i] = loss_value(total.loss)
+        loss = photometric_value(scene.loss.photometric, rgb, target_rgb[i])
+        loss += ray_loss(scene.loss.on_ray, total.loss, total.transmittance)
+        if wp.static(on_samples):
+            factor = scene.loss.on_samples
+            loss += sample_loss(factor, total.of_samples, total.channels, target_rgb[i])
+        out_loss[i] = loss
         out_n_samples[i] = total.n_samples
-        adj_rgb = adj_squared_error(rgb, target_rgb[i], loss_weight)
+        adj_rgb = adj_photometric(scene.loss.photometric, rgb, target_rgb[i], loss_weight)
         adj_channels, adj_opacity = adj_shade(
             scene.head, ray.direction, total.channels, opacity, adj_rgb, out_gradient
         )
@@ -164,6 +171,7 @@ def train(variant: Variant) -> wp.Kernel:
             wp.dot(adj_rgb, behind_all) - adj_opacity,
             real(0.0),
             loss_weight,
+            target_rgb[i],
             ray_value(rays.content_distance, i),
             contraction,
             scaling,

@@ -10,11 +10,12 @@ from typing import NamedTuple
 
 import warp as wp
 
-from ..base.parts import Encoding, Head, RayLoss, Sampler
+from ..base.parts import Encoding, Head, Losses, Sampler
 from ..base.types import gradient_type, real, vec3, vector
+from ..heads import rgb
 from ..sampling.steps import STEPS
 from ..volume import scene as scenes
-from ..volume.ray_loss import NONE
+from ..volume.loss import PLAIN
 from ..volume.scene import ray_getter
 from ..volume.walk_packs import walk_packs
 
@@ -25,7 +26,7 @@ class Parts(NamedTuple):
     encoding: Encoding
     head: Head
     sampler: Sampler = STEPS
-    loss: RayLoss = NONE
+    losses: Losses = PLAIN
 
     @property
     def have_packs(self) -> bool:
@@ -35,6 +36,11 @@ class Parts(NamedTuple):
             and self.encoding.vectors is not None
             and self.head.vectors is not None
         )
+
+    @property
+    def have_colours_of_samples(self) -> bool:
+        """Whether channels are red, green and blue, and their sum the ray's colour."""
+        return self.head.shade is rgb.shade
 
 
 class Variant(NamedTuple):
@@ -54,12 +60,12 @@ class Variant(NamedTuple):
 
 def scene_type(parts: Parts) -> type:
     """What rays are marched through."""
-    return scenes.scene_type(parts.sampler, parts.encoding, parts.head)
+    return scenes.scene_type(parts.sampler, parts.encoding, parts.head, parts.losses)
 
 
 def ray_of_parts(parts: Parts) -> wp.Function:
     """The function that makes a ray for a model's parts."""
-    return ray_getter(parts.sampler, parts.encoding, parts.head)
+    return ray_getter(parts.sampler, parts.encoding, parts.head, parts.losses)
 
 
 @cache
@@ -90,7 +96,7 @@ def scratch_type(variant: Variant) -> type:
     if not variant.packed:
         return Nowhere
     parts = variant.parts
-    walked = walk_packs(parts.sampler, parts.encoding, parts.head, parts.loss)
+    walked = walk_packs(parts.sampler, parts.encoding, parts.head, parts.losses)
 
     @wp.struct
     class Scratch:
@@ -106,4 +112,4 @@ def sink_type(variant: Variant) -> type:
     parts = variant.parts
     if not variant.packed:
         return gradient_type(parts.encoding.n_floats)
-    return walk_packs(parts.sampler, parts.encoding, parts.head, parts.loss).Sink
+    return walk_packs(parts.sampler, parts.encoding, parts.head, parts.losses).Sink

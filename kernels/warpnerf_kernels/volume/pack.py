@@ -15,17 +15,19 @@ from typing import Any
 
 import warp as wp
 
-from ..base.parts import Encoding, Head, RayLoss
+from ..base.parts import Encoding, Head, Losses
 from ..base.simd import LANES, VECTORS, lanes, lanes_int
 from ..base.types import Density, Ray, struct
-from .ray_loss import NONE
+from .ray_loss import NONE, vector_form
+from .sample_loss import ColourSums
 
 wp.set_module_options({"enable_backward": False})
 
 
 @cache
-def pack_type(encoding: Encoding, head: Head, loss: RayLoss) -> type:
+def pack_type(encoding: Encoding, head: Head, losses: Losses) -> type:
     """Sixteen consecutive steps of a ray, which of them are samples, and what those hold."""
+    loss = losses.on_ray
     return struct(
         "Pack",
         {
@@ -52,16 +54,21 @@ def pack_type(encoding: Encoding, head: Head, loss: RayLoss) -> type:
             **dict(encoding.vectors.pack_fields),
             **dict(head.vectors.pack_fields),
             **({"adj_weight": lanes} if loss is not NONE else {}),  # from the loss on the ray
+            **({"adj_density": lanes} if loss.adj_density else {}),  # likewise, of raw densities
+            **dict(vector_form(loss).pack_fields),
+            **({"of_samples": wp.types.vector(2, wp.float32)} if losses.on_samples else {}),
         },
         __name__,
     )
 
 
 @cache
-def row_type(head: Head, loss: RayLoss) -> type:
+def row_type(head: Head, losses: Losses) -> type:
     """A ray between the two passes."""
+    loss = losses.on_ray
     channels = wp.types.vector(head.n_channels, wp.float32)
     vec3 = wp.types.vector(3, wp.float32)
+    of_colours = {"of_samples": ColourSums, "target_rgb": vec3, "sample_slope": wp.float32}
     return struct(
         "Row",
         {
@@ -77,6 +84,7 @@ def row_type(head: Head, loss: RayLoss) -> type:
             "adj_opacity": wp.float32,
             **dict(head.vectors.row_fields),
             **({"loss": loss.State} if loss is not NONE else {}),  # sums over its samples
+            **(of_colours if losses.on_samples else {}),
         },
         __name__,
     )
@@ -120,6 +128,16 @@ def weigh(
     ...
 
 
+OF_SAMPLES = r"""
+const vec counted = weight > WEIGHT_MIN ? weight : all(0.0f);
+vec square = all(0.0f);
+for (int c = 0; c < CHANNELS; ++c) {
+    square = fma(load(pack.channel.data[c]), load(pack.channel.data[c]), square);
+}
+pack.of_samples.c[0] = sum(counted);
+pack.of_samples.c[1] = sum(counted * square);
+"""
+
 COMPOSITE = r"""
 auto& pack = packs.data[slot];
 constexpr int CHANNELS = sizeof(pack.channel) / sizeof(vec);
@@ -148,21 +166,25 @@ vec left = behind - running_sum(weight * adj_weight);
 left = least(most(left, -limit * light), limit * light);
 vec adj_tau = fma(light, adj_weight, -left);
 const vec adj_sigma = load(pack.scale) * (load(pack.dt) * adj_tau);
-store(pack.adj_raw.data[0], load(pack.sigma_slope) * adj_sigma);
+store(pack.adj_raw.data[0], load(pack.sigma_slope) * adj_sigma OF_DENSITY);
 pack.behind = left[LANES - 1];
 """
 
 
 @cache
-def compositing(loss: RayLoss) -> tuple[wp.Function, wp.Function]:
+def compositing(head: Head, losses: Losses) -> tuple[wp.Function, wp.Function]:
     """composite, what walk.integrate adds up for the samples of a pack, and adj_composite.
 
     The latter does what walk.adj_integrate does with densities. Where there is a loss on the ray,
-    the pack holds what it adds to the slope of each weight.
+    the pack holds what it adds to the slopes of each weight and each raw density.
     """
-    of_loss = "" if loss is NONE else "adj_weight += load(pack.adj_weight);"
+    loss = losses.on_ray
     forward = VECTORS + COMPOSITE
-    backward = VECTORS + ADJ_COMPOSITE.replace("OF_LOSS", of_loss)
+    if losses.on_samples:
+        forward += OF_SAMPLES.replace("WEIGHT_MIN", f"{float(head.weight_min)!r}f")
+    of_loss = "" if loss is NONE else "adj_weight += load(pack.adj_weight);"
+    of_density = "+ load(pack.scale) * load(pack.adj_density)" if loss.adj_density else ""
+    backward = VECTORS + ADJ_COMPOSITE.replace("OF_LOSS", of_loss).replace("OF_DENSITY", of_density)
 
     @wp.func_native(forward)
     def composite(packs: wp.array(dtype=Any), slot: int): ...

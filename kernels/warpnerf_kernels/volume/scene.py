@@ -4,7 +4,7 @@ from functools import cache
 
 import warp as wp
 
-from ..base.parts import Encoding, Head, Sampler
+from ..base.parts import Encoding, Head, Losses, Sampler
 from ..base.types import Box, Density, FreeSpace, Ray, real, vec3
 from ..sampling.traversal import traversal
 
@@ -12,9 +12,24 @@ wp.set_module_options({"enable_backward": False})
 
 
 @cache
-def scene_type(sampler: Sampler, encoding: Encoding, head: Head) -> type:
+def loss_type(losses: Losses) -> type:
+    """The numbers that losses depend on, besides what is rendered."""
+    OfColour, OfRay = losses.photometric.Params, losses.on_ray.Params
+
+    @wp.struct
+    class Loss:
+        photometric: OfColour
+        on_ray: OfRay
+        on_samples: real  # factor
+
+    return Loss
+
+
+@cache
+def scene_type(sampler: Sampler, encoding: Encoding, head: Head, losses: Losses) -> type:
     """What rays are marched through."""
     Steps, Field, Weights = sampler.Params, encoding.Params, head.Params
+    Loss = loss_type(losses)
 
     @wp.struct
     class Scene:
@@ -24,6 +39,7 @@ def scene_type(sampler: Sampler, encoding: Encoding, head: Head) -> type:
         field: Field
         density: Density
         head: Weights
+        loss: Loss
 
     return Scene
 
@@ -52,9 +68,9 @@ def ray_value(values: wp.array(dtype=real), ray: int) -> real:  # noqa: F811 (an
 
 
 @cache
-def ray_getter(sampler: Sampler, encoding: Encoding, head: Head) -> wp.Function:
+def ray_getter(sampler: Sampler, encoding: Encoding, head: Head, losses: Losses) -> wp.Function:
     """The function ray_of(scene, rays, i, contraction) -> Ray."""
-    Scene = scene_type(sampler, encoding, head)
+    Scene = scene_type(sampler, encoding, head, losses)
     prepare_ray = traversal(sampler).prepare_ray
 
     @wp.func

@@ -14,20 +14,21 @@ from typing import Any
 import warp as wp
 
 from ..base.activation import adj_softplus, opacity_of
-from ..base.parts import Encoding, Head, RayLoss, Sampler
-from ..base.types import Ray, gradient_type, real, vector
+from ..base.parts import Encoding, Head, Losses, Sampler
+from ..base.types import Ray, gradient_type, real, vec3, vector
 from ..sampling.traversal import traversal
 from .compositing import matter_of, shed
 from .gradscale import distance_scale
+from .sample_loss import ColourSums, adj_sample_loss
 from .scene import scene_type
 
 wp.set_module_options({"enable_backward": False})
 
 
 @cache
-def integral_type(n_channels: int, loss: RayLoss) -> type:
+def integral_type(n_channels: int, losses: Losses) -> type:
     """What a ray has gathered."""
-    State = loss.State
+    State = losses.on_ray.State
 
     @wp.struct
     class Integral:
@@ -36,28 +37,32 @@ def integral_type(n_channels: int, loss: RayLoss) -> type:
         transmittance: real  # what passes all samples
         n_samples: int
         loss: State  # sums of the loss over samples
+        of_samples: ColourSums  # of the loss on their colours, where there is one
 
     return Integral
 
 
 @cache
-def walk(sampler: Sampler, encoding: Encoding, head: Head, loss: RayLoss) -> SimpleNamespace:
+def walk(sampler: Sampler, encoding: Encoding, head: Head, losses: Losses) -> SimpleNamespace:
     """The two passes for a model's parts.
 
     Returns:
         integrate, adj_integrate, and Integral, the type between them.
     """
-    Scene = scene_type(sampler, encoding, head)
+    Scene = scene_type(sampler, encoding, head, losses)
     Raw, Channels, View = vector(encoding.n_floats), vector(head.n_channels), head.View
     Gradient = gradient_type(encoding.n_floats)
+    loss, on_samples = losses.on_ray, losses.on_samples
     State = loss.State
-    Integral = integral_type(head.n_channels, loss)
+    Integral = integral_type(head.n_channels, losses)
     next_sample = traversal(sampler).next_sample
     edge = sampler.edge
     read, adj_read = encoding.read, encoding.adj_read
     prepare, adj_prepare = head.prepare, head.adj_prepare
     decode, adj_decode = head.decode, head.adj_decode
     add_loss, weighted, adj_loss, loss_bound = loss.add, loss.weighted, loss.adj_weight, loss.bound
+    adj_light, adj_density = loss.adj_transmittance, loss.adj_density
+    of_light, of_density = adj_light is not None, adj_density is not None
     weight_min = head.weight_min
 
     @wp.func
@@ -80,8 +85,14 @@ def walk(sampler: Sampler, encoding: Encoding, head: Head, loss: RayLoss) -> Sim
                 opacity = opacity_of(matter.sigma * sample.dt, matter.attenuation)
                 weight = total.transmittance * opacity
                 if weight > real(weight_min):
-                    total.channels += weight * decode(scene.head, view, raw)
-                total.loss = add_loss(total.loss, weight, sample.t, sample.dt)
+                    channels = decode(scene.head, view, raw)
+                    total.channels += weight * channels
+                    if wp.static(on_samples):
+                        total.of_samples.weight += weight
+                        total.of_samples.square += weight * wp.length_sq(channels)
+                total.loss = add_loss(
+                    scene.loss.on_ray, total.loss, weight, sample.t, sample.dt, raw[0]
+                )
                 total.depth += weight * sample.t
                 total.transmittance *= matter.attenuation
                 total.n_samples += 1
@@ -98,6 +109,7 @@ def walk(sampler: Sampler, encoding: Encoding, head: Head, loss: RayLoss) -> Sim
         adj_transmittance: real,  # of what passes all samples
         adj_depth: real,
         adj_loss_value: real,
+        target_rgb: vec3,  # of the loss on samples
         content_distance: real,
         contraction: int,
         scaling: int,
@@ -107,23 +119,27 @@ def walk(sampler: Sampler, encoding: Encoding, head: Head, loss: RayLoss) -> Sim
         """Adjoint of integrate. With G_i = dL/dw_i = <adj_channels, c_i> + adj_depth t_i + loss,
 
         dL/dsigma_i = dt_i (T_{i+1} G_i - sum_{j>i} w_j G_j - T_end dL/dT_end),
-        dL/dc_i = w_i adj_channels,
+        dL/dc_i = w_i (adj_channels, and the loss on samples),
 
         both multiplied by the distance scaling. The two sums are what lies behind sample i.
         """
         view = prepare(scene.head, ray.direction)
         adj_view = View()
+        on_ray = scene.loss.on_ray
+        adj_end = adj_transmittance
+        if wp.static(of_light):
+            adj_end += adj_loss_value * adj_light(on_ray, total.transmittance)
         behind = (
             wp.dot(adj_channels, total.channels)
             + adj_depth * total.depth
-            + adj_transmittance * total.transmittance
-            + adj_loss_value * weighted(total.loss)
+            + adj_end * total.transmittance
+            + adj_loss_value * weighted(on_ray, total.loss)
         )
         limit = behind_limit(
-            adj_transmittance,
+            adj_end,
             adj_channels,
             adj_depth * edge(scene.march, ray, ray.end),
-            adj_loss_value * loss_bound(total.loss, edge(scene.march, ray, ray.end)),
+            adj_loss_value * loss_bound(on_ray, total.loss, edge(scene.march, ray, ray.end)),
         )
         before = State()
         transmittance = real(1.0)
@@ -139,14 +155,18 @@ def walk(sampler: Sampler, encoding: Encoding, head: Head, loss: RayLoss) -> Sim
                 sample.t, content_distance, sample.det_jacobian, scaling, jacobian
             )
             adj_weight = adj_depth * sample.t + adj_loss_value * adj_loss(
-                total.loss, before, weight, sample.t, sample.dt
+                on_ray, total.loss, before, weight, sample.t, sample.dt
             )
-            before = add_loss(before, weight, sample.t, sample.dt)
+            before = add_loss(on_ray, before, weight, sample.t, sample.dt, raw[0])
             adj_raw = Raw()
             if weight > real(weight_min):
                 channels = decode(scene.head, view, raw)
                 adj_weight += wp.dot(adj_channels, channels)
-                adj_sample_channels = scale * (weight * adj_channels)
+                adj_own = adj_channels
+                if wp.static(on_samples):
+                    slope = real(2.0) * scene.loss.on_samples * adj_loss_value
+                    adj_own += adj_sample_loss(slope, channels, target_rgb)
+                adj_sample_channels = scale * (weight * adj_own)
                 adj_raw, adj_sample_view = adj_decode(
                     scene.head, view, raw, channels, adj_sample_channels, gradient
                 )
@@ -154,6 +174,8 @@ def walk(sampler: Sampler, encoding: Encoding, head: Head, loss: RayLoss) -> Sim
             behind = shed(behind, weight, adj_weight, limit, transmittance)
             adj_sigma = scale * (sample.dt * (transmittance * adj_weight - behind))
             adj_raw[0] = adj_softplus(matter.sigma_slope, adj_sigma)
+            if wp.static(of_density):
+                adj_raw[0] += scale * (adj_loss_value * adj_density(on_ray, sample.t))
             adj_read(scene.field, sample.position, adj_raw, gradient)
         adj_prepare(scene.head, ray.direction, adj_view, gradient)
 

@@ -10,14 +10,15 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from ..base.parts import Encoding, Head, RayLoss, Sampler
+from ..base.parts import Encoding, Head, Losses, Sampler
 from ..base.simd import LANES, lanes
 from ..base.types import Ray
 from ..cpu.scatter import sink_type
 from ..sampling.traversal import locate_pack, traversal
 from .gradscale import distance_scale
 from .pack import compositing, pack_type, row_type, weigh
-from .ray_loss import NONE
+from .ray_loss import NONE, vector_form
+from .sample_loss import ColourSums
 from .scene import scene_type
 from .walk import behind_limit
 
@@ -25,26 +26,32 @@ wp.set_module_options({"enable_backward": False})
 
 
 @cache
-def walk_packs(sampler: Sampler, encoding: Encoding, head: Head, loss: RayLoss) -> SimpleNamespace:
+def walk_packs(sampler: Sampler, encoding: Encoding, head: Head, losses: Losses) -> SimpleNamespace:
     """The two passes for a model's parts.
 
     Returns:
         integrate, adj_integrate, and what they keep: Pack, Row; and Sink, what they add to.
     """
-    Scene = scene_type(sampler, encoding, head)
+    Scene = scene_type(sampler, encoding, head, losses)
+    loss, on_samples = losses.on_ray, losses.on_samples
     own, of_head = encoding.vectors, head.vectors
-    Pack, Row = pack_type(encoding, head, loss), row_type(head, loss)
+    Pack, Row = pack_type(encoding, head, losses), row_type(head, losses)
     Sink = sink_type(encoding)
     Channels = wp.types.vector(head.n_channels, wp.float32)
     next_sample = traversal(sampler).next_sample
     edge, place_pack = sampler.edge, sampler.place_pack
     read_pack, adj_read_pack, fetch_pack = own.read_pack, own.adj_read_pack, own.fetch_pack
-    decode_pack, adj_decode_pack = of_head.decode_pack, of_head.adj_decode_pack
+    decode_pack = of_head.decode_pack
+    adj_decode_pack = (
+        of_head.adj_decode_pack_with_colours if on_samples else of_head.adj_decode_pack
+    )
     n_packs = of_head.n_packs
     prepare_row, adj_prepare_row = of_head.prepare_row, of_head.adj_prepare_row
-    composite, adj_composite = compositing(loss)
+    composite, adj_composite = compositing(head, losses)
     has_loss, State = loss is not NONE, loss.State
-    add_loss, weighted, adj_loss, loss_bound = loss.add, loss.weighted, loss.adj_weight, loss.bound
+    weighted, loss_bound, adj_light = loss.weighted, loss.bound, loss.adj_transmittance
+    of_light, of_density = adj_light is not None, loss.adj_density is not None
+    add_pack, adj_add_pack = vector_form(loss)[:2]
 
     @wp.func
     def next_pack(
@@ -74,35 +81,6 @@ def walk_packs(sampler: Sampler, encoding: Encoding, head: Head, loss: RayLoss) 
         return wp.min(step + LANES, ray.end)
 
     @wp.func
-    def add_pack(before: State, packs: wp.array(dtype=Pack), slot: int) -> State:
-        """The loss's sums with the samples of a pack. One after the other: they build on it."""
-        state = before
-        for lane in range(LANES):
-            if packs[slot].visited[lane] != 0:
-                weight = packs[slot].weight[lane]
-                state = add_loss(state, weight, packs[slot].t[lane], packs[slot].dt[lane])
-        return state
-
-    @wp.func
-    def adj_add_pack(
-        total: State,
-        before: State,
-        adj_loss_value: float,
-        packs: wp.array(dtype=Pack),  # whose adj_weight is written
-        slot: int,
-    ) -> State:
-        """What the loss adds to the slope of each weight of a pack; the sums with its samples."""
-        state = before
-        adj = lanes()
-        for lane in range(LANES):
-            if packs[slot].visited[lane] != 0:
-                weight, t, dt = packs[slot].weight[lane], packs[slot].t[lane], packs[slot].dt[lane]
-                adj[lane] = adj_loss_value * adj_loss(total, state, weight, t, dt)
-                state = add_loss(state, weight, t, dt)
-        packs[slot].adj_weight = adj
-        return state
-
-    @wp.func
     def integrate(
         scene: Scene,
         rows: wp.array(dtype=Row),
@@ -117,6 +95,7 @@ def walk_packs(sampler: Sampler, encoding: Encoding, head: Head, loss: RayLoss) 
         ray = rows[row].ray
         channels = Channels()
         state = State()
+        of_samples = ColourSums()
         depth = float(0.0)
         transmittance = float(1.0)
         n_samples = int(0)
@@ -147,7 +126,10 @@ def walk_packs(sampler: Sampler, encoding: Encoding, head: Head, loss: RayLoss) 
                 channels += packs[k].sums
                 depth += packs[k].depth
                 if wp.static(has_loss):
-                    state = add_pack(state, packs, k)
+                    state = add_pack(scene.loss.on_ray, state, packs, k)
+                if wp.static(on_samples):
+                    of_samples.weight += packs[k].of_samples[0]
+                    of_samples.square += packs[k].of_samples[1]
             n += slot - first
         rows[row].channels = channels
         rows[row].depth = depth
@@ -156,6 +138,8 @@ def walk_packs(sampler: Sampler, encoding: Encoding, head: Head, loss: RayLoss) 
         rows[row].slot = begin
         if wp.static(has_loss):
             rows[row].loss = state
+        if wp.static(on_samples):
+            rows[row].of_samples = of_samples
         return wp.min(begin + n, end - n_packs)
 
     @wp.func
@@ -182,17 +166,25 @@ def walk_packs(sampler: Sampler, encoding: Encoding, head: Head, loss: RayLoss) 
         ray = rows[row].ray
         begin = rows[row].slot
         adj_channels = rows[row].adj_channels
+        on_ray = scene.loss.on_ray
+        adj_end = adj_transmittance
+        if wp.static(of_light):
+            adj_end += adj_loss_value * adj_light(on_ray, rows[row].transmittance)
         behind = (
             wp.dot(adj_channels, rows[row].channels)
             + adj_depth * rows[row].depth
-            + adj_transmittance * rows[row].transmittance
+            + adj_end * rows[row].transmittance
         )
         of_loss = float(0.0)
         if wp.static(has_loss):
-            behind += adj_loss_value * weighted(rows[row].loss)
-            of_loss = adj_loss_value * loss_bound(rows[row].loss, edge(scene.march, ray, ray.end))
+            behind += adj_loss_value * weighted(on_ray, rows[row].loss)
+            of_loss = adj_loss_value * loss_bound(
+                on_ray, rows[row].loss, edge(scene.march, ray, ray.end)
+            )
+        if wp.static(on_samples):
+            rows[row].sample_slope = 2.0 * scene.loss.on_samples * adj_loss_value
         limit = behind_limit(
-            adj_transmittance, adj_channels, adj_depth * edge(scene.march, ray, ray.end), of_loss
+            adj_end, adj_channels, adj_depth * edge(scene.march, ray, ray.end), of_loss
         )
         before = State()
         short = rows[row].n_samples < 4 * LANES  # else adj_read_pack asks for all but the first two
@@ -234,7 +226,12 @@ def walk_packs(sampler: Sampler, encoding: Encoding, head: Head, loss: RayLoss) 
                 if short and n + slot - first < wp.static(max(n_packs, 2)):
                     fetch_pack(scene.field, packs, slot, worker, sink)
                 if wp.static(has_loss):
-                    before = adj_add_pack(rows[row].loss, before, adj_loss_value, packs, slot)
+                    packs[slot].adj_weight = lanes()
+                    if wp.static(of_density):
+                        packs[slot].adj_density = lanes()
+                    before = adj_add_pack(
+                        on_ray, rows[row].loss, before, adj_loss_value, packs, slot
+                    )
                 adj_composite(adj_depth, behind, limit, rows, row, packs, slot)
                 behind = packs[slot].behind
                 slot += 1

@@ -1,0 +1,1 @@
+"""Losses on the samples of a ray, a file each."""
