@@ -56,7 +56,8 @@ class Trainer:
             scene: What is trained on.
             config: How.
             resume: Where to go on.
-            sight: Gives box and content distances in place of the scene's, for a new training.
+            sight: Gives content distances in place of the scene's, and its box where the scene's is
+                a guess, for a new training.
             seconds: Spent on it so far.
 
         Raises:
@@ -70,6 +71,8 @@ class Trainer:
         self.steps_done = 0
         self._given = scene
         self._scene_digest = None if resume is None else resume.scene_digest
+        self.sight = sight
+        """What a short training has found; None: the scene's own extent is used."""
         if sight is not None:
             scene = seen_scene(scene, sight)
         self.scene = scene
@@ -434,8 +437,9 @@ def _content_distances(scene: Scene, config: TrainConfig) -> tuple[float, list[f
     if chosen == "per-camera":
         if scene.content_distances is None:
             raise InputError(
-                f"content_distance is per-camera, but {scene.name} has no points that tell what "
-                "each camera sees; use auto, or a number."
+                f"content_distance is per-camera, but {scene.name} brings no points, and no short "
+                "training has found what each camera sees: that takes 500 steps or more, and "
+                "photographs that show something opaque; use auto, or a number."
             )
         return scene.content_distance, [float(scene.content_distances[i]) for i in train]
     one = scene.content_distance if chosen == "auto" else float(chosen)
