@@ -38,6 +38,10 @@ FIRST_LOOK = 200
 so densities must have had time to show."""
 
 
+TIGHTEN_AT = 0.1
+"""Share of the training at which the box of an object is tightened, before the grid first grows."""
+
+
 class Trainer:
     """A training run between two updates: the grid, its optimiser, and what comes next."""
 
@@ -106,6 +110,7 @@ class Trainer:
             self.workers,
         )
         self._accumulation = config.optim.accumulation(scene.kind)
+        self._resize_at = _resize_at(scene, config)
         self._grown = 0
         self._updates = 0
         assert isinstance(config.model, Model)
@@ -346,8 +351,8 @@ class Trainer:
         )
 
     def _voxels(self, grown: int) -> int:
-        """Nodes after that many growing steps."""
-        left = len(self.config.grid.grow_at) - grown
+        """Nodes after the grid was resized so often."""
+        left = min(len(self._resize_at) - grown, len(self.config.grid.grow_at))
         return max(8, self.config.grid.voxels >> left)
 
     def parameters(self) -> tuple[Parameter, ...]:
@@ -380,8 +385,8 @@ class Trainer:
         )
 
     def _grow(self, fraction: float) -> None:
-        """Carry grid and optimiser over to more nodes, once the schedule says so."""
-        grown = sum(fraction >= at for at in self.config.grid.grow_at)
+        """Carry grid and optimiser over to more or smaller voxels, once the schedule says so."""
+        grown = sum(fraction >= at for at in self._resize_at)
         if grown == self._grown or self.steps_done < FIRST_LOOK:
             return
         box = self._tight_box()
@@ -429,6 +434,18 @@ def _contraction(scene: Scene, config: TrainConfig) -> Contraction:
     if config.grid.contraction == "auto":
         return "linf" if scene.unbounded else "none"
     return config.grid.contraction
+
+
+def _resize_at(scene: Scene, config: TrainConfig) -> tuple[float, ...]:
+    """Shares of the training at which the grid gets another box or more nodes.
+
+    Around an object much of the first box is empty. What the first steps show of that suffices to
+    spend its nodes elsewhere; they need no training, and no grid, of their own.
+    """
+    grow_at = config.grid.grow_at
+    if scene.kind == "object" and grow_at and grow_at[0] > TIGHTEN_AT:
+        return (TIGHTEN_AT, *grow_at)
+    return grow_at
 
 
 def _content_distances(scene: Scene, config: TrainConfig) -> tuple[float, list[float]]:
