@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import signal
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -9,8 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import warp as wp
+from PIL import Image
 from tiny_fields import tiny_field
 from tiny_scenes import camera_at, look_at, ring, tiny_scene
+from watched_command import command, make_scene
 
 import warpnerf as wn
 from warpnerf.model.nodes import points_of
@@ -278,3 +284,64 @@ def test_the_search_leaves_them_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(coarse, "leave_out_near", lambda grid, cameras, near: asked.append(near))
     find_sight(guessed_scene(), replace(SHORT, march=wn.MarchConfig(near=0.25)))
     assert asked == [0.25, 0.25]
+
+
+FEW = ("--model", "rgb", "--threads", "1", "--voxels", "8000", "--steps", "500")
+
+
+def black_scene(folder: Path) -> Path:
+    """Photographs that empty space explains as well as anything."""
+    scene = make_scene(folder)
+    for path in (scene / "images").iterdir():
+        Image.fromarray(np.zeros((12, 16, 3), np.uint8)).save(path)
+    return scene
+
+
+def test_the_command_says_that_nothing_was_found(tmp_path: Path) -> None:
+    scene = black_scene(tmp_path)
+    done = command("train", scene, "--output", "run", *FEW, folder=tmp_path, limit=None)
+    assert done.code == 0, done.err
+    assert f"note: {coarse.NOTHING_SEEN}" in done.out
+    config = json.loads((done.run / "config.json").read_text())
+    assert "found" not in config and coarse.NOTHING_SEEN in config["notes"]
+
+
+def test_the_command_refuses_distances_of_cameras_that_see_nothing(tmp_path: Path) -> None:
+    scene = black_scene(tmp_path)
+    each = ("--content-distance", "per-camera")
+    done = command("train", scene, "--output", "run", *FEW, *each, folder=tmp_path, limit=None)
+    assert done.code == 2 and not done.run.exists()
+    assert done.err.count("\n") == 1 and "something opaque; use auto, or a number" in done.err
+
+
+def test_the_command_keeps_what_it_found(tmp_path: Path) -> None:
+    scene = make_scene(tmp_path)
+    done = command("train", scene, "--output", "run", *FEW, folder=tmp_path, limit=None)
+    assert done.code == 0, done.err
+    looking, _, rest = done.out.partition("found by a short training")
+    assert "step 25" in looking.partition("looking for how far the cameras see")[2] and rest
+    config = Run(done.run).read_config()
+    assert config.found is not None
+    assert config.found.content_distance == config.content_distance
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no SIGINT for one process there")
+def test_stopped_while_it_looks_the_command_leaves_nothing(tmp_path: Path) -> None:
+    scene, run = make_scene(tmp_path), tmp_path / "run"
+    process = subprocess.Popen(
+        [sys.executable, "-m", "warpnerf", "train", str(scene), "--output", str(run), *FEW[:-4]],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if "step " in line:
+                break
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 130 and err == "stopped\n"
+    assert "content distance" not in out and not run.exists()
