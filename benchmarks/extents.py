@@ -2,13 +2,13 @@
 
     python benchmarks/extents.py room-scan path/to/scene --steps 1200 --seeds 0 1
 
-Scenes are folders that bring points, and room-scan: the built-in room seen outward only, written as
-photographs and a COLMAP model by room_scan.py. Each is trained with the extent that the cameras
-give alone, with the one that two short trainings find, where the cameras look at no common point,
-with that of the points, and with that and a content distance for each camera, for as many steps,
-whatever the time. Prints PSNR
-and SSIM of the test views, optical depth within a tenth of the points' content distance of the
-training cameras, and seconds; writes benchmarks/results/extents_<device>.json.
+Scenes are folders that bring points or not, and room-scan, room-inward and room-mixed: the built-in
+room seen outward, inward and both, written as photographs and a COLMAP model by room_scan.py. Each
+is trained with the extent that the cameras give alone, with the one that short trainings find,
+whose steps count to neither, and with that of the points where there are some; of the last two also
+with a content distance for each camera; for as many steps, whatever the time. Prints PSNR and SSIM
+of the test views, optical depth within a tenth of the content distance of the training cameras, and
+seconds; writes benchmarks/results/extents_<device>.json.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from measuring import machine, options, write_record
-from room_scan import write_scan
+from room_scan import SCANS, write_scan
 from training import path_of
 
 import warpnerf as wn
@@ -28,17 +28,16 @@ from warpnerf.runtime.parallel import Workers
 from warpnerf.scenes.scene import estimate_extent
 from warpnerf.training.coarse import begin
 
-ROOM_SCAN = "room-scan"
-
 
 def main() -> None:
     parser = options(__doc__)
-    parser.add_argument("scenes", nargs="*", default=[ROOM_SCAN], help="folders, room-scan")
+    known = f"folders, {', '.join(SCANS)}"
+    parser.add_argument("scenes", nargs="*", default=["room-scan"], help=known)
     parser.add_argument("--steps", type=int, default=1200)
     parser.add_argument("--voxels", type=int, default=112**3)
     parser.add_argument("--threads", type=int, help="by default one per usable core")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--views", type=int, default=125, help="photographs of room-scan")
+    parser.add_argument("--views", type=int, default=125, help="photographs of a scan")
     parser.add_argument("--model", default="rgb", choices=list(MODELS))
     arguments = parser.parse_args()
     config = wn.TrainConfig(
@@ -50,18 +49,25 @@ def main() -> None:
     )
     rows: list[dict[str, Any]] = []
     print(
-        "scene         seed  extent      distance  longest edge   PSNR   SSIM  near_mass  seconds"
+        "scene         seed  extent              distance  longest edge   PSNR   SSIM  near_mass  "
+        "seconds"
     )
     with tempfile.TemporaryDirectory() as temporary:
         for name in arguments.scenes:
+            scene, truth = load(name, Path(temporary) / name, arguments.views)
             for seed in arguments.seeds:
-                scene = load(name, Path(temporary) / ROOM_SCAN, arguments.views)
                 for extent, (scene_of, chosen) in variants(scene).items():
                     found = measure(scene, scene_of, replace(config, seed=seed, **chosen))
-                    row = {"scene": name, "seed": seed, "extent": extent, **found}
+                    row = {
+                        "scene": name,
+                        "seed": seed,
+                        "extent": extent,
+                        "true_distance": truth,
+                        **found,
+                    }
                     rows.append(row)
                     print(
-                        f"{name:12}  {seed:4}  {extent:10}  {row['content_distance']:8.3f}  "
+                        f"{name:12}  {seed:4}  {extent:18}  {row['content_distance']:8.3f}  "
                         f"{row['longest_edge']:12.3f}  {row['psnr']:5.2f}  {row['ssim']:.3f}  "
                         f"{row['near_mass']:9.4f}  {row['seconds']:7.1f}",
                         flush=True,
@@ -76,19 +82,16 @@ def main() -> None:
     print(f"wrote {write_record(record, arguments.output, 'extents', arguments.device)}")
 
 
-def load(name: str, folder: Path, views: int) -> wn.Scene:
-    """A scene that brings points."""
-    if name != ROOM_SCAN:
-        return wn.load_scene(path_of(name))
-    if not folder.exists():
-        write_scan(folder, views, n_points=32 * views)
-    return wn.load_scene(folder)
+def load(name: str, folder: Path, views: int) -> tuple[wn.Scene, float | None]:
+    """A scene, and the median true distance of what its cameras see, where that is known."""
+    if name not in SCANS:
+        return wn.load_scene(path_of(name)), None
+    truth = write_scan(folder, views, n_points=32 * views, scan=name)
+    return wn.load_scene(folder), truth
 
 
 def variants(scene: wn.Scene) -> dict[str, tuple[wn.Scene, dict[str, Any]]]:
     """The scene with each extent, and what the configuration says."""
-    if scene.content_distances is None:
-        raise SystemExit(f"{scene.name} brings no points")
     alone = estimate_extent(scene.training_cameras, unbounded=scene.unbounded)
     without = replace(
         scene,
@@ -98,13 +101,15 @@ def variants(scene: wn.Scene) -> dict[str, tuple[wn.Scene, dict[str, Any]]]:
         content_distances=None,
         guessed=alone.guessed,
     )
-    found = {"cameras": (without, {"coarse_steps": 0})}
-    if alone.guessed:
-        found["coarse"] = (without, {})
-    return found | {
-        "points": (scene, {}),
-        "per camera": (scene, {"content_distance": "per-camera"}),
+    each = {"content_distance": "per-camera"}
+    found: dict[str, tuple[wn.Scene, dict[str, Any]]] = {
+        "cameras": (without, {"coarse_steps": 0}),
+        "coarse": (without, {}),
+        "coarse, per camera": (without, each),
     }
+    if scene.content_distances is not None:
+        found |= {"points": (scene, {}), "points, per camera": (scene, each)}
+    return found
 
 
 def measure(scene: wn.Scene, trained: wn.Scene, config: wn.TrainConfig) -> dict[str, float]:

@@ -1,12 +1,15 @@
-"""Photographs of the built-in room as someone takes them who turns around in its middle.
+"""Photographs of the built-in room as people take them.
 
-All cameras look outward, and a COLMAP text model beside them holds points of the room's surfaces
-with the photographs that show them, as structure from motion would find them: with noise, and with
-a share of outliers far behind the walls and close before the cameras.
+Who takes them turns around in its middle, walks around its table, or does both. A COLMAP text model
+beside them holds points of the room's surfaces with the photographs that show them, as structure
+from motion would find them: with noise, and with a share of outliers far behind the walls and close
+before the cameras.
 """
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +27,6 @@ OUTLIERS = 0.03
 def scan_cameras(n: int, width: int, height: int, seed: int = 0) -> list[Camera]:
     """Cameras within 0.75 m of the room's middle, 0.8 to 1.9 m high, that look away from it."""
     rng = np.random.default_rng(seed)
-    focal = 0.5 * width / np.tan(np.radians(65.0) / 2.0)
     cameras: list[Camera] = []
     while len(cameras) < n:
         angle = 2.0 * np.pi * (len(cameras) * 0.381966 + rng.uniform(-0.02, 0.02))
@@ -32,28 +34,67 @@ def scan_cameras(n: int, width: int, height: int, seed: int = 0) -> list[Camera]
         eye = np.array([0.25, 0.0, 0.0]) + rng.uniform(0.25, 0.75) * out
         eye[2] = rng.uniform(0.8, 1.9)
         turned = angle + rng.uniform(-0.4, 0.4)
-        back = -np.array([np.cos(turned), np.sin(turned), rng.uniform(-0.35, 0.25)])
-        back /= np.linalg.norm(back)
-        right = np.cross((0.0, 0.0, 1.0), back)
-        right /= np.linalg.norm(right)
-        c2w = np.stack([right, np.cross(back, right), back, eye], axis=1)
-        if first_hit(eye[None], -back[None])[0] > 0.3:
-            cameras.append(
-                Camera(
-                    width=width,
-                    height=height,
-                    fx=focal,
-                    fy=focal,
-                    cx=0.5 * width,
-                    cy=0.5 * height,
-                    c2w=c2w,
-                )
-            )
+        ahead = np.array([np.cos(turned), np.sin(turned), rng.uniform(-0.35, 0.25)])
+        cameras += _standing(eye, ahead, width, height)
     return cameras
 
 
+def inward_cameras(n: int, width: int, height: int, seed: int = 0) -> list[Camera]:
+    """Cameras on an oval around the table, 1 to 1.8 m high, that look at it."""
+    rng = np.random.default_rng(seed)
+    cameras: list[Camera] = []
+    for k in itertools.count():
+        if len(cameras) == n:
+            return cameras
+        angle = 2.0 * np.pi * (k * 0.381966 + rng.uniform(-0.02, 0.02))
+        eye = np.array([0.1 + rng.uniform(1.1, 1.5) * np.cos(angle), 0.0, rng.uniform(1.0, 1.8)])
+        eye[1] = rng.uniform(1.4, 1.9) * np.sin(angle)
+        target = [-0.2, 0.0, 0.57] + rng.uniform(-0.2, 0.2, 3) * [1.0, 1.0, 0.6]
+        cameras += _standing(eye, target - eye, width, height)
+    return cameras
+
+
+def mixed_cameras(n: int, width: int, height: int, seed: int = 0) -> list[Camera]:
+    """Half of them look inward, half outward."""
+    inward = inward_cameras(n // 2, width, height, seed)
+    return inward + scan_cameras(n - n // 2, width, height, seed)
+
+
+def _standing(eye: np.ndarray, ahead: np.ndarray, width: int, height: int) -> list[Camera]:
+    """An upright camera, 65 degrees wide, none where something stands right before it."""
+    focal = 0.5 * width / np.tan(np.radians(65.0) / 2.0)
+    back = -ahead / np.linalg.norm(ahead)
+    right = np.cross((0.0, 0.0, 1.0), back)
+    right /= np.linalg.norm(right)
+    if first_hit(eye[None], -back[None])[0] <= 0.3:
+        return []
+    return [
+        Camera(
+            width=width,
+            height=height,
+            fx=focal,
+            fy=focal,
+            cx=0.5 * width,
+            cy=0.5 * height,
+            c2w=np.stack([right, np.cross(back, right), back, eye], axis=1),
+        )
+    ]
+
+
+SCANS: dict[str, Callable[[int, int, int], list[Camera]]] = {
+    "room-scan": scan_cameras,
+    "room-inward": inward_cameras,
+    "room-mixed": mixed_cameras,
+}
+"""The cameras of each capture, by how many there are, and width and height of its pictures."""
+
+
 def write_scan(
-    folder: Path, n_views: int = 125, n_points: int = 4000, size: tuple[int, int] = (160, 120)
+    folder: Path,
+    n_views: int = 125,
+    n_points: int = 4000,
+    size: tuple[int, int] = (160, 120),
+    scan: str = "room-scan",
 ) -> float:
     """Write photographs and model.
 
@@ -62,6 +103,7 @@ def write_scan(
         n_views: Photographs.
         n_points: Of the model.
         size: Width and height, pixels.
+        scan: One of SCANS.
 
     Returns:
         The median true distance over all pixels, metres.
@@ -69,7 +111,7 @@ def write_scan(
     (folder / "images").mkdir(parents=True)
     model = folder / "sparse" / "0"
     model.mkdir(parents=True)
-    cameras = scan_cameras(n_views, *size)
+    cameras = SCANS[scan](n_views, *size)
     depths = []
     poses = ["# Images"]
     for number, camera in enumerate(cameras):

@@ -9,9 +9,9 @@ import warp as wp
 from warpnerf_kernels.base.types import vector
 
 from warpnerf.config import Contraction
-from warpnerf.exporting.nodes import points_of
 from warpnerf.model.grid import FreeCells, VoxelGrid
 from warpnerf.model.models import Rgb
+from warpnerf.model.nodes import points_of
 from warpnerf.rendering.field import Field
 from warpnerf.rendering.render import Steps
 from warpnerf.runtime.parallel import Workers

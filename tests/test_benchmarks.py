@@ -10,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
+from tiny_scenes import picture, ring, write_blender
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "benchmarks"))
@@ -301,16 +303,18 @@ def test_photos_on_disk(tmp_path):
 
 @pytest.mark.slow
 def test_extents(tmp_path):
-    options = ("room-scan", "--views", "9", "--steps", "20", "--voxels", "8000", "--threads", "1")
+    options = ("room-scan", "--views", "9", "--steps", "500", "--voxels", "8000", "--threads", "1")
     record, printed = run("extents.py", tmp_path / "record.json", *options)
     rows = {row["extent"]: row for row in record["rows"]}
-    assert list(rows) == ["cameras", "coarse", "points", "per camera"]
+    found = ["coarse", "coarse, per camera"]
+    assert list(rows) == ["cameras", *found, "points", "points, per camera"]
     assert rows["cameras"]["longest_edge"] < 1.5  # a guess
-    for extent in ("points", "per camera"):
+    for extent in ("points", "points, per camera"):
         assert 5.0 < rows[extent]["longest_edge"] < 6.0  # the room's
         assert 1.5 < rows[extent]["content_distance"] < 2.5
     for row in rows.values():
         assert row["psnr"] > 5 and row["near_mass"] >= 0 and row["seconds"] > 0
+        assert 1.5 < row["true_distance"] < 2.5
         assert f"{row['psnr']:5.2f}" in printed
 
 
@@ -325,6 +329,23 @@ def test_schedules(tmp_path):
     for row in rows:
         assert row["steps"] > 2 and 5 < row["psnr"] < 50 and 0 < row["besides_rays"] < 1
         assert row["seconds"] > 1.4  # the others' turns do not count
+        assert f"{row['psnr']:.2f}" in printed
+
+
+@pytest.mark.slow
+def test_tightening(tmp_path):
+    scene = tmp_path / "scene"
+    scene.mkdir()
+    for split in ("train", "test"):
+        write_blender(scene, split, ring(4))
+        for i in range(4):  # large enough for SSIM
+            pixels = picture(i, width=16, height=12, channels=4)
+            Image.fromarray(pixels).save(scene / split / f"r_{i}.png")
+    options = (str(scene), "--time-limit", "1.5", "--voxels", "8000", "--threads", "1")
+    record, printed = run("tightening.py", tmp_path / "record.json", *options)
+    assert [row["box"] for row in record["rows"]] == ["at growth", "own grid", "early"]
+    for row in record["rows"]:
+        assert row["steps"] > 2 and 5 < row["psnr"] < 50 and row["longest_edge"] > 0
         assert f"{row['psnr']:.2f}" in printed
 
 

@@ -10,8 +10,8 @@ from solid_fields import ball_field, camera_at, cameras_around
 from tiny_fields import tiny_field
 
 from warpnerf.exporting import sight
-from warpnerf.exporting.nodes import nodes_of, points_of, values_at
 from warpnerf.exporting.sight import look
+from warpnerf.model.nodes import nodes_of, points_of, values_at
 from warpnerf.scenes.scene import View
 from warpnerf.scenes.undistort import seen_pixels
 

@@ -11,10 +11,10 @@ from solid_fields import ball_field, camera_at, cameras_around
 
 from warpnerf.checks import InputError
 from warpnerf.exporting import splats
-from warpnerf.exporting.nodes import points_of
 from warpnerf.exporting.quaternions import quaternions
 from warpnerf.exporting.sight import look
 from warpnerf.exporting.splats import Splats, splats_of, splats_ply
+from warpnerf.model.nodes import points_of
 from warpnerf.rendering.field import Field
 from warpnerf.scenes.camera import Camera
 
@@ -104,7 +104,7 @@ def test_splats_of_folded_space_are_as_large_as_their_cells(contraction: str) ->
     turned = rotations(made.rotations[far].astype(float)) * made.scales[far][:, None, :]
     covariance = turned @ turned.transpose(0, 2, 1)
     step = np.eye(3)
-    from warpnerf.exporting.nodes import nodes_of
+    from warpnerf.model.nodes import nodes_of
 
     nodes = nodes_of(field.grid, made.centres[far].astype(float))
     cells = np.stack(

@@ -25,14 +25,14 @@ from warpnerf.training.train import train
 from warpnerf.training.trainer import Trainer
 
 STEPS = 20
-GROWING = (7, 13)
+FIRST_LOOK, GROWING = 4, (7, 13)
 """The steps at which the grid of ``tiny_config`` grows: the first with a share above 0.3, 0.6."""
 
 
 @pytest.fixture(autouse=True)
 def early_growth(monkeypatch: pytest.MonkeyPatch) -> None:
     """Free space is looked for, and the grid grows, within a short training."""
-    monkeypatch.setattr(training, "FIRST_LOOK", 4)
+    monkeypatch.setattr(training, "FIRST_LOOK", FIRST_LOOK)
     monkeypatch.setattr(training, "REPORT_EVERY", 3)
 
 
@@ -101,11 +101,12 @@ def test_resumed_after_any_step_it_ends_the_same(
     scene = replace(ball(), unbounded=unbounded)
     config = tiny_config(threads=threads, model=model)
     whole = stopped_at(STEPS, tmp_path / "whole", config, scene)
-    assert whole.grown == 2 and 0.02 < whole.progress.occupied < 0.98
+    resizing = GROWING if unbounded else (FIRST_LOOK, *GROWING)
+    assert whole.grown == len(resizing) and 0.02 < whole.progress.occupied < 0.98
     assert unbounded or (whole.field.grid.box_min > scene.box_min).any()
     for step in range(1, STEPS):
         begun = stopped_at(step, tmp_path / "begun", config, scene)
-        assert begun.grown == sum(step > at for at in GROWING)
+        assert begun.grown == sum(step > at for at in resizing)
         resumed = stopped_at(STEPS, tmp_path / "resumed", begun.config, scene, begun)
         assert_same_state(without_seconds(resumed), without_seconds(whole))
 
@@ -117,6 +118,38 @@ def test_interrupted_after_every_step_it_ends_the_same(tmp_path: Path, on_cpu: N
         state = stopped_at(step, tmp_path / "state", tiny_config(), ball(), state)
     assert state is not None
     assert_same_state(without_seconds(state), without_seconds(whole))
+
+
+def resized_at(config: TrainConfig, scene: Scene) -> list[tuple[int, float, float]]:
+    """After which steps the grid was resized, and the shares of nodes and of the box then left."""
+    trainer, found = Trainer(scene, config), []
+    before = trainer.grid
+    while trainer.fraction < 1.0:
+        done = trainer.steps_done
+        trainer.update()
+        grid = trainer.grid
+        if grid.size != before.size or not np.array_equal(grid.box_min, before.box_min):
+            edges = [np.prod(g.box_max - g.box_min) for g in (grid, before)]
+            nodes = [np.prod(g.size) for g in (grid, before)]
+            found.append((done, float(nodes[0] / nodes[1]), float(edges[0] / edges[1])))
+        before = grid
+    return found
+
+
+def test_the_box_of_an_object_is_tightened_before_the_grid_grows(on_cpu: None) -> None:
+    config = tiny_config(steps=100)  # in which 10 suffice for a ball to show
+    config = replace(config, grid=replace(config.grid, alpha_init=0.05))
+    found = resized_at(config, ball())
+    assert [step for step, _, _ in found] == [10, 31, 61]
+    nodes, box = np.array(found)[:, 1:].T
+    assert box[0] < 0.9 and nodes == pytest.approx([1.0, 2.0, 2.0], rel=0.2)
+    opaque = [replace(view, image=view.image[..., :3].copy()) for view in ball().views]
+    filled = resized_at(config, replace(ball(), views=opaque))
+    assert [step for step, _, _ in filled] == [31, 61]
+    early = replace(config, grid=replace(config.grid, grow_at=(0.05, 0.601)))
+    assert [step for step, _, _ in resized_at(early, ball())] == [5, 61]
+    never = replace(config, grid=replace(config.grid, grow_at=()))
+    assert resized_at(never, ball()) == []
 
 
 def accumulating(config: TrainConfig, *shares: float) -> TrainConfig:

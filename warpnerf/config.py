@@ -241,12 +241,11 @@ class TrainConfig:
     (t / D)^2, or clamped min(1, (t / D)^2), the method of "Floaters No More"."""
     content_distance: float | Literal["auto", "per-camera"] = "auto"
     """D: where gradients reach full strength, scene units; auto: the scene's estimate; per-camera:
-    of each camera's rays the distance of what it sees, for scenes that bring points, and where it
-    is looked for by ``coarse_steps``."""
+    of each camera's rays the distance of what it sees, as points or short trainings tell."""
     coarse_steps: int = 200
-    """Steps, at most, of each of two short trainings on a small grid that find box and content
-    distance where cameras look at no common point and bring no points; 0: none, and these two stay
-    guesses."""
+    """Steps, at most, of a short training on a small grid that finds the content distance of
+    photographs without points; two of them find the box as well where cameras look at no common
+    point. 0: none, and the extent stays what the cameras suggest."""
     jacobian: Jacobian = "none"
     """Whether the scaling takes the contraction's change of volume into account."""
     rays_per_step: int = 4096

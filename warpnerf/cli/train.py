@@ -74,17 +74,15 @@ def train_command(
             that is the same from all sides).
         model_options: Of the model, such as specular=8 width=64 (deferred), features=12
             residual=false threshold=0.0001 (features), degree=2 (sh).
-        steps: Batches of rays to train on; by default as many as the preset says, or as the time
-            limit allows.
-        time_limit: Seconds of training; the schedule is fitted to them.
         loss: What is minimised besides, and how: photometric=huber huber_delta=0.1, and weights of
             distortion=0.01, entropy=0.001, sample_colour=0.1 (not for deferred), near_clip=0.01
             near_clip_distance=0.2.
-        steps: Batches of rays to train on.
-        time_limit: Seconds of training; the schedule is squeezed to fit.
+        steps: Batches of rays to train on; by default as many as the preset says, or as the time
+            limit allows.
+        time_limit: Seconds of training; the schedule is fitted to them.
         scaling: How a sample's gradient depends on its distance from the camera.
         content_distance: Where gradients reach full strength, in the scene's units; per-camera: of
-            each camera what it sees, where the scene brings points.
+            each camera what it sees, as points or a short training tell.
         voxels: Nodes of the final grid, in all; memory goes with their number.
         near: Nothing is sampled nearer to the camera than this, in the scene's units.
         downscale: Average blocks of so many pixels squared; by default 1, as they are.
@@ -202,8 +200,13 @@ def _begin_alone(
     from warpnerf.training.run import Run
 
     if is_needed(scene, config):
-        print("no common focus: looking for how far the cameras see", flush=True)
-    trainer = begin(scene, config)
+        print("looking for how far the cameras see", flush=True)
+        with ProgressBar("first step") as bar:
+            trainer = begin(
+                scene, config, on_progress=lambda found: bar.report(found.fraction, _text(found))
+            )
+    else:
+        trainer = begin(scene, config)
     trained = trainer.scene  # in which box and distance may be other ones
     _describe(trained, trainer.content_distance, config)
     for oddity in oddities(trained, survey(source), trainer.content_distance, config.march.near):
@@ -212,7 +215,7 @@ def _begin_alone(
     with training_page(page, trained, trainer) as session:
         folder = None if masks is None else str(masks.resolve())
         distance = trainer.content_distance
-        found = scene.guessed and not trained.guessed
+        found = trainer.sight is not None
         run.create(trained, _absolute(source), downscale, distance, config, folder, found)
         return _train(run, trained, trainer, session)
 

@@ -25,9 +25,6 @@ from warpnerf.scenes.scene import Scene, find_focus, share_aimed_at, up_directio
 from warpnerf.scenes.survey import Survey, survey
 from warpnerf.scenes.undistort import COEFFICIENTS
 
-MIN_SHARE_AIMED = 0.5
-"""Share of cameras that aim at the focus, below which it is no common one."""
-
 MANY_TIMES = 20.0
 """A content distance so many times the estimate, or as small a part of it, is likely a mistake."""
 
@@ -275,9 +272,7 @@ def oddities(scene: Scene, found: Survey, content_distance: float, near: float) 
 def _focus(cameras: Sequence[Camera]) -> np.ndarray | None:
     """The point that most cameras have in the middle of their image."""
     focus = find_focus(cameras)
-    if focus.guessed or share_aimed_at(cameras, focus.point) < MIN_SHARE_AIMED:
-        return None
-    return focus.point
+    return None if focus.guessed else focus.point
 
 
 def _odd_directions(cameras: Sequence[Camera], known: bool) -> list[str]:

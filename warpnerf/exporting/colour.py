@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from warpnerf.exporting.nodes import nodes_of, voxel_edges
 from warpnerf.exporting.sight import Sight
 from warpnerf.model.grid import FreeCells
+from warpnerf.model.nodes import nodes_of, voxel_edges
 from warpnerf.rendering.field import Field
 from warpnerf.rendering.render import Steps
 

@@ -14,8 +14,8 @@ import numpy as np
 import warp as wp
 from warpnerf_kernels.base.types import real, vec3, vector
 
-from warpnerf.exporting.nodes import values_at
 from warpnerf.model.models import Rgb
+from warpnerf.model.nodes import values_at
 from warpnerf.rendering.field import Field
 from warpnerf.rendering.rays import RayBatch, camera_rays
 from warpnerf.rendering.render import TrainingPass

@@ -19,7 +19,6 @@ import numpy as np
 
 from warpnerf.checks import InputError
 from warpnerf.exporting.colour import colours
-from warpnerf.exporting.nodes import points_of
 from warpnerf.exporting.ply import ply
 from warpnerf.exporting.quaternions import quaternions
 from warpnerf.exporting.sight import Sight
@@ -31,6 +30,7 @@ from warpnerf.exporting.surface import (
     normals_at,
     raw_density,
 )
+from warpnerf.model.nodes import points_of
 from warpnerf.rendering.field import Field
 
 SPREAD = 0.5

@@ -11,8 +11,8 @@ import warp as wp
 
 from warpnerf.checks import InputError, require_at_least, require_positive
 from warpnerf.exporting.colour import colours
-from warpnerf.exporting.nodes import nodes_of, points_of, values_at, voxel_edges
 from warpnerf.exporting.sight import SEEN, Sight
+from warpnerf.model.nodes import nodes_of, points_of, values_at, voxel_edges
 from warpnerf.rendering.field import Field
 
 LEVEL_OPACITY = 0.2

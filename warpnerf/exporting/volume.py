@@ -12,9 +12,9 @@ import warp as wp
 
 from warpnerf.checks import InputError
 from warpnerf.exporting.colour import colours
-from warpnerf.exporting.nodes import nodes_of, points_of
 from warpnerf.exporting.sight import SEEN, Sight
 from warpnerf.exporting.surface import Crop, checked_crop, density, normals_at, raw_density
+from warpnerf.model.nodes import nodes_of, points_of
 from warpnerf.rendering.field import Field
 
 

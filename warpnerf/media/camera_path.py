@@ -12,12 +12,15 @@ import numpy as np
 from warpnerf.checks import InputError, require_one_of, require_positive, require_whole
 from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.fisheye import angle_of
-from warpnerf.scenes.scene import Scene, find_focus, share_aimed_at, up_direction
+from warpnerf.scenes.scene import (
+    MIN_SHARE_AIMED,
+    Scene,
+    find_focus,
+    share_aimed_at,
+    up_direction,
+)
 
 PathKind = Literal["orbit", "through", "back"]
-
-MIN_SHARE_AIMED = 0.75
-"""Share of cameras with the focus in the middle of their image, for a scene to be an object."""
 
 FULL_CIRCLE_GAP = np.radians(100.0)
 """Largest angle without a camera around an object that an orbit still crosses."""

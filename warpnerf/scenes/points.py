@@ -209,21 +209,20 @@ def extent_by_points(
 
 
 def seen_scene(scene: Scene, sight: SeenExtent) -> Scene:
-    """The scene with the extent of what its cameras see, found by training."""
-    edges = " x ".join(f"{edge:.3g}" for edge in sight.box_max - sight.box_min)
+    """The scene with what its cameras see, found by training; its box only where it was a guess."""
+    note = f"content distance {sight.content_distance:.3g}"
+    if scene.guessed:
+        edges = " x ".join(f"{edge:.3g}" for edge in sight.box_max - sight.box_min)
+        note += f" and box of edges {edges}"
     return replace(
         scene,
-        box_min=sight.box_min,
-        box_max=sight.box_max,
+        box_min=sight.box_min if scene.guessed else scene.box_min,
+        box_max=sight.box_max if scene.guessed else scene.box_max,
         content_distance=sight.content_distance,
         content_distances=sight.distances,
         near_content=sight.near_content,
         guessed=False,
-        notes=(
-            *scene.notes,
-            f"content distance {sight.content_distance:.3g} and box of edges {edges} instead: what "
-            "the cameras see, found by two short trainings",
-        ),
+        notes=(*scene.notes, f"{note} instead: what the cameras see, found by a short training"),
     )
 
 

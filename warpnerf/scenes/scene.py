@@ -26,6 +26,10 @@ MIN_LEVEL_SPREAD = 0.02
 MIN_SHARE_IN_FRONT = 0.75
 """Share of cameras that must have the focus in front of them for it to be what they look at."""
 
+MIN_SHARE_AIMED = 0.75
+"""Share of cameras that must have the focus in the middle of their image, for it to be a common
+one."""
+
 MAX_HALF_ANGLE = math.radians(60.0)
 """Of a fisheye lens, for the box of what its images show: their rims are mostly background."""
 
@@ -165,7 +169,7 @@ class Scene:
     where the capture brings no points."""
     guessed: bool = False
     """Whether box and content distance are guesses, because the cameras look at no common point;
-    training then looks for better ones first."""
+    training then looks for a better box first, too, and not only for the content distance."""
     near_content: float | None = None
     """Distance from the cameras within which 1 in 100 of these points lies, scene units."""
     points: np.ndarray | None = None
@@ -280,6 +284,7 @@ def find_focus(cameras: Sequence[Camera]) -> Focus:
 
     Where the axes are parallel, or the point lies behind many cameras because they look outward,
     distance = mean_i |o_i - mean o| and point = mean o + distance * mean d, and ``how`` says so.
+    Where they look in and out, few have the point in the middle of their image: see ``guessed``.
 
     Args:
         cameras: The training cameras, at least two, not all in one place.
@@ -309,7 +314,10 @@ def find_focus(cameras: Sequence[Camera]) -> Focus:
         depths = np.einsum("ni,ni->n", axes, point - centres)
         if np.mean(depths > 0.0) >= MIN_SHARE_IN_FRONT:
             how = "median depth of the point that the training cameras look at"
-            return Focus(point=point, distance=float(np.median(depths)), how=how)
+            few = share_aimed_at(cameras, point) < MIN_SHARE_AIMED
+            if few:
+                how += ", though few of them have it in the middle of their image"
+            return Focus(point=point, distance=float(np.median(depths)), how=how, guessed=few)
         reason = "the training cameras look outward"
     return Focus(
         point=middle + spread * axes.mean(axis=0),

@@ -121,8 +121,8 @@ def load_checkpoint(path: str | Path) -> TrainingState:
         raise InputError(
             f"{path} holds a field but no training to go on with; name a checkpoint, or train anew."
         )
-    if not 0 <= training.grown <= len(training.config.grid.grow_at):
-        _refuse(path, f"a grid cannot have grown {training.grown} times")
+    if not 0 <= training.grown <= 1 + len(training.config.grid.grow_at):
+        _refuse(path, f"a grid cannot have been resized {training.grown} times")
     if not 0 <= training.updates <= training.progress.step:
         _refuse(path, f"{training.updates} updates do not fit {training.progress.step} steps")
     if (training.config.content_distance == "per-camera") != bool(training.content_distances):

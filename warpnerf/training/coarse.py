@@ -1,28 +1,36 @@
-"""Where content is and how far from the cameras, from a short training on a small grid.
+"""How far from the cameras content is, and where, from a short training on a small grid.
 
-Cameras that look outward, or in parallel directions, do not tell, and not every capture brings
-points. So such scenes are trained for a moment, in a box that may be several times too small, with
-all space around it folded in. What half of the light of a ray has met is a point of the scene; what
-points tell, these tell (``warpnerf.scenes.points.seen_extent``). A second round begins with the box
-and the distance of the first.
+Not every capture brings points, and cameras tell little: what they look at is nearer than most of
+what they see, and where they look outward, or in parallel directions, there is no such thing. So
+photographs without points are trained on for a moment, in a box that may be several times too
+small, with all space around it folded in. What half of the light of a ray has met is a point of the
+scene; what points tell, these tell (``warpnerf.scenes.points.seen_extent``).
+
+Where cameras look at a common point, the box stays around that: what lies behind it is seen, too,
+but is not what the box is for. Elsewhere the box is found as well, and a second round begins with
+the box and the distance of the first.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from warpnerf.config import GridConfig, TrainConfig
+from warpnerf.config import TrainConfig
+from warpnerf.model.grid import VoxelGrid
+from warpnerf.model.nodes import points_of
 from warpnerf.rendering.field import Field
 from warpnerf.rendering.rays import camera_rays
+from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.points import SeenExtent, seen_extent
 from warpnerf.scenes.scene import Scene, View
-from warpnerf.training.state import TrainingState
+from warpnerf.training.state import Progress, TrainingState
 from warpnerf.training.trainer import Trainer
 
 ROUNDS = 2
+"""Where cameras look at no common point; elsewhere one."""
 VOXELS = 48**3
 MIN_STEPS = 50
 """Of a round; in fewer nothing has grown yet."""
@@ -41,31 +49,65 @@ OUTSIDE = 0.05
 """Share of what cameras see that may lie outside the box at each face: depths of so short a
 training are rougher than matched points are."""
 
+EMPTY = -200.0
+"""Raw density so low that a few hundred updates do not raise it to anything visible."""
 
-def begin(scene: Scene, config: TrainConfig, resume: TrainingState | None = None) -> Trainer:
-    """A training before its next update, its box and content distance looked for where need be.
+NOTHING_SEEN = (
+    "a short training met nothing opaque: content distance and box stay what the cameras suggest"
+)
+
+
+def begin(
+    scene: Scene,
+    config: TrainConfig,
+    resume: TrainingState | None = None,
+    on_progress: Callable[[Progress], None] | None = None,
+) -> Trainer:
+    """A training before its next update, its extent looked for where need be.
+
+    Args:
+        scene: What is trained on.
+        config: How.
+        resume: Where to go on; what was found then is used again.
+        on_progress: Called while the extent is looked for, with the share of that.
 
     Raises:
         InputError: As for ``Trainer``.
     """
     sight, seconds = None, 0.0
     if resume is None and is_needed(scene, config):
-        sight, seconds = find_sight(scene, config)
+        sight, seconds = find_sight(scene, config, on_progress)
+        if sight is None:
+            scene = replace(scene, notes=(*scene.notes, NOTHING_SEEN))
     return Trainer(scene, config, resume, sight=sight, seconds=seconds)
 
 
 def is_needed(scene: Scene, config: TrainConfig) -> bool:
-    """Whether a scene's extent is a guess, and training long enough to look for a better one."""
+    """Whether a better extent than the scene's is of use, and training long enough to look for it.
+
+    Args:
+        scene: Where it brings points, these tell.
+        config: Where it says a content distance, only a box that is a guess is looked for.
+    """
+    if scene.content_distances is not None or _steps(config) < MIN_STEPS:
+        return False
+    if config.content_distance == "per-camera":
+        return True
     folded = scene.unbounded and config.grid.contraction != "none"
-    return scene.guessed and folded and _steps(config) >= MIN_STEPS
+    return folded and (scene.guessed or config.content_distance == "auto")
 
 
-def find_sight(scene: Scene, config: TrainConfig) -> tuple[SeenExtent | None, float]:
+def find_sight(
+    scene: Scene,
+    config: TrainConfig,
+    on_progress: Callable[[Progress], None] | None = None,
+) -> tuple[SeenExtent | None, float]:
     """Find out what the cameras of a scene see, by short trainings.
 
     Args:
         scene: Its box and content distance are where the first one begins.
         config: Of the training that it is for.
+        on_progress: Called with each report of these, its fraction that of all of them.
 
     Returns:
         What they see, None where nothing opaque has grown; seconds of training, to which compiling
@@ -77,22 +119,46 @@ def find_sight(scene: Scene, config: TrainConfig) -> tuple[SeenExtent | None, fl
         steps=_steps(config),
         time_limit=None if limit is None else TIME_SHARE * limit,
         content_distance="auto" if isinstance(given, str) else given,
-        grid=GridConfig(
-            voxels=min(VOXELS, config.grid.voxels),
-            contraction=config.grid.contraction,
-            grow_at=(),
-        ),
+        grid=replace(config.grid, voxels=min(VOXELS, config.grid.voxels), grow_at=()),
     )
+    rounds = ROUNDS if scene.guessed else 1
     sight, seconds = None, 0.0
-    for _ in range(ROUNDS):
+    for done in range(rounds):
+
+        def report(progress: Progress, done: int = done) -> None:
+            if on_progress is not None:
+                on_progress(replace(progress, fraction=(done + progress.fraction) / rounds))
+
         trainer = Trainer(scene, small, sight=sight)
-        seconds += trainer.run().seconds
+        leave_out_near(trainer.grid, scene.training_cameras, config.march.near)
+        seconds += trainer.run(report).seconds
         found = sight_of(scene, trainer.field())
         del trainer  # its copy of the photographs, before the next one makes its own
         if found is None:
             break
         sight = found
     return sight, seconds
+
+
+def leave_out_near(grid: VoxelGrid, cameras: Sequence[Camera], near: float) -> None:
+    """Empty for good the nodes that lie nearer than the near plane to a camera: it stood there.
+
+    Source: DirectVoxGO, Sun et al. 2022. The camera itself samples nothing there, others would.
+
+    Args:
+        grid: New; its raw densities are changed.
+        cameras: The training cameras.
+        near: Scene units; 0 leaves out nothing.
+    """
+    if near <= 0.0:
+        return
+    points = points_of(grid, np.indices(grid.size).reshape(3, -1).T)
+    within = np.zeros(len(points), bool)
+    for camera in cameras:
+        within |= np.square(points - camera.position).sum(axis=1) < near * near
+    values = grid.values.numpy()
+    values[within, 0] = EMPTY
+    grid.values.assign(values)
 
 
 def _steps(config: TrainConfig) -> int:

@@ -58,7 +58,7 @@ class TrainingState:
     reach: float
     """From the outermost camera to the farthest corner of the first box, scene units."""
     grown: int
-    """How often the grid has grown."""
+    """How often the grid has been resized: its box tightened, or its nodes doubled."""
     updates: int
     """How often the optimiser has updated the grid."""
     progress: Progress

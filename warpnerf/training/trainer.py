@@ -39,6 +39,10 @@ FIRST_LOOK = 200
 so densities must have had time to show."""
 
 
+TIGHTEN_AT = 0.1
+"""Share of the training at which the box of an object is tightened, before the grid first grows."""
+
+
 class Trainer:
     """A training run between two updates: the grid, its optimiser, and what comes next."""
 
@@ -57,7 +61,8 @@ class Trainer:
             scene: What is trained on.
             config: How.
             resume: Where to go on.
-            sight: Gives box and content distances in place of the scene's, for a new training.
+            sight: Gives content distances in place of the scene's, and its box where the scene's is
+                a guess, for a new training.
             seconds: Spent on it so far.
 
         Raises:
@@ -71,6 +76,8 @@ class Trainer:
         self.steps_done = 0
         self._given = scene
         self._scene_digest = None if resume is None else resume.scene_digest
+        self.sight = sight
+        """What a short training has found; None: the scene's own extent is used."""
         if sight is not None:
             scene = seen_scene(scene, sight)
         self.scene = scene
@@ -104,6 +111,7 @@ class Trainer:
             self.workers,
         )
         self._accumulation = config.optim.accumulation(scene.kind)
+        self._resize_at = _resize_at(scene, config)
         self._grown = 0
         self._updates = 0
         assert isinstance(config.model, Model)
@@ -344,8 +352,8 @@ class Trainer:
         )
 
     def _voxels(self, grown: int) -> int:
-        """Nodes after that many growing steps."""
-        left = len(self.config.grid.grow_at) - grown
+        """Nodes after the grid was resized so often."""
+        left = min(len(self._resize_at) - grown, len(self.config.grid.grow_at))
         return max(8, self.config.grid.voxels >> left)
 
     def parameters(self) -> tuple[Parameter, ...]:
@@ -380,8 +388,8 @@ class Trainer:
         )
 
     def _grow(self, fraction: float) -> None:
-        """Carry grid and optimiser over to more nodes, once the schedule says so."""
-        grown = sum(fraction >= at for at in self.config.grid.grow_at)
+        """Carry grid and optimiser over to more or smaller voxels, once the schedule says so."""
+        grown = sum(fraction >= at for at in self._resize_at)
         if grown == self._grown or self.steps_done < FIRST_LOOK:
             return
         box = self._tight_box()
@@ -431,14 +439,27 @@ def _contraction(scene: Scene, config: TrainConfig) -> Contraction:
     return config.grid.contraction
 
 
+def _resize_at(scene: Scene, config: TrainConfig) -> tuple[float, ...]:
+    """Shares of the training at which the grid gets another box or more nodes.
+
+    Around an object much of the first box is empty. What the first steps show of that suffices to
+    spend its nodes elsewhere; they need no training, and no grid, of their own.
+    """
+    grow_at = config.grid.grow_at
+    if scene.kind == "object" and grow_at and grow_at[0] > TIGHTEN_AT:
+        return (TIGHTEN_AT, *grow_at)
+    return grow_at
+
+
 def _content_distances(scene: Scene, config: TrainConfig) -> tuple[float, list[float]]:
     """The content distance of the scene, and those of its training views."""
     chosen, train = config.content_distance, scene.splits["train"]
     if chosen == "per-camera":
         if scene.content_distances is None:
             raise InputError(
-                f"content_distance is per-camera, but {scene.name} has no points that tell what "
-                "each camera sees; use auto, or a number."
+                f"content_distance is per-camera, but {scene.name} brings no points, and no short "
+                "training has found what each camera sees: that takes 500 steps or more, and "
+                "photographs that show something opaque; use auto, or a number."
             )
         return scene.content_distance, [float(scene.content_distances[i]) for i in train]
     one = scene.content_distance if chosen == "auto" else float(chosen)
