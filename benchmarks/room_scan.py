@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from warpnerf.exporting.quaternions import quaternions
 from warpnerf.scenes.builtin.room import first_hit, photograph
 from warpnerf.scenes.camera import Camera
 
@@ -119,7 +120,7 @@ def write_scan(
         depths.append(depth)
         Image.fromarray(rgb).save(folder / f"images/{number:04}.png")
         rotation = (camera.c2w[:, :3] * [1.0, -1.0, -1.0]).T
-        numbers = [*_quaternion(rotation), *(-rotation @ camera.position)]
+        numbers = [*quaternions(rotation[None])[0], *(-rotation @ camera.position)]
         poses += [f"{number + 1} {' '.join(map(repr, map(float, numbers)))} 1 {number:04}.png", ""]
     camera = cameras[0]
     lens = f"{float(camera.fx)} {camera.cx} {camera.cy}"
@@ -170,18 +171,3 @@ def _sees(cameras: list[Camera], point: np.ndarray) -> np.ndarray:
     candidates = np.flatnonzero(inside)
     hits = first_hit(origins[candidates], directions[candidates])
     return candidates[hits >= 0.999 * away[candidates]]
-
-
-def _quaternion(rotation: np.ndarray) -> np.ndarray:
-    """w, x, y, z: the eigenvector of the largest eigenvalue of Bar-Itzhack's matrix (2000)."""
-    r = rotation
-    lower = np.array(
-        [
-            [r[0, 0] - r[1, 1] - r[2, 2], 0.0, 0.0, 0.0],
-            [r[1, 0] + r[0, 1], r[1, 1] - r[0, 0] - r[2, 2], 0.0, 0.0],
-            [r[2, 0] + r[0, 2], r[2, 1] + r[1, 2], r[2, 2] - r[0, 0] - r[1, 1], 0.0],
-            [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], r.trace()],
-        ]
-    )
-    x, y, z, w = np.linalg.eigh(lower)[1][:, -1]
-    return np.array([w, x, y, z])

@@ -179,18 +179,34 @@ class Orbit:
 
 
 def in_a_browser(port: int, rounds: int) -> dict[str, Any]:
-    """From the load event of the page to the panel's word about its first picture."""
-    seconds = []
+    """From the load event of the page to the panel's word about its first picture.
+
+    And on the way: when its scripts have run, so that it connects, and when it says where its
+    camera is, for which a picture can be made.
+    """
+    seconds: dict[str, list[float]] = {"connected": [], "camera": [], "first_picture": []}
     with browser() as chromium:
         for _ in range(rounds):
             page = chromium.new_page(viewport={"width": WIDTH, "height": HEIGHT})
+            connected: list[float] = []
+            said: list[float] = []
+
+            def listen(socket: Any, connected: list[float] = connected, said: Any = said) -> None:
+                connected.append(time.monotonic())
+                socket.on("framesent", lambda _: said.append(time.monotonic()))
+
+            page.on("websocket", listen)
             page.goto(f"http://127.0.0.1:{port}/")
             began = time.monotonic()
             page.get_by_text("pixels").wait_for()
-            seconds.append(time.monotonic() - began)
+            ended = time.monotonic()
+            for name, at in zip(seconds, (connected[0], said[0], ended), strict=True):
+                seconds[name].append(at - began)
             page.close()
-    result = {"first_picture_seconds": median_interval(seconds)}
-    print(f"in a browser, after     {show(result['first_picture_seconds'], 2)} s")
+    result = {f"{name}_seconds": median_interval(values) for name, values in seconds.items()}
+    print(f"in a browser, connects  {show(result['connected_seconds'], 2)} s")
+    print(f"  its camera is known   {show(result['camera_seconds'], 2)} s")
+    print(f"  first picture after   {show(result['first_picture_seconds'], 2)} s")
     return result
 
 

@@ -119,5 +119,5 @@ def test_small_or_unequal_images_are_refused(tmp_path: Path) -> None:
 
 def test_without_torch_it_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(sys.modules, "torch", None)
-    with pytest.raises(InputError, match="pip install torch"):
+    with pytest.raises(InputError, match=r'LPIPS needs torch: pip install "warpnerf\[torch\]"'):
         Lpips(tmp_path / "weights.pth")

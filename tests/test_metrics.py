@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 from flip_evaluator import evaluate
@@ -80,8 +82,10 @@ def test_flip_is_that_of_its_package() -> None:
 
 
 def test_flip_without_its_package_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("warpnerf.evaluation.metrics.has_flip", lambda: False)
-    with pytest.raises(InputError, match="pip install flip-evaluator"):
+    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
+    with pytest.raises(
+        InputError, match=r'FLIP needs flip_evaluator: pip install "warpnerf\[metrics\]"'
+    ):
         flip(np.zeros((12, 12, 3)), np.zeros((12, 12, 3)))
 
 

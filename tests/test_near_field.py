@@ -15,7 +15,6 @@ from warpnerf.evaluation.near_field import (
     MAX_PIXELS,
     MAX_PULLED,
     measure_near_field,
-    pulled_back,
 )
 from warpnerf.model.grid import FreeCells
 from warpnerf.rendering.field import Field
@@ -114,7 +113,7 @@ def test_pulled_back_cameras_see_what_their_photographs_show() -> None:
 def test_moving_back_leaves_the_camera_as_it_was() -> None:
     camera = scene_inside().views[0].camera
     before = camera.c2w.copy()
-    pulled_back(camera, 2.0)
+    camera.moved_back(2.0)
     np.testing.assert_array_equal(camera.c2w, before)
 
 

@@ -11,7 +11,7 @@ from PIL import ExifTags, Image
 from tiny_scenes import picture
 
 from warpnerf.checks import InputError
-from warpnerf.sfm.photographs import Photograph, put_into, read_photographs
+from warpnerf.sfm.photographs import UnposedPhotograph, put_into, read_photographs
 
 
 def photograph(
@@ -80,7 +80,7 @@ def test_damaged_exif_is_none(tmp_path: Path) -> None:
     place = raw.index(b"Exif\0\0") + 6
     raw[place : place + 16] = b"\xff" * 16
     path.write_bytes(raw)
-    found: Photograph = read_photographs([path] * 3, lenses="auto", masks=None)[0]
+    found: UnposedPhotograph = read_photographs([path] * 3, lenses="auto", masks=None)[0]
     assert found.up == (0, 1) and found.lens == 0
 
 

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from warpnerf.checks import InputError
+from warpnerf.checks import InputError, require_extra
 
 SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
@@ -164,10 +164,9 @@ class Lpips:
 
 def _read(path: Path) -> dict[str, Any]:
     """The tensors in a file, by name."""
-    try:
-        import torch
-    except ImportError as error:
-        raise InputError("LPIPS needs torch; install it with: pip install torch.") from error
+    require_extra("torch", "torch", "LPIPS")
+    import torch
+
     try:
         if path.suffix == ".safetensors":
             from safetensors.torch import load_file

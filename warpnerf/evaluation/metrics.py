@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from warpnerf.checks import InputError
+from warpnerf.checks import InputError, require_extra
 
 SSIM_WINDOW = 11
 """Pixels along the edge of SSIM's window."""
@@ -101,8 +101,7 @@ def flip(rgb: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None) ->
         InputError: Shapes differ, a value is not finite, or the package is not installed.
     """
     a, b = _checked(rgb, target)
-    if not has_flip():
-        raise InputError("FLIP needs its package; install it with: pip install flip-evaluator.")
+    require_extra("flip_evaluator", "metrics", "FLIP")
     from flip_evaluator import evaluate
 
     a = alike_where_masked(a, b, mask)

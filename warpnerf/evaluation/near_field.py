@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from warpnerf.evaluation.metrics import psnr
-from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.scene import Scene
 
 if TYPE_CHECKING:
@@ -114,13 +113,6 @@ def ends_within(seen: Rendering, distance: float) -> np.ndarray:
     return np.asarray((seen.opacity >= 0.5) & (seen.depth < distance * seen.opacity))
 
 
-def pulled_back(camera: Camera, distance: float) -> Camera:
-    """The camera moved straight back, scene units."""
-    c2w = camera.c2w.copy()
-    c2w[:, 3] -= distance * camera.forward
-    return replace(camera, c2w=c2w)
-
-
 def pulled_psnr(field: Field, scene: Scene) -> list[float]:
     """PSNR of training cameras moved straight back, where the scene can be photographed from there.
 
@@ -132,7 +124,7 @@ def pulled_psnr(field: Field, scene: Scene) -> list[float]:
     values = []
     cameras = scene.training_cameras
     for camera in cameras[:: math.ceil(len(cameras) / MAX_PULLED)]:
-        moved = pulled_back(camera, PULLED_SHARE * scene.content_distance)
+        moved = camera.moved_back(PULLED_SHARE * scene.content_distance)
         image = scene.photograph(moved)
         if image is not None:
             values.append(psnr(np.clip(field.render(moved).rgb, 0.0, 1.0), image / 255.0))

@@ -85,13 +85,12 @@ def camera_path(
         poses = _orbit(cameras, n_frames)
     else:
         poses = _through(cameras, n_frames, scene.content_distance)
+    path = [replace(lens, c2w=pose) for pose in poses]
     if kind == "back":
         end = BACK_SHARE * scene.content_distance if distance is None else distance
-        poses = [
-            backed_away(pose, end * share)
-            for pose, share in zip(poses, _eased(n_frames), strict=True)
-        ]
-    return [replace(lens, c2w=pose) for pose in poses]
+        shares = _eased(n_frames)
+        path = [camera.moved_back(end * s) for camera, s in zip(path, shares, strict=True)]
+    return path
 
 
 def backing_away(camera: Camera, distance: float, n_frames: int) -> list[Camera]:
@@ -102,16 +101,7 @@ def backing_away(camera: Camera, distance: float, n_frames: int) -> list[Camera]
         distance: How far it gets, scene units.
         n_frames: How many cameras.
     """
-    return [
-        replace(camera, c2w=backed_away(camera.c2w, distance * share)) for share in _eased(n_frames)
-    ]
-
-
-def backed_away(c2w: np.ndarray, distance: float) -> np.ndarray:
-    """A pose [3, 4] moved against its viewing direction, by a distance in scene units."""
-    moved = c2w.copy()
-    moved[:, 3] += distance * c2w[:, 2]
-    return moved
+    return [camera.moved_back(distance * share) for share in _eased(n_frames)]
 
 
 def path_lens(cameras: Sequence[Camera], size: tuple[int, int] | None) -> Camera:

@@ -156,6 +156,12 @@ class Camera:
         jacobian += bend[:, None, None] * points[:, :, None] * points[:, None, :]
         return points * scale[:, None], jacobian
 
+    def moved_back(self, distance: float) -> Camera:
+        """The camera moved straight back, by a distance in scene units."""
+        c2w = self.c2w.copy()
+        c2w[:, 3] -= distance * self.forward
+        return replace(self, c2w=c2w)
+
     def block_for(self, n_pixels: int) -> int:
         """Edge of the smallest blocks of which ``downscaled`` makes at most so many pixels.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
-from warpnerf.checks import InputError
+from warpnerf.checks import InputError, require_extra
 from warpnerf.scenes.contents import NEEDED
 
 if TYPE_CHECKING:
@@ -44,10 +43,7 @@ def sharp_frames(
         InputError: It is no video, is damaged, or too short; or PyAV is missing.
         OSError: The folder cannot be written.
     """
-    if importlib.util.find_spec("av") is None:
-        raise InputError(
-            f'{video}: reading a video needs PyAV; `pip install "warpnerf[sfm]"` brings it.'
-        )
+    require_extra("av", "sfm", f"{video}: reading a video")
     import av
 
     folder.mkdir(parents=True, exist_ok=True)

@@ -39,7 +39,7 @@ the picture's first column that shows the top in 5 and 6, its last one in 7 and 
 
 
 @dataclass(frozen=True, kw_only=True)
-class Photograph:
+class UnposedPhotograph:
     """One photograph, before its pose is known."""
 
     path: Path
@@ -55,7 +55,7 @@ class Photograph:
 
 def read_photographs(
     paths: Sequence[Path], *, lenses: Lenses, masks: Path | None
-) -> list[Photograph]:
+) -> list[UnposedPhotograph]:
     """Look at photographs: whether each is whole, and what it says of its lens.
 
     Args:
@@ -92,7 +92,7 @@ def read_photographs(
         size = image_size(path)
         key = {"auto": (size, read_exif(path, _camera)), "one": "one", "each": number}[lenses]
         photographs.append(
-            Photograph(
+            UnposedPhotograph(
                 path=path,
                 size=size,
                 lens=keys.setdefault(key, len(keys)),

@@ -34,7 +34,7 @@ from warpnerf.scenes.undistort import COEFFICIENTS
 from warpnerf.sfm import scene_files
 from warpnerf.sfm.config import Lenses, PoseConfig
 from warpnerf.sfm.frames import sharp_frames
-from warpnerf.sfm.photographs import Photograph, put_into, read_photographs
+from warpnerf.sfm.photographs import UnposedPhotograph, put_into, read_photographs
 from warpnerf.sfm.summary import WELL_COVERED, Posing, nothing_placed, summary
 from warpnerf.sfm.worker import estimate, require_pycolmap
 
@@ -247,7 +247,7 @@ def _into_scene(
 
 
 def _job(
-    photographs: Sequence[Photograph], config: PoseConfig, matching: str, prepared: Path
+    photographs: Sequence[UnposedPhotograph], config: PoseConfig, matching: str, prepared: Path
 ) -> dict[str, Any]:
     """What ``sfm.mapping`` is asked to do; masks are put where COLMAP looks for them."""
     shared = Counter(p.lens for p in photographs)
@@ -287,7 +287,7 @@ def _camera_model(asked: str, sharing: int) -> str:
 
 
 def _notes(
-    source: Path, photographs: Sequence[Photograph], matching: str, is_video: bool
+    source: Path, photographs: Sequence[UnposedPhotograph], matching: str, is_video: bool
 ) -> Iterator[str]:
     """What is unusual about the photographs, a sentence each."""
     unread = [] if is_video else unread_photographs(source)
@@ -312,7 +312,7 @@ def _write(
     posing: Posing,
     found: dict[str, Any],
     in_scene: dict[Path, str],
-    photographs: Sequence[Photograph],
+    photographs: Sequence[UnposedPhotograph],
     made_of: dict[str, Any],
 ) -> None:
     """Write transforms.json and pose.json."""

@@ -10,7 +10,7 @@ from typing import Any
 from warpnerf.scenes.contents import NEEDED
 from warpnerf.scenes.files import printable
 from warpnerf.scenes.undistort import COEFFICIENTS
-from warpnerf.sfm.photographs import Photograph
+from warpnerf.sfm.photographs import UnposedPhotograph
 
 WELL_COVERED = 10
 """Photographs from which on a scene and its lens are well known."""
@@ -57,7 +57,9 @@ class Posing:
         return "\n".join([*lines, *(f"  note: {note}" for note in self.notes)])
 
 
-def summary(folder: Path, photographs: Sequence[Photograph], found: Mapping[str, Any]) -> Posing:
+def summary(
+    folder: Path, photographs: Sequence[UnposedPhotograph], found: Mapping[str, Any]
+) -> Posing:
     """Put what ``sfm.mapping`` found into words.
 
     Args:

@@ -16,7 +16,7 @@ from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any, TextIO
 
-from warpnerf.checks import InputError
+from warpnerf.checks import require_extra
 from warpnerf.scenes.files import printable
 
 COUNTED = {"features": "descriptors", "matches": "two_view_geometries"}
@@ -132,11 +132,7 @@ def require_pycolmap() -> None:
     Raises:
         InputError: It is not installed.
     """
-    if not is_installed():
-        raise InputError(
-            'poses are estimated by pycolmap, which is not installed; `pip install "warpnerf[sfm]"`'
-            " brings it."
-        )
+    require_extra("pycolmap", "sfm", "estimating poses")
 
 
 def _path() -> str:
