@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 import warp as wp
+from drive_losses import LOSSES
 from warpnerf_kernels.base import precision
 
 from warpnerf.model.interface import Model
@@ -57,6 +58,10 @@ def test_every_kernel_compiles_for_cuda(
             assembly.render_backward_kernel(variant),
             assembly.render_train_kernel(variant),
         ]
+    if isinstance(model, Rgb):
+        losses = LOSSES["all"]
+        variant = variant_of(model, name, "none", "clamped", "none", packed=False, losses=losses)
+        kernels.append(assembly.render_train_kernel(variant))
     modules = [kernel.module for kernel in kernels]
     if isinstance(model, Rgb):
         modules += [wp.get_module(precision.load(name, module).__name__) for module in SHARED]

@@ -40,6 +40,14 @@ def test_values_and_gradients_against_autograd(name: str, kernels64: Kernels) ->
             assert np.abs(ours - without).max() > 1e-3 * np.abs(without).max()
 
 
+def test_distortion_where_colours_are_right(kernels64: Kernels) -> None:
+    """What lies behind a sample is then bounded by the loss alone."""
+    for seed in range(4):
+        p = problem_with(LOSSES["distortion"], seed)
+        p = replace(p, target=kernels64.forward(p).rgb)
+        assert_close(kernels64.train(p)[1], oracle_minimised(p)[1], 1e-7)
+
+
 @pytest.mark.parametrize("name", ["huber", "distortion", "entropy", "near_clip"])
 def test_gradients_against_central_differences(name: str, kernels64: Kernels) -> None:
     """Of the others weights are constants, which differences do not know."""
