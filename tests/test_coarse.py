@@ -182,6 +182,10 @@ def test_where_nothing_opaque_grows_the_guess_stays(monkeypatch: pytest.MonkeyPa
         begin(scene, replace(SHORT, content_distance="per-camera"))
 
 
+def test_too_little_time_finds_nothing() -> None:
+    assert find_sight(guessed_scene(), replace(SHORT, time_limit=0.01))[0] is None
+
+
 @pytest.mark.parametrize(("guessed", "rounds"), [(True, 2), (False, 1)])
 def test_progress_counts_all_rounds(guessed: bool, rounds: int) -> None:
     fractions: list[float] = []

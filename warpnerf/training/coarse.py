@@ -33,11 +33,11 @@ ROUNDS = 2
 """Where cameras look at no common point; elsewhere one."""
 VOXELS = 48**3
 MIN_STEPS = 50
-"""Of a round; in fewer nothing has grown yet."""
+"""Of a round; after fewer nothing has settled, and distances come out several times too large."""
 STEPS_SHARE = 0.1
 """Of a training's steps, that a round takes at most."""
-TIME_SHARE = 0.06
-"""The same of its time limit."""
+TIME_SHARE = 0.12
+"""The same of its time limit, all rounds together."""
 
 RAYS = 128
 """Of each camera, at most."""
@@ -53,7 +53,8 @@ EMPTY = -200.0
 """Raw density so low that a few hundred updates do not raise it to anything visible."""
 
 NOTHING_SEEN = (
-    "a short training met nothing opaque: content distance and box stay what the cameras suggest"
+    "a short training met nothing opaque, or had too little time: content distance and box stay "
+    "what the cameras suggest"
 )
 
 
@@ -110,18 +111,18 @@ def find_sight(
         on_progress: Called with each report of these, its fraction that of all of them.
 
     Returns:
-        What they see, None where nothing opaque has grown; seconds of training, to which compiling
-        and looking at depths do not count.
+        What they see, None where nothing opaque has grown or time was too short; seconds of
+        training, to which compiling and looking at depths do not count.
     """
     limit, given = config.time_limit, config.content_distance
+    rounds = ROUNDS if scene.guessed else 1
     small = replace(
         config,
         steps=_steps(config),
-        time_limit=None if limit is None else TIME_SHARE * limit,
+        time_limit=None if limit is None else TIME_SHARE * limit / rounds,
         content_distance="auto" if isinstance(given, str) else given,
         grid=replace(config.grid, voxels=min(VOXELS, config.grid.voxels), grow_at=()),
     )
-    rounds = ROUNDS if scene.guessed else 1
     sight, seconds = None, 0.0
     for done in range(rounds):
 
@@ -132,7 +133,8 @@ def find_sight(
         trainer = Trainer(scene, small, sight=sight)
         leave_out_near(trainer.grid, scene.training_cameras, config.march.near)
         seconds += trainer.run(report).seconds
-        found = sight_of(scene, trainer.field())
+        done_enough = trainer.steps_done >= MIN_STEPS
+        found = sight_of(scene, trainer.field()) if done_enough else None
         del trainer  # its copy of the photographs, before the next one makes its own
         if found is None:
             break

@@ -458,8 +458,8 @@ def _content_distances(scene: Scene, config: TrainConfig) -> tuple[float, list[f
         if scene.content_distances is None:
             raise InputError(
                 f"content_distance is per-camera, but {scene.name} brings no points, and no short "
-                "training has found what each camera sees: that takes 500 steps or more, and "
-                "photographs that show something opaque; use auto, or a number."
+                "training has found what each camera sees: that takes 500 steps or more, time for "
+                "them, and photographs that show something opaque; use auto, or a number."
             )
         return scene.content_distance, [float(scene.content_distances[i]) for i in train]
     one = scene.content_distance if chosen == "auto" else float(chosen)
