@@ -57,7 +57,7 @@ def test_help_names_every_option() -> None:
     assert code == 0
     options = ["output", "steps", "time-limit", "scaling", "content-distance", "near", "downscale"]
     more = ["device", "threads", "seed", "preset", "voxels", "resume", "checkpoint-every"]
-    more += ["model", "model-options", "overwrite"]
+    more += ["model", "model-options", "loss", "overwrite"]
     for option in [*options, *more]:
         assert f"--{option}" in out
     code, out, _ = run("eval", "--help")
