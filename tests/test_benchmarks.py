@@ -331,6 +331,16 @@ def test_schedules(tmp_path):
 
 
 @pytest.mark.slow
+def test_distances(tmp_path):
+    options = ("room-inward", "--views", "9", "--model", "rgb", "--threads", "1")
+    record, printed = run("distances.py", tmp_path / "record.json", *options)
+    (row,) = record["rows"]
+    assert 2.0 < row["true"] < 3.5 and not row["box_found"]
+    assert row["cameras"] < 0.8 * row["true"] and 0.5 < row["found"] / row["true"] < 2.0
+    assert f"{row['found']:.3g}" in printed and f"{row['true']:.3g}" in printed
+
+
+@pytest.mark.slow
 def test_tightening(tmp_path):
     scene = tmp_path / "scene"
     scene.mkdir()

@@ -307,7 +307,7 @@ def test_a_resumed_training_keeps_them(tmp_path: Path) -> None:
 
 def test_they_are_asked_for_where_there_are_none() -> None:
     scene = replace(scene_of_two_distances(), content_distances=None)
-    with pytest.raises(InputError, match=r"tiny has no points that tell .* use auto, or a"):
+    with pytest.raises(InputError, match=r"tiny brings no points, .* use auto, or a"):
         Trainer(scene, PER_CAMERA)
     for wrong in (np.ones(5), np.array([1.0, 2.0, 3.0, 0.0, 1.0, 1.0])):
         with pytest.raises(InputError, match="content_distances must be one above 0 for each of 6"):
