@@ -22,13 +22,22 @@ from warpnerf.checks import InputError
 from warpnerf.config import MAX_VOXELS, TRAINING_BYTES, Contraction
 from warpnerf.runtime.memory import usable_memory
 from warpnerf.runtime.parallel import NODES, Workers
+from warpnerf.scenes.frustum import Frustum
 
-CONTRACTIONS = {"none": contraction.NONE, "linf": contraction.LINF, "l2": contraction.L2}
+CONTRACTIONS = {
+    "none": contraction.NONE,
+    "linf": contraction.LINF,
+    "l2": contraction.L2,
+    "ndc": contraction.NDC,
+}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class VoxelGrid:
-    """A dense grid [X, Y, Z] of raw values, z fastest, nodes on the box's faces."""
+    """A dense grid [X, Y, Z] of raw values, z fastest, nodes on the box's faces.
+
+    Box and lengths are in scene units, but in coordinates of the frustum where there is one.
+    """
 
     values: wp.array
     """[X * Y * Z] vectors: raw density, raw features, padding to a power of two."""
@@ -46,6 +55,13 @@ class VoxelGrid:
     """sigma = density_scale softplus(raw density + density_shift)."""
     density_scale: float = 1.0
     """1 / scene unit."""
+    frustum: Frustum | None = None
+    """Whose coordinates the box has, with ndc."""
+
+    @property
+    def folded(self) -> bool:
+        """Whether space outside the box is folded in."""
+        return self.contraction in ("linf", "l2")
 
     @property
     def voxel_size(self) -> np.ndarray:
@@ -70,8 +86,21 @@ class VoxelGrid:
 
     @cached_property
     def box(self) -> Box:
-        """Its box as kernels take it."""
+        """Its box as kernels take it that do not follow rays."""
         return box_struct(types, self.box_min, self.box_max, self.border)
+
+    def box_between(self, near: float, far: float) -> Box:
+        """Its box as kernels take it, for rays from near to far.
+
+        Args:
+            near: Nothing is sampled nearer to their origins, scene units; for boxes in a frustum,
+                as those in the scene leave that to the steps.
+            far: Nor at this distance or beyond.
+        """
+        box = box_struct(types, self.box_min, self.box_max, self.border)
+        if self.frustum is not None:
+            box.frustum = frustum_struct(types, self.frustum, near, far)
+        return box
 
     @cached_property
     def density(self) -> Density:
@@ -140,6 +169,16 @@ def box_struct(types: ModuleType, box_min: np.ndarray, box_max: np.ndarray, bord
     box.half = types.vec3(*(0.5 * (box_max - box_min)))
     box.border = border
     return box
+
+
+def frustum_struct(types: ModuleType, frustum: Frustum, near: float, far: float) -> Any:
+    """A kernel's Frustum, in the precision of the given ``warpnerf_kernels.base.types``."""
+    struct = types.Frustum()
+    struct.origin = types.vec3(*frustum.origin)
+    struct.axes = types.mat33(*frustum.axes.ravel())
+    struct.near, struct.depth = frustum.near, frustum.depth
+    struct.begin, struct.end = near, far
+    return struct
 
 
 def density_struct(types: ModuleType, shift: float, scale: float) -> Any:
