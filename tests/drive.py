@@ -113,7 +113,6 @@ def in_frustum(problem: Problem, seed: int = 0) -> Problem:
     rng = np.random.default_rng(300 + seed)
     axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     axes *= np.sign(np.linalg.det(axes))
-    axes[2] *= -1.0  # left-handed: right, up, forward
     origin = 0.2 * rng.normal(size=3) - 1.4 * axes[2]
     return replace(
         problem,

@@ -31,6 +31,9 @@ CONTRACTIONS = {
     "ndc": contraction.NDC,
 }
 
+SHOWN = 8.0
+"""Depth, in near planes of a frustum, to which a box around it reaches: the rest is background."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class VoxelGrid:
@@ -70,8 +73,20 @@ class VoxelGrid:
         return extent / (np.array(self.size) - 1)
 
     @property
+    def surroundings(self) -> tuple[np.ndarray, np.ndarray]:
+        """Corners, [3] scene units, of a box around what it holds: its own, or around a frustum."""
+        if self.frustum is None:
+            return self.box_min, self.box_max
+        high = self.box_max.copy()
+        high[2] = min(high[2], self.frustum.depth * (1.0 - 1.0 / SHOWN))
+        ends = np.stack([self.box_min, high])
+        corners = np.stack(np.meshgrid(*ends.T), axis=-1).reshape(-1, 3)
+        points = self.frustum.to_scene(corners)
+        return points.min(axis=0), points.max(axis=0)
+
+    @property
     def diagonal(self) -> float:
-        """Of the box, scene units."""
+        """Of the box, in its units."""
         return float(np.linalg.norm(self.box_max - self.box_min))
 
     @property
@@ -241,6 +256,20 @@ def _cells(grid: VoxelGrid) -> tuple[int, int, int]:
     return x, y, z
 
 
+def _cells_within(
+    grid: VoxelGrid, size: tuple[int, int, int], low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    """Which cells of a grid in a frustum lie in a box of the scene, with all corners: [*size]."""
+    assert grid.frustum is not None
+    shares = [np.arange(n + 1) / n for n in size]
+    corners = np.stack(np.meshgrid(*shares, indexing="ij"), axis=-1)
+    points = grid.frustum.to_scene(grid.box_min + corners * (grid.box_max - grid.box_min))
+    inside = ((low <= points) & (points <= high)).all(axis=-1)
+    for axis, n in enumerate(size):
+        inside = np.take(inside, np.arange(n), axis) & np.take(inside, np.arange(1, n + 1), axis)
+    return np.asarray(inside)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FreeCells:
     """Which cells of a grid's domain hold nothing visible: distances to the nearest that does."""
@@ -354,13 +383,17 @@ class FreeCells:
         size = _cells(grid)
         occupied = self.distance.numpy() == 0
         occupied = np.ones(size, bool) if self.size != size else occupied.reshape(size)
-        share = np.stack([low, high] - grid.box_min) / (grid.box_max - grid.box_min)
-        # The box's share of the domain, whose border lies around it.
-        share = 0.5 + (share - 0.5) / (1.0 + grid.border)
-        for axis, n in enumerate(size):
-            edges = np.arange(n + 1) / n
-            inside = (share[0, axis] <= edges[:-1] + 1e-6) & (edges[1:] - 1e-6 <= share[1, axis])
-            occupied = occupied & np.expand_dims(inside, [a for a in range(3) if a != axis])
+        if grid.frustum is not None:
+            occupied = occupied & _cells_within(grid, size, low, high)
+        else:
+            share = np.stack([low, high] - grid.box_min) / (grid.box_max - grid.box_min)
+            # The box's share of the domain, whose border lies around it.
+            share = 0.5 + (share - 0.5) / (1.0 + grid.border)
+            for axis, n in enumerate(size):
+                edges = np.arange(n + 1) / n
+                inside = share[0, axis] <= edges[:-1] + 1e-6
+                inside &= edges[1:] - 1e-6 <= share[1, axis]
+                occupied = occupied & np.expand_dims(inside, [a for a in range(3) if a != axis])
         distance = np.where(occupied, 0, int(occupancy.FAR) + 1).astype(np.uint8)
         there = wp.array(distance.ravel(), dtype=wp.uint8, device=workers.device)
         return FreeCells._around(there, size, grid.border, workers)

@@ -41,7 +41,7 @@ class Frustum:
     origin: np.ndarray
     """[3] centre of projection, scene units."""
     axes: np.ndarray
-    """[3, 3] unit vectors in rows: right, up, forward."""
+    """[3, 3] unit vectors in rows: right, down, forward."""
     near: float
     """n, scene units."""
     depth: float = 1.0
@@ -61,12 +61,20 @@ class Frustum:
         return np.stack([x / w, y / w, self.depth * (1.0 - self.near / w)], axis=-1)
 
     def to_scene(self, coordinates: np.ndarray) -> np.ndarray:
-        """Points of coordinates [..., 3], the inverse of ``to_ndc``; [..., 3] scene units."""
+        """Points of coordinates, the inverse of ``to_ndc``.
+
+        Args:
+            coordinates: [..., 3]
+
+        Returns:
+            [..., 3] scene units; not finite from the depth of what is infinitely far on.
+        """
         e = np.asarray(coordinates, np.float64)
         with np.errstate(divide="ignore"):
             w = self.near / np.maximum(1.0 - e[..., 2] / self.depth, 0.0)
-        local = np.stack([e[..., 0] * w, e[..., 1] * w, w], axis=-1)
-        return self.origin + local @ self.axes
+        with np.errstate(invalid="ignore"):
+            local = np.stack([e[..., 0] * w, e[..., 1] * w, w], axis=-1)
+            return self.origin + local @ self.axes
 
     def depths(self, points: np.ndarray) -> np.ndarray:
         """w of points [..., 3], scene units."""
@@ -109,7 +117,7 @@ def fit_frustum(
     up = _unit(up - (up @ forward) * forward)
     frustum = Frustum(
         origin=np.mean([c.position for c in cameras], axis=0),
-        axes=np.stack([np.cross(forward, up), up, forward]),
+        axes=np.stack([np.cross(forward, up), -up, forward]),
         near=1.0,
     )
     frustum = replace(frustum, near=MARGIN * _nearest(scene, frustum))

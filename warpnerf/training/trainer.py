@@ -83,8 +83,7 @@ class Trainer:
             scene = seen_scene(scene, sight)
         self.scene = scene
         """What it trains on, with the extent that a new training begins with."""
-        if _contraction(scene, config) != "ndc":
-            _require_samples(scene, config)
+        _require_samples(scene, config)
         if resume is None:
             self.content_distance, distances = _content_distances(scene, config)
             self._reach = _reach(scene)
@@ -483,6 +482,8 @@ def _require_samples(scene: Scene, config: TrainConfig) -> None:
     begin = float(np.linalg.norm(outside, axis=1).min())
     end = float(np.linalg.norm(across, axis=1).max())
     march = config.march
+    if _contraction(scene, config) == "ndc":
+        return  # the frustum begins before all content, and ends far behind it
     if _contraction(scene, config) != "none":
         begin = 0.0  # space outside the box is sampled too
     if march.near >= end:

@@ -54,7 +54,7 @@ class Frustum:
     """The frame of normalised device coordinates, see space.ndc; not used in others."""
 
     origin: vec3  # centre of projection, scene units
-    axes: mat33  # rows: right, up, forward
+    axes: mat33  # rows: right, down, forward
     near: real  # depth of the near plane, scene units
     depth: real  # z of what is infinitely far
     begin: real  # nothing is sampled nearer to the ray's origin than this, scene units

@@ -1,6 +1,6 @@
 """Normalised device coordinates: space before a plane as a box, for forward-facing captures.
 
-With (x, y, w) a point in the frame of the frustum (right, up, forward), n its near plane:
+With (x, y, w) a point in the frame of the frustum (right, down, forward), n its near plane:
 
     e = (x / w, y / w, depth (1 - n / w))        from w = n, e_z = 0, to infinity, e_z = depth
 
