@@ -38,13 +38,6 @@ MUTANTS = [
         "line.t += (frustum.near - p[2]) / line.slope",
         PLAIN,
     ),
-    Mutant(
-        "ndc: rays that turn away",
-        "space/ndc.py",
-        "    if line.w < frustum.near:\n        velocity = vec3()\n",
-        "    if line.w < real(-1.0e9):\n        velocity = vec3()\n",
-        PLAIN,
-    ),
     Mutant("ndc: across without perspective", "space/ndc.py", "d[0] - p[0] * share", "d[0]", PLAIN),
     Mutant(
         "ndc: sign of the perspective",

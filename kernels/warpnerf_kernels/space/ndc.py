@@ -31,7 +31,7 @@ LEAST = 0.5 / FARTHEST
 def enter(frustum: Frustum, origin: vec3, direction: vec3):
     """Where a ray passes the near plane, or begins beyond it: its line, e_0 and its direction in e.
 
-    Of a ray that never does, the direction is 0.
+    A ray that never does is outside all along: before the near plane, or behind the far one.
     """
     line = Line()
     p = frustum.axes * (origin - frustum.origin)
@@ -47,10 +47,7 @@ def enter(frustum: Frustum, origin: vec3, direction: vec3):
     share = line.slope / line.w
     velocity = vec3(d[0] - p[0] * share, d[1] - p[1] * share, frustum.depth * frustum.near * share)
     line.speed = wp.length(velocity)
-    if line.w < frustum.near:
-        velocity = vec3()
-    else:
-        velocity /= line.speed
+    velocity /= line.speed
     place = vec3(p[0] / line.w, p[1] / line.w, frustum.depth * (real(1.0) - frustum.near / line.w))
     return line, place, velocity
 
