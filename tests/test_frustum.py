@@ -15,11 +15,11 @@ from tiny_scenes import look_at, picture
 import warpnerf as wn
 from warpnerf.checks import InputError
 from warpnerf.exporting.export import export
-from warpnerf.exporting.nodes import nodes_of, points_of
 from warpnerf.exporting.sight import look
 from warpnerf.exporting.splats import splats_of
 from warpnerf.exporting.surface import extract_surface
 from warpnerf.exporting.volume import volume_of
+from warpnerf.model.nodes import nodes_of, points_of
 from warpnerf.rendering.rays import camera_rays
 from warpnerf.runtime.parallel import Workers
 from warpnerf.scenes.frustum import FARTHEST, fit_frustum

@@ -52,7 +52,7 @@ class GridConfig:
     contraction: Literal["auto", "none", "linf", "l2", "ndc"] = "auto"
     """How space outside the box is folded in; auto: linf for unbounded scenes, else none. ndc: the
     grid lies in normalised device coordinates instead, for cameras that look the same way."""
-    planes: int = 128
+    planes: int = 64
     """Nodes of the final grid along the depth of normalised device coordinates; with ndc only."""
     border: float = 0.2
     """Width of the shell that holds space outside the box, in half edges of the box; (0, 1]."""

@@ -167,12 +167,11 @@ MUTANTS = [
         "if (contraction == 0) {",
         f"{EQUAL}[ndc]",
     ),
-    # walk_packs.py
     Mutant(
         "packs, ndc: lengths of losses in its own units",
-        "volume/walk_packs.py",
-        "length = length_of(ray, t, packs[slot].dt[lane], contraction)\n                state",
-        "length = packs[slot].dt[lane]\n                state",
+        "sampling/traversal.py",
+        "    length *= w * w / (ray.line.w * ray.line.speed);\n",
+        "",
         LOSSES,
     ),
 ]
