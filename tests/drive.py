@@ -12,7 +12,13 @@ import warp as wp
 from numpy.typing import NDArray
 from warpnerf_kernels.base import precision, tiles
 
-from warpnerf.model.grid import box_struct, density_struct, free_struct, grid_struct
+from warpnerf.model.grid import (
+    box_struct,
+    density_struct,
+    free_struct,
+    frustum_struct,
+    grid_struct,
+)
 from warpnerf.model.interface import Model
 from warpnerf.model.models import Rgb
 from warpnerf.rendering.adjoint import AdjointLaunch, gradient_struct
@@ -26,6 +32,7 @@ from warpnerf.rendering.render import (
     variant_of,
 )
 from warpnerf.runtime.parallel import Workers
+from warpnerf.scenes.frustum import Frustum
 
 Float64 = NDArray[np.float64]
 
@@ -58,6 +65,7 @@ class Problem:
     content_distance: Float64 = field(default_factory=lambda: np.array([1.0]))  # likewise
     contraction: str = "none"
     border: float = 0.0
+    frustum: Frustum | None = None  # with ndc: box_min and box_max are in its coordinates
     density_shift: float = 0.3
     density_scale: float = 1.0
     free: NDArray[np.uint8] = field(default_factory=none_free)  # [MX, MY, MZ] distances, cells
@@ -100,8 +108,26 @@ def make_problem(
     return replace(problem, **changes)
 
 
+def in_frustum(problem: Problem, seed: int = 0) -> Problem:
+    """The same rays through a grid in a turned frustum: they go away, come back, and pass by."""
+    rng = np.random.default_rng(300 + seed)
+    axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    axes *= np.sign(np.linalg.det(axes))
+    origin = 0.2 * rng.normal(size=3) - 1.4 * axes[2]
+    return replace(
+        problem,
+        contraction="ndc",
+        frustum=Frustum(origin=origin, axes=axes, near=0.6, depth=1.3),
+        box_min=np.array([-1.1, -0.8, 0.06]),
+        box_max=np.array([0.9, 1.0, 1.3 * 0.999]),
+        steps=replace(problem.steps, near=0.07, far=40.0, step=0.043, in_ndc=True),
+    )
+
+
 def unbounded(problem: Problem, contraction: str, border: float) -> Problem:
-    """The same in a contracted space, with growing steps."""
+    """The same in a contracted space, with growing steps; or in a frustum."""
+    if contraction == "ndc":
+        return in_frustum(problem)
     steps = Steps(near=0.07, far=40.0, step=0.11, n_linear=12, growth=0.09)
     return replace(problem, contraction=contraction, border=border, steps=steps)
 
@@ -118,6 +144,11 @@ class Rendered:
 
 def in_float32(p: Problem) -> Problem:
     """The same with numbers that float32 holds, so that only arithmetic can differ."""
+    if p.frustum is not None:
+        origin, axes = (
+            v.astype(np.float32).astype(np.float64) for v in (p.frustum.origin, p.frustum.axes)
+        )
+        p = replace(p, frustum=replace(p.frustum, origin=origin, axes=axes))
     rounded = {
         name: value.astype(np.float32).astype(np.float64)
         for name, value in vars(p).items()
@@ -161,7 +192,10 @@ class Kernels:
 
     def box(self, p: Problem) -> Any:
         """Its box likewise."""
-        return box_struct(self.types, p.box_min, p.box_max, p.border)
+        box = box_struct(self.types, p.box_min, p.box_max, p.border)
+        if p.frustum is not None:
+            box.frustum = frustum_struct(self.types, p.frustum, p.steps.near, p.steps.far)
+        return box
 
     def density(self, p: Problem) -> Any:
         """And what its densities mean."""
@@ -342,8 +376,16 @@ def oracle(
     head: reference.Head = RGB,
 ) -> reference.Rendering:
     """The same problem in the reference, raw a tensor that may want a gradient."""
-    n_steps = 1
-    while last_edge(p.steps, n_steps) < min(p.steps.far, 50.0):
+    n_steps, frustum = 1, None
+    if p.frustum is not None:
+        n_steps = int(4.0 * np.linalg.norm(p.box_max - p.box_min) / p.steps.step)
+        frustum = reference.Frustum(
+            torch.tensor(p.frustum.origin),
+            torch.tensor(p.frustum.axes),
+            p.frustum.near,
+            p.frustum.depth,
+        )
+    while p.frustum is None and last_edge(p.steps, n_steps) < min(p.steps.far, 50.0):
         n_steps += 1
     offsets, content = torch.tensor(p.offsets), torch.tensor(p.content_distance)
     return reference.render(
@@ -359,7 +401,8 @@ def oracle(
         growth=p.steps.growth,
         n_linear=p.steps.n_linear,
         offset=offsets.expand(p.n_rays),
-        norm=p.contraction,
+        norm="none" if frustum else p.contraction,
+        frustum=frustum,
         border=p.border,
         density_shift=p.density_shift,
         density_scale=p.density_scale,

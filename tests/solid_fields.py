@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import warp as wp
@@ -16,9 +17,17 @@ from warpnerf.rendering.field import Field
 from warpnerf.rendering.render import Steps
 from warpnerf.runtime.parallel import Workers
 from warpnerf.scenes.camera import Camera
+from warpnerf.scenes.frustum import Frustum
 
 SIZE = (41, 45, 49)
 BOX_MIN, BOX_MAX = np.array([-1.0, -1.1, -1.2]), np.array([1.0, 1.1, 1.2])
+FRUSTUM = Frustum(
+    origin=np.array([0.2, -3.0, 0.1]),
+    axes=np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+    near=1.5,
+    depth=1.2,
+)
+"""Before the ball, looking along y, z up."""
 LEVEL = 10.0 * math.log(2.0)
 """Density at the ball's surface, where the raw density is 0."""
 
@@ -45,10 +54,18 @@ def ball_field(
         box_min=BOX_MIN,
         box_max=BOX_MAX,
         contraction=contraction,
-        border=0.0 if contraction == "none" else 0.2,
+        border=0.2 if contraction in ("linf", "l2") else 0.0,
         density_shift=0.0,
         density_scale=10.0,
     )
+    if contraction == "ndc":
+        grid = replace(
+            grid,
+            frustum=FRUSTUM,
+            box_min=np.array([-0.5, -0.6, 0.0]),
+            box_max=np.array([0.6, 0.5, 1.0]),
+            density_scale=20.0,
+        )
     points = points_of(grid, nodes)
     points = np.where(np.isfinite(points), points, 1e6)
     apart = np.linalg.norm(points - centre, axis=1)
@@ -63,7 +80,7 @@ def ball_field(
     blue = 0.5 + 0.3 * np.clip((points[:, 2] - centre[2]) / radius, -1.0, 1.0)
     values[:, 3] = np.log(blue / (1.0 - blue))
     grid.values.assign(values)
-    folded = contraction != "none"
+    folded = grid.folded
     steps = Steps(
         near=0.0,
         far=100.0,
@@ -71,6 +88,7 @@ def ball_field(
         n_linear=100 if folded else 0,
         growth=0.02 if folded else 0.0,
         transmittance_min=1e-4,
+        in_ndc=grid.frustum is not None,
     )
     return Field(
         model=Rgb(),

@@ -24,7 +24,7 @@ def compiled(module: wp.Module, folder: Path) -> str:
 @pytest.mark.parametrize(
     ("model", "contractions"),
     [
-        pytest.param(Rgb(), ("none",), id="rgb"),
+        pytest.param(Rgb(), ("none", "ndc"), id="rgb"),
         pytest.param(Rgb(), ("linf", "l2"), id="rgb, folded", marks=pytest.mark.slow),
         pytest.param(SphericalHarmonics(degree=1), ("none",), id="sh", marks=pytest.mark.slow),
         pytest.param(Deferred(), ("linf",), id="deferred"),

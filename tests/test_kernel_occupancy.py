@@ -12,6 +12,7 @@ from drive import (
     Kernels,
     Problem,
     assert_close,
+    in_frustum,
     make_problem,
     oracle,
     oracle_gradient,
@@ -79,7 +80,7 @@ def with_free_space(p: Problem, seed: int) -> Problem:
 
 
 @pytest.mark.parametrize("jitter", [False, True])
-@pytest.mark.parametrize("contraction", ["none", "linf", "l2"])
+@pytest.mark.parametrize("contraction", ["none", "linf", "l2", "ndc"])
 def test_skipping_visits_what_a_test_of_each_sample_keeps(
     contraction: str, jitter: bool, kernels64: Kernels
 ) -> None:
@@ -88,7 +89,10 @@ def test_skipping_visits_what_a_test_of_each_sample_keeps(
     for seed in range(N_SEEDS):
         p = make_problem(seed, n_rays=16, density_scale=0.2)
         p = replace(p, steps=replace(p.steps, step=0.031))
-        if contraction != "none":
+        if contraction == "ndc":
+            p = in_frustum(p, seed)
+            p = replace(p, steps=replace(p.steps, step=0.017))
+        elif contraction != "none":
             border = float(np.random.default_rng(seed).uniform(0.1, 1.0))
             p = unbounded(p, contraction, border)
             p = replace(p, steps=Steps(near=0.02, far=50.0, step=0.05, n_linear=30, growth=0.05))

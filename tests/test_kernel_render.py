@@ -13,6 +13,7 @@ from drive import (
     Problem,
     assert_close,
     directional_differences,
+    in_frustum,
     make_problem,
     oracle,
     oracle_gradient,
@@ -42,6 +43,11 @@ def masked(p: Problem, seed: int) -> Problem:
 
 def early(p: Problem) -> Problem:
     return replace(p, density_scale=2.5, steps=replace(p.steps, transmittance_min=0.2))
+
+
+def clipped(p: Problem) -> Problem:
+    """Near and far plane, in scene units, on the way through the box."""
+    return replace(p, steps=replace(p.steps, near=0.9, far=2.3))
 
 
 def jittered(p: Problem, seed: int) -> Problem:
@@ -75,6 +81,11 @@ PATHS: dict[str, Path] = {
     "early stop": lambda seed: early(make_problem(seed)),
     "linf": lambda seed: unbounded(make_problem(seed), "linf", 0.2),
     "l2": lambda seed: unbounded(make_problem(seed), "l2", 1.0),
+    "ndc": lambda seed: in_frustum(make_problem(seed), seed),
+    "ndc, clipped": lambda seed: clipped(in_frustum(make_problem(seed), seed)),
+    "all, ndc": lambda seed: early(
+        jittered(masked(in_frustum(make_problem(seed), seed), seed), seed)
+    ),
     "all, linf": lambda seed: early(
         jittered(masked(unbounded(make_problem(seed), "linf", 0.5), seed), seed)
     ),
@@ -96,6 +107,8 @@ USUAL = {
     *(("none", scaling, "none") for scaling in ("none", "quadratic", "clamped")),
     *(("linf", *scaled) for scaled in (("none", "none"), ("clamped", "none"))),
     ("linf", "quadratic", "density"),
+    ("ndc", "none", "none"),
+    ("ndc", "clamped", "none"),
     ("l2", "none", "none"),
     ("l2", "clamped", "paper"),
 }
@@ -109,9 +122,9 @@ def variant(*constants: str) -> Any:
 
 VARIANTS = [
     variant(contraction, scaling, jacobian)
-    for contraction in ("none", "linf", "l2")
+    for contraction in ("none", "linf", "l2", "ndc")
     for scaling, jacobian in SCALED
-    if contraction != "none" or jacobian == "none"  # without contraction the determinant is 1
+    if contraction in ("linf", "l2") or jacobian == "none"  # else there is no determinant
 ]
 
 

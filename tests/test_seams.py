@@ -6,8 +6,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 import warp as wp
-from drive import Kernels, Problem, assert_close, in_float32, make_problem
+from drive import (
+    N_SEEDS,
+    Kernels,
+    Problem,
+    assert_close,
+    directional_differences,
+    in_float32,
+    in_frustum,
+    make_problem,
+    oracle,
+)
 from seams.constant_features import OneColour
 from seams.given_distances import AtDistances
 from seams.grey import Grey
@@ -100,6 +111,35 @@ def test_values_of_the_losses(kernels64: Kernels) -> None:
         p = replace(p, offsets=np.array([0.5]))
         found = kernels64.train(p)[0] - kernels64.train(replace(p, model=model_of("rgb")))[0]
         assert_close(found, [by_hand(*weights_of(kernels64, p, n)) for n in range(12)], 1e-9)
+
+
+def test_losses_in_a_frustum_are_those_of_distances_in_the_scene(kernels64: Kernels) -> None:
+    """Weights of the oracle, its distances, and lengths of steps by differences of these."""
+    packs = Kernels("float32", "cpu", packed=True)
+    for seed in range(N_SEEDS):
+        p = in_frustum(problem(MODELS["loss with sums"], seed), seed)
+        plain = replace(p, model=model_of("rgb"))
+        seen, h = oracle(plain, torch.tensor(p.raw)), 1e-4
+        later, sooner = (
+            oracle(replace(plain, offsets=p.offsets + d), torch.tensor(p.raw)).t for d in (h, -h)
+        )
+        dt = torch.where(seen.kept, (later - sooner) / (2.0 * h), 0.0).numpy()
+        t = torch.where(seen.kept, seen.t, 0.0).numpy()
+        expected = [apart(*ray) for ray in zip(seen.weights.numpy(), t, dt, strict=True)]
+        found = kernels64.train(p)[0] - kernels64.train(plain)[0]
+        assert_close(found, expected, 1e-6)
+        exact, rounded = kernels64.train(in_float32(p)), packs.train(in_float32(p))
+        assert_close(rounded[0], exact[0], 5e-5)
+        assert_close(rounded[1], exact[1], 5e-5)
+        direction = np.random.default_rng(seed).normal(size=p.raw.shape)
+        if seed % 2 == 0:  # no ray comes to its end
+            by = directional_differences(
+                lambda raw, p=p: loss_of(kernels64, replace(p, raw=raw)),
+                p.raw,
+                direction[None],
+                h=2e-5,
+            )
+            assert_close([np.vdot(direction, kernels64.train(p)[1])], by, 1e-7)
 
 
 def weights_of(kernels: Kernels, p: Problem, ray: int) -> tuple[Any, Any, float]:

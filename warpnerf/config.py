@@ -19,7 +19,7 @@ from warpnerf.model.models import Deferred, model_of, to_json
 
 Scaling = Literal["none", "quadratic", "clamped"]
 Jacobian = Literal["none", "density", "paper"]
-Contraction = Literal["none", "linf", "l2"]
+Contraction = Literal["none", "linf", "l2", "ndc"]
 Background = Literal["auto", "white", "black", "random"]
 SceneKind = Literal["object", "bounded", "unbounded"]
 """Bounded with photographs that have alpha, other bounded ones, and those that are not."""
@@ -49,8 +49,11 @@ class GridConfig:
     """Shares of the training at which the number of nodes doubles."""
     alpha_init: float = 1e-3
     """Opacity of one voxel's length before training."""
-    contraction: Literal["auto", "none", "linf", "l2"] = "auto"
-    """How space outside the box is folded in; auto: linf for unbounded scenes, else none."""
+    contraction: Literal["auto", "none", "linf", "l2", "ndc"] = "auto"
+    """How space outside the box is folded in; auto: linf for unbounded scenes, else none. ndc: the
+    grid lies in normalised device coordinates instead, for cameras that look the same way."""
+    planes: int = 64
+    """Nodes of the final grid along the depth of normalised device coordinates; with ndc only."""
     border: float = 0.2
     """Width of the shell that holds space outside the box, in half edges of the box; (0, 1]."""
 
@@ -63,6 +66,7 @@ class GridConfig:
                 "fewer --voxels."
             )
         require_one_of("grid.contraction", self.contraction, ("auto", *get_args(Contraction)))
+        require_whole("grid.planes", self.planes, 2)
         if not 0 < self.alpha_init < 1:
             raise InputError(f"grid.alpha_init must lie between 0 and 1, not {self.alpha_init}.")
         if not 0 < self.border <= 1:
@@ -293,6 +297,11 @@ class TrainConfig:
             raise InputError(f"seed must be at least 0 and below 2^63, not {self.seed}.")
         require_one_of("scaling", self.scaling, get_args(Scaling))
         require_one_of("jacobian", self.jacobian, get_args(Jacobian))
+        if self.grid.contraction == "ndc" and self.jacobian != "none":
+            raise InputError(
+                f"jacobian must be none with grid.contraction ndc, not {self.jacobian}: it is for "
+                "contractions that leave a box around the cameras as it is."
+            )
         require_positive("checkpoint_every", self.checkpoint_every)
         if self.time_limit is not None:
             require_positive("time_limit", self.time_limit)

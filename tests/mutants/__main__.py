@@ -21,6 +21,7 @@ from pathlib import Path
 
 import heads
 import losses
+import ndc
 import packed
 import plain
 import scatter
@@ -39,6 +40,7 @@ MUTANTS = (
     *schedule.MUTANTS,
     *heads.MUTANTS,
     *losses.MUTANTS,
+    *ndc.MUTANTS,
 )
 
 

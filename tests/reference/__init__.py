@@ -3,7 +3,7 @@
 It shares no code with the package or its kernels, and prefers the textbook form to the fast one.
 Everything works for any floating dtype; float64 is what it is meant for.
 
-    geometry  contraction and its Jacobian, grid coordinates, distances along a ray
+    geometry  contraction and its Jacobian, grid coordinates, distances along a ray, frusta
     render    trilinear interpolation, the paper's gradient scaling, integration along rays
     heads     the models: view encoding, spherical harmonics, networks, what they make of features
     training  photometric loss, total variation, one Adam step
@@ -13,6 +13,7 @@ Everything works for any floating dtype; float64 is what it is meant for.
 
 from .cameras import distort, fisheye_rays, pinhole_rays, undistort
 from .geometry import (
+    Frustum,
     SampleDistances,
     contract,
     grid_coordinates,
@@ -58,6 +59,7 @@ from .training import adam, photometric_loss, total_variation
 __all__ = [
     "DeferredHead",
     "FeaturesHead",
+    "Frustum",
     "GradientScaler",
     "Head",
     "Light",

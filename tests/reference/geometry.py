@@ -176,3 +176,68 @@ def sample_distances(
     within = torch.as_tensor(offset, dtype=torch.float64).cpu()[..., None]  # [..., 1]
     t = (edges[:-1] + within * dt).to(dtype)
     return SampleDistances(t, dt.to(dtype), t < far)
+
+
+class Frustum(NamedTuple):
+    """Normalised device coordinates e = (x / w, y / w, depth (1 - near / w)).
+
+    (x, y, w) = axes (p - origin) for a point p of the scene.
+    """
+
+    origin: Tensor
+    """[3] scene units."""
+    axes: Tensor
+    """[3, 3] unit vectors in rows."""
+    near: float
+    """Depth w of the near plane, scene units."""
+    depth: float
+    """e_z of what is infinitely far."""
+
+    def of_points(self, points: Tensor) -> Tensor:
+        """Points [..., 3] in its coordinates [..., 3]."""
+        x, y, w = ((points - self.origin) @ self.axes.T).unbind(-1)
+        return torch.stack([x / w, y / w, self.depth * (1.0 - self.near / w)], dim=-1)
+
+    def to_points(self, e: Tensor) -> Tensor:
+        """The inverse."""
+        w = self.near / (1.0 - e[..., 2] / self.depth)
+        return torch.stack([e[..., 0] * w, e[..., 1] * w, w], dim=-1) @ self.axes + self.origin
+
+    def samples(
+        self,
+        origins: Tensor,
+        directions: Tensor,
+        near: float,
+        step: float,
+        n_steps: int,
+        offset: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """Samples at equal distances in its coordinates, from where rays are beyond its near plane.
+
+        Found from two points of each ray and the straight line through them in these coordinates.
+
+        Args:
+            origins: [n_rays, 3] scene units.
+            directions: [n_rays, 3] unit vectors.
+            near: Rays begin no nearer to their origins, scene units.
+            step: In its coordinates.
+            n_steps: Samples of a ray.
+            offset: [n_rays] place within the step.
+
+        Returns:
+            e [n_rays, n_steps, 3], and t [n_rays, n_steps] in scene units; not numbers for rays
+            never beyond the near plane, and t below 0 or infinite where a line has left space.
+        """
+        w, slope = (origins - self.origin) @ self.axes[2], directions @ self.axes[2]
+        begin = torch.full_like(w, near)
+        before = w + near * slope < self.near
+        begin = torch.where(before, (self.near - w) / slope, begin)
+        begin = torch.where(before & (slope <= 0.0), torch.full_like(w, torch.nan), begin)
+        first = self.of_points(origins + begin[:, None] * directions)
+        second = self.of_points(origins + (begin + 0.3 * self.near)[:, None] * directions)
+        along = second - first
+        along = along / torch.linalg.vector_norm(along, dim=-1, keepdim=True)
+        k = torch.arange(n_steps, dtype=origins.dtype) + offset[:, None]
+        e = first[:, None] + (step * k)[..., None] * along[:, None]
+        points = self.to_points(e)
+        return e, ((points - origins[:, None]) * directions[:, None]).sum(-1)

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from .geometry import (
+    Frustum,
     grid_coordinates,
     jacobian_determinant,
     normalized_coordinates,
@@ -288,6 +289,7 @@ def render(
     content_distance: float | Tensor = 1.0,
     jacobian: str = "none",
     head: Head = RGB,
+    frustum: Frustum | None = None,
 ) -> Rendering:
     """Render rays through a grid of raw values, every candidate sample of every ray at once.
 
@@ -323,6 +325,8 @@ def render(
         content_distance: See `distance_scale`; one for all or [n_rays].
         jacobian: See `distance_scale`; |det J| is 1 without contraction.
         head: Makes colours of features; `RgbHead` has F = 3, c = sigmoid(raw_1..3).
+        frustum: In whose coordinates box and step are; steps are equal in them, and begin where a
+            ray, from `near` on, is beyond its near plane.
 
     Returns:
         Rendering of n_rays rays.
@@ -339,9 +343,14 @@ def render(
     t = steps.t.to(raw.device).expand(origins.shape[0], n_steps)
     dt = steps.dt.to(raw.device)
     points = origins[:, None, :] + t[..., None] * directions[:, None, :]  # [n_rays, n_steps, 3]
+    valid = steps.before_far.to(raw.device).expand_as(t)
+    if frustum is not None:
+        places = torch.as_tensor(offset, dtype=raw.dtype).expand(origins.shape[0])
+        points, t = frustum.samples(origins, directions, near, step, n_steps, places)
+        dt = torch.full_like(t, step)
+        valid = t < far
     u = grid_coordinates(points, corner_min, corner_max, shape, norm, border)
 
-    valid = steps.before_far.to(raw.device).expand_as(t)
     if norm == "none":
         last = like_raw([size - 1 for size in shape])
         valid = valid & ((u >= 0.0) & (u <= last)).all(dim=-1)

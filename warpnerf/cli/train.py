@@ -47,6 +47,7 @@ def train_command(
     scaling: Scaling | None = None,
     content_distance: float | Literal["auto", "per-camera"] | None = None,
     voxels: int | None = None,
+    contraction: Literal["auto", "none", "linf", "l2", "ndc"] | None = None,
     near: float | None = None,
     downscale: int | None = None,
     masks: Path | None = None,
@@ -84,6 +85,8 @@ def train_command(
         content_distance: Where gradients reach full strength, in the scene's units; per-camera: of
             each camera what it sees, as points or a short training tell.
         voxels: Nodes of the final grid, in all; memory goes with their number.
+        contraction: How space outside the box is held: none, folded in (linf, l2), or ndc, for
+            cameras that look the same way; by default folded in where photographs have no alpha.
         near: Nothing is sampled nearer to the camera than this, in the scene's units.
         downscale: Average blocks of so many pixels squared; by default 1, as they are.
         masks: Folder of images named after the photographs, white where pixels count and black
@@ -118,6 +121,9 @@ def train_command(
         config = dataclasses.replace(config, loss=chosen_losses(config.loss, loss))
         if voxels is not None:
             grid = dataclasses.replace(config.grid, voxels=voxels)
+            config = dataclasses.replace(config, grid=grid)
+        if contraction is not None:
+            grid = dataclasses.replace(config.grid, contraction=contraction)
             config = dataclasses.replace(config, grid=grid)
         if near is not None:
             march = dataclasses.replace(config.march, near=near)
@@ -335,6 +341,9 @@ def _describe(scene: Scene, content_distance: float, config: TrainConfig) -> Non
     sizes = sorted({(c.width, c.height) for c in scene.cameras})
     shown = ", ".join(f"{w} x {h}" for w, h in sizes[:3]) + (", ..." if len(sizes) > 3 else "")
     extent = scene.box_max - scene.box_min
+    outside = "space outside folded in" if scene.unbounded else "nothing outside"
+    if config.grid.contraction == "ndc":
+        outside = "but the grid is in normalised device coordinates"
     print(f"{scene.name}: {train} training and {test} test views, {shown} pixels")
     for warning in scene.warnings:
         print(f"  warning: {warning}")
@@ -343,8 +352,7 @@ def _describe(scene: Scene, content_distance: float, config: TrainConfig) -> Non
     each = ", of each camera its own" if config.content_distance == "per-camera" else ""
     print(f"  content distance {content_distance:.4g} scene units{each}, scaling {config.scaling}")
     print(
-        f"  box {extent[0]:.4g} x {extent[1]:.4g} x {extent[2]:.4g} scene units, "
-        + ("space outside folded in" if scene.unbounded else "nothing outside"),
+        f"  box {extent[0]:.4g} x {extent[1]:.4g} x {extent[2]:.4g} scene units, {outside}",
         flush=True,
     )
 

@@ -57,6 +57,8 @@ def opaque_colours(field: Field, points: np.ndarray, directions: np.ndarray) -> 
         [n, 3] float32 in [0, 1]; the background outside of the grid.
     """
     edges = voxel_edges(field.grid, points)
+    if field.grid.frustum is not None:
+        return _colours_in_frustum(field, points, directions)
     if field.grid.contraction == "none":  # rounding must not leave points on its faces outside
         margin = THIN * edges[:, None]
         points = np.clip(points, field.grid.box_min + margin, field.grid.box_max - margin)
@@ -74,6 +76,20 @@ def opaque_colours(field: Field, points: np.ndarray, directions: np.ndarray) -> 
         origins = points[chosen] - 0.5 * step * directions[chosen]
         rgb[chosen] = opaque.render_rays(origins, directions[chosen]).rgb
     return rgb
+
+
+def _colours_in_frustum(field: Field, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """``opaque_colours`` where steps are lengths in a frustum; rays begin at the points."""
+    grid, step = field.grid, THIN * float(field.grid.voxel_size.min())
+    assert grid.frustum is not None
+    places = np.clip(grid.frustum.to_ndc(points), grid.box_min + step, grid.box_max - step)
+    opaque = replace(
+        field,
+        grid=replace(grid, density_shift=_lift(field), density_scale=OPAQUE / step),
+        free=FreeCells.none(field.workers),
+        steps=Steps(near=0.0, far=1e30, step=step, in_ndc=True),
+    )
+    return opaque.render_rays(grid.frustum.to_scene(places), directions).rgb
 
 
 def _lift(field: Field) -> float:

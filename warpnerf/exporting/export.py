@@ -80,6 +80,8 @@ def export(
     surface.check_options(field, level, crop, min_size)  # before what takes long
     if scene is None and ending in ("", ".html"):
         raise InputError(f"{path}: a {FORMATS[ending]} needs the scene of the training; give it.")
+    if ending in VOLUMES:
+        volume.require_boxes(field)
     views = [] if scene is None else [scene.views[index] for index in scene.splits["train"]]
     sight = look(field, views, on_camera) if views else None
     if ending in SPLATS:

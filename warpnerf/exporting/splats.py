@@ -106,10 +106,13 @@ def splats_of(
         )
     points, jacobian, sigma = points[usable], jacobian[usable], sigma[kept][usable]
     # Where space is folded, cells are long and are looked along, from the box outward.
-    outward = points - 0.5 * (grid.box_min + grid.box_max)
+    middle = 0.5 * (grid.box_min + grid.box_max)
+    outward = points - (middle if grid.frustum is None else grid.frustum.origin)
     length = np.linalg.norm(outward, axis=1, keepdims=True)
     outward = np.where(length > 0.0, outward / np.maximum(length, 1e-30), [1.0, 0.0, 0.0])
     crossed = np.linalg.norm(np.linalg.solve(jacobian, outward[..., None])[..., 0], axis=1)
+    if grid.frustum is not None:  # whose densities are those of its coordinates
+        crossed[:] = 1.0 / float(grid.voxel_size.mean())
     scales, rotations = _axes(jacobian)
     return Splats(
         centres=points.astype(np.float32),

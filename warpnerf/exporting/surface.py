@@ -59,8 +59,8 @@ def extract_surface(
             and colours are those that they see. None: all is kept, and colours are those seen
             along the normals.
         unseen: Keep what no camera sees, too.
-        level: Density of the surface, 1 / scene unit; None: that of which a voxel edge is 20 %
-            opaque.
+        level: Density of the surface, 1 / scene unit, in a frustum 1 / unit of its coordinates;
+            None: that of which a voxel edge is 20 % opaque.
         crop: Only triangles inside this box; None: the field's box.
         min_size: Components whose box has a shorter diagonal are dropped, scene units; None: eight
             voxel edges.
@@ -76,7 +76,6 @@ def extract_surface(
     edge = float(grid.voxel_size.mean())
     check_options(field, level, crop, min_size)
     level = -math.log1p(-LEVEL_OPACITY) / edge if level is None else level
-    min_size = MIN_SIZE * edge if min_size is None else min_size
     box = checked_crop(field, crop)
     raw = raw_density(field)
     nodes, faces = _marching_cubes(raw, _raw_of(field, level), field)
@@ -90,6 +89,10 @@ def extract_surface(
         )
     if sight is not None and not unseen:
         kept &= values_at(sight.light, nodes) > SEEN
+    if min_size is None:
+        if grid.frustum is not None and kept.any():
+            edge = float(np.median(voxel_edges(grid, points[kept])))
+        min_size = MIN_SIZE * edge
     faces = faces[kept[faces].all(axis=1)]
     faces = faces[_large_components(points, faces, min_size)]
     if not len(faces):
@@ -127,6 +130,8 @@ def checked_crop(field: Field, crop: Crop | None) -> np.ndarray:
         InputError: It is no box, or outside of a field that ends at its own.
     """
     own = np.stack([field.grid.box_min, field.grid.box_max])
+    if field.grid.frustum is not None:  # which is no box in the scene
+        own = np.array([[-np.inf] * 3, [np.inf] * 3])
     if crop is None:
         return own
     box = np.asarray(crop, np.float64)

@@ -53,9 +53,11 @@ def volume_of(
         The volume.
 
     Raises:
-        InputError: The crop is no box, or holds no two nodes along an axis.
+        InputError: The crop is no box, or holds no two nodes along an axis; or the field is one in
+            normalised device coordinates.
     """
     grid = field.grid
+    require_boxes(field)
     box = checked_crop(field, crop)
     box = np.clip(box, grid.box_min, grid.box_max)
     low, high = nodes_of(grid, box)
@@ -81,6 +83,15 @@ def volume_of(
         box_min=corners[0],
         box_max=corners[1],
     )
+
+
+def require_boxes(field: Field) -> None:
+    """Raise InputError where voxels are no boxes in the scene."""
+    if field.grid.frustum is not None:
+        raise InputError(
+            "a volume has voxels of one size, but this field's are those of normalised device "
+            "coordinates, which grow with the distance; export a mesh, points or splats."
+        )
 
 
 def volume_npz(volume: Volume) -> list[bytes]:

@@ -22,13 +22,25 @@ from warpnerf.checks import InputError
 from warpnerf.config import MAX_VOXELS, TRAINING_BYTES, Contraction
 from warpnerf.runtime.memory import usable_memory
 from warpnerf.runtime.parallel import NODES, Workers
+from warpnerf.scenes.frustum import Frustum
 
-CONTRACTIONS = {"none": contraction.NONE, "linf": contraction.LINF, "l2": contraction.L2}
+CONTRACTIONS = {
+    "none": contraction.NONE,
+    "linf": contraction.LINF,
+    "l2": contraction.L2,
+    "ndc": contraction.NDC,
+}
+
+SHOWN = 8.0
+"""Depth, in near planes of a frustum, to which a box around it reaches: the rest is background."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class VoxelGrid:
-    """A dense grid [X, Y, Z] of raw values, z fastest, nodes on the box's faces."""
+    """A dense grid [X, Y, Z] of raw values, z fastest, nodes on the box's faces.
+
+    Box and lengths are in scene units, but in coordinates of the frustum where there is one.
+    """
 
     values: wp.array
     """[X * Y * Z] vectors: raw density, raw features, padding to a power of two."""
@@ -46,6 +58,13 @@ class VoxelGrid:
     """sigma = density_scale softplus(raw density + density_shift)."""
     density_scale: float = 1.0
     """1 / scene unit."""
+    frustum: Frustum | None = None
+    """Whose coordinates the box has, with ndc."""
+
+    @property
+    def folded(self) -> bool:
+        """Whether space outside the box is folded in."""
+        return self.contraction in ("linf", "l2")
 
     @property
     def voxel_size(self) -> np.ndarray:
@@ -54,8 +73,20 @@ class VoxelGrid:
         return extent / (np.array(self.size) - 1)
 
     @property
+    def surroundings(self) -> tuple[np.ndarray, np.ndarray]:
+        """Corners, [3] scene units, of a box around what it holds: its own, or around a frustum."""
+        if self.frustum is None:
+            return self.box_min, self.box_max
+        high = self.box_max.copy()
+        high[2] = min(high[2], self.frustum.depth * (1.0 - 1.0 / SHOWN))
+        ends = np.stack([self.box_min, high])
+        corners = np.stack(np.meshgrid(*ends.T), axis=-1).reshape(-1, 3)
+        points = self.frustum.to_scene(corners)
+        return points.min(axis=0), points.max(axis=0)
+
+    @property
     def diagonal(self) -> float:
-        """Of the box, scene units."""
+        """Of the box, in its units."""
         return float(np.linalg.norm(self.box_max - self.box_min))
 
     @property
@@ -70,8 +101,21 @@ class VoxelGrid:
 
     @cached_property
     def box(self) -> Box:
-        """Its box as kernels take it."""
+        """Its box as kernels take it that do not follow rays."""
         return box_struct(types, self.box_min, self.box_max, self.border)
+
+    def box_between(self, near: float, far: float) -> Box:
+        """Its box as kernels take it, for rays from near to far.
+
+        Args:
+            near: Nothing is sampled nearer to their origins, scene units; for boxes in a frustum,
+                as those in the scene leave that to the steps.
+            far: Nor at this distance or beyond.
+        """
+        box = box_struct(types, self.box_min, self.box_max, self.border)
+        if self.frustum is not None:
+            box.frustum = frustum_struct(types, self.frustum, near, far)
+        return box
 
     @cached_property
     def density(self) -> Density:
@@ -142,6 +186,16 @@ def box_struct(types: ModuleType, box_min: np.ndarray, box_max: np.ndarray, bord
     return box
 
 
+def frustum_struct(types: ModuleType, frustum: Frustum, near: float, far: float) -> Any:
+    """A kernel's Frustum, in the precision of the given ``warpnerf_kernels.base.types``."""
+    struct = types.Frustum()
+    struct.origin = types.vec3(*frustum.origin)
+    struct.axes = types.mat33(*frustum.axes.ravel())
+    struct.near, struct.depth = frustum.near, frustum.depth
+    struct.begin, struct.end = near, far
+    return struct
+
+
 def density_struct(types: ModuleType, shift: float, scale: float) -> Any:
     """A kernel's Density, in the precision of the given ``warpnerf_kernels.base.types``."""
     density = types.Density()
@@ -200,6 +254,20 @@ def _cells(grid: VoxelGrid) -> tuple[int, int, int]:
     """MX, MY, MZ: a cell is two voxels wide, or a little more."""
     x, y, z = (max(1, (n - 1) // 2) for n in grid.size)
     return x, y, z
+
+
+def _cells_within(
+    grid: VoxelGrid, size: tuple[int, int, int], low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    """Which cells of a grid in a frustum lie in a box of the scene, with all corners: [*size]."""
+    assert grid.frustum is not None
+    shares = [np.arange(n + 1) / n for n in size]
+    corners = np.stack(np.meshgrid(*shares, indexing="ij"), axis=-1)
+    points = grid.frustum.to_scene(grid.box_min + corners * (grid.box_max - grid.box_min))
+    inside = ((low <= points) & (points <= high)).all(axis=-1)
+    for axis, n in enumerate(size):
+        inside = np.take(inside, np.arange(n), axis) & np.take(inside, np.arange(1, n + 1), axis)
+    return np.asarray(inside)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -315,13 +383,17 @@ class FreeCells:
         size = _cells(grid)
         occupied = self.distance.numpy() == 0
         occupied = np.ones(size, bool) if self.size != size else occupied.reshape(size)
-        share = np.stack([low, high] - grid.box_min) / (grid.box_max - grid.box_min)
-        # The box's share of the domain, whose border lies around it.
-        share = 0.5 + (share - 0.5) / (1.0 + grid.border)
-        for axis, n in enumerate(size):
-            edges = np.arange(n + 1) / n
-            inside = (share[0, axis] <= edges[:-1] + 1e-6) & (edges[1:] - 1e-6 <= share[1, axis])
-            occupied = occupied & np.expand_dims(inside, [a for a in range(3) if a != axis])
+        if grid.frustum is not None:
+            occupied = occupied & _cells_within(grid, size, low, high)
+        else:
+            share = np.stack([low, high] - grid.box_min) / (grid.box_max - grid.box_min)
+            # The box's share of the domain, whose border lies around it.
+            share = 0.5 + (share - 0.5) / (1.0 + grid.border)
+            for axis, n in enumerate(size):
+                edges = np.arange(n + 1) / n
+                inside = share[0, axis] <= edges[:-1] + 1e-6
+                inside &= edges[1:] - 1e-6 <= share[1, axis]
+                occupied = occupied & np.expand_dims(inside, [a for a in range(3) if a != axis])
         distance = np.where(occupied, 0, int(occupancy.FAR) + 1).astype(np.uint8)
         there = wp.array(distance.ravel(), dtype=wp.uint8, device=workers.device)
         return FreeCells._around(there, size, grid.border, workers)

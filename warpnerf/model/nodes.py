@@ -1,7 +1,7 @@
-"""Where scene and grid meet: node coordinates of points, in folded space too, and values there.
+"""Where scene and grid meet: node coordinates of points, in warped space too, and values there.
 
 Node coordinates count voxel edges from the grid's lower corner. Folding and its inverse are those
-of ``warpnerf_kernels.space.contraction``.
+of ``warpnerf_kernels.space.contraction``, and grids in a frustum have its coordinates.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ def points_of(grid: VoxelGrid, nodes: np.ndarray) -> np.ndarray:
         nodes: [n, 3] node coordinates.
 
     Returns:
-        [n, 3] float64 scene units; infinite at the outer faces of folded space.
+        [n, 3] float64 scene units; infinite at the outer faces of folded space, not finite far
+        beyond a frustum.
     """
     middle = 0.5 * (np.array(grid.size) - 1)
     c = (np.asarray(nodes, np.float64) - middle) * ((1.0 + grid.border) / middle)
@@ -48,11 +49,14 @@ def points_of(grid: VoxelGrid, nodes: np.ndarray) -> np.ndarray:
         factor = grid.border / left / norm[outside]
         stretched = c[outside] * factor[:, None]
     c[outside] = np.where(c[outside] == 0.0, 0.0, stretched)
-    return 0.5 * (grid.box_min + grid.box_max) + 0.5 * c * (grid.box_max - grid.box_min)
+    places = 0.5 * (grid.box_min + grid.box_max) + 0.5 * c * (grid.box_max - grid.box_min)
+    return places if grid.frustum is None else grid.frustum.to_scene(places)
 
 
 def voxel_edges(grid: VoxelGrid, points: np.ndarray) -> np.ndarray:
-    """How long a voxel's edge is at points, about: in folded space it grows with the distance.
+    """How long a voxel's edge is at points, about: in warped space it grows with the distance.
+
+    In a frustum that is an edge across; those along the depth are longer far away.
 
     Args:
         grid: The grid.
@@ -61,6 +65,9 @@ def voxel_edges(grid: VoxelGrid, points: np.ndarray) -> np.ndarray:
     Returns:
         [n] scene units.
     """
+    if grid.frustum is not None:
+        depth = np.maximum(grid.frustum.depths(points), grid.frustum.near)
+        return float(grid.voxel_size.mean()) * depth
     return float(grid.voxel_size.mean()) * np.maximum(1.0, _norm(grid, _normalised(grid, points)))
 
 
@@ -94,12 +101,14 @@ def values_at(values: np.ndarray, nodes: np.ndarray) -> np.ndarray:
 def _normalised(grid: VoxelGrid, points: np.ndarray) -> np.ndarray:
     """With the box at [-1, 1]^3."""
     half = 0.5 * (grid.box_max - grid.box_min)
+    if grid.frustum is not None:
+        points = np.nan_to_num(grid.frustum.to_ndc(points), nan=-1e6)  # behind it: outside
     return (np.asarray(points, np.float64) - 0.5 * (grid.box_min + grid.box_max)) / half
 
 
 def _norm(grid: VoxelGrid, q: np.ndarray) -> np.ndarray:
     """The norm that space is folded by, [n]; 0 where it is not."""
-    if grid.contraction == "none":
+    if not grid.folded:
         return np.zeros(len(q))
     if grid.contraction == "l2":
         return np.linalg.norm(q, axis=1)

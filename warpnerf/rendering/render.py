@@ -55,13 +55,18 @@ class Steps:
     """Each later step is (1 + growth) times the one before; 0: all are equal."""
     transmittance_min: float = 0.0
     """A ray ends where less light than this would pass."""
+    in_ndc: bool = False
+    """Whether steps are lengths in the coordinates of a grid's frustum, and begin where a ray
+    enters it. Near and far are in scene units all the same; the grid's box minds them."""
 
     def most(self, length: float) -> int:
         """How many steps a ray can take, at most.
 
         Args:
-            length: Of its way through the box, scene units; infinite where space is folded.
+            length: Of its way through the box, in its coordinates; infinite where space is folded.
         """
+        if self.in_ndc:
+            return int(min(length / self.step, 1e9)) + 4
         linear = self.near + self.n_linear * self.step  # where growing steps begin
         if self.growth == 0.0 or self.far <= linear:
             shortest, in_all = self.step, (self.far - self.near) / self.step
@@ -74,8 +79,8 @@ class Steps:
     def struct(self, sampling: ModuleType = sampling) -> Any:
         """The steps as kernels take them, in the precision of the given ``sampling.steps``."""
         march = sampling.March()
-        march.near = self.near
-        march.far = self.far
+        march.near = 0.0 if self.in_ndc else self.near
+        march.far = 1e30 if self.in_ndc else self.far
         march.step = self.step
         march.growth = self.growth
         march.n_linear = self.n_linear
@@ -275,7 +280,7 @@ def render_rays(
     scene = scene_struct(
         model,
         "float32",
-        box=grid.box,
+        box=grid.box_between(steps.near, steps.far),
         free=free.struct,
         steps=steps,
         grid=grid.struct,
@@ -332,7 +337,7 @@ class TrainingPass:
         self.launch = AdjointLaunch(
             assembly.render_train_kernel(variant),
             variant,
-            model.most_steps(steps, math.inf if grid.contraction != "none" else grid.diagonal),
+            model.most_steps(steps, math.inf if grid.folded else grid.diagonal),
             n_rays,
             workers,
         )
@@ -342,7 +347,7 @@ class TrainingPass:
         self._scene = scene_struct(
             model,
             "float32",
-            box=grid.box,
+            box=grid.box_between(steps.near, steps.far),
             free=FreeCells.none(workers).struct,
             steps=steps,
             grid=grid.struct,

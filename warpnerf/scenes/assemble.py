@@ -49,6 +49,8 @@ class Frame:
     """True depth; None: not known."""
     image: np.ndarray | None = None
     """As a view has it, where it was read already; None: it is in ``path``."""
+    bounds: tuple[float, float] | None = None
+    """Depth of the nearest and of the farthest content, scene units; None: not known."""
 
 
 def find_images(
@@ -178,6 +180,7 @@ def assemble(
         guessed=extent.guessed and sight is None,
         near_content=None if sight is None else sight.near_content,
         points=None if sight is None or points is None else points.sample,
+        bounds=_bounds(frames, views),
         notes=(*notes, *kept.notes, *extent.notes),
         warnings=(
             *(*warnings, *mask_warnings, *_oddities(views, complete, transparent)),
@@ -186,6 +189,14 @@ def assemble(
             ),
         ),
     )
+
+
+def _bounds(frames: Sequence[Frame], views: Sequence[View]) -> np.ndarray | None:
+    """The bounds of views, [n_views, 2], if all frames have some."""
+    given = {frame.name: frame.bounds for frame in frames if frame.bounds is not None}
+    if len(given) < len(frames):
+        return None
+    return np.array([given[view.name] for view in views])
 
 
 def complete_splits(

@@ -2,7 +2,7 @@
 
 Each row holds a matrix [3, 5], camera to world with axes down, right, backward and, in its last
 column, height, width and focal length in pixels of the original photographs; then two bounds of
-depth, which are not used.
+depth, between which what the photograph shows lies.
 """
 
 from __future__ import annotations
@@ -82,6 +82,7 @@ def load_llff(
                 path=path,
                 c2w=check_pose(pose.tolist(), field=f"{file}: {place}"),
                 lens=Lens(file=file, values=angles, fields=fields),
+                bounds=(float(row[15]), float(row[16])),
             )
         )
     return assemble(

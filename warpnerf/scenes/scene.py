@@ -174,6 +174,9 @@ class Scene:
     """Distance from the cameras within which 1 in 100 of these points lies, scene units."""
     points: np.ndarray | None = None
     """[n, 3] float64, some of these points, scene units."""
+    bounds: np.ndarray | None = None
+    """[n_views, 2] float64, depth of the nearest and of the farthest content that each camera sees,
+    scene units, as the file gives them: not checked. None where it gives none."""
     notes: tuple[str, ...] = field(default=())
     """How the scene was understood: its split, what was estimated; a line each."""
     warnings: tuple[str, ...] = field(default=())
@@ -202,6 +205,10 @@ class Scene:
             raise InputError(
                 f"{self.name}: content_distances must be one above 0 for each of "
                 f"{len(self.views)} views."
+            )
+        if self.bounds is not None and self.bounds.shape != (len(self.views), 2):
+            raise InputError(
+                f"{self.name}: bounds must be two for each of {len(self.views)} views."
             )
         if len({view.name for view in self.views}) < len(self.views):
             raise InputError(f"{self.name}: two views have one name; give each its own.")

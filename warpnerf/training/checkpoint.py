@@ -29,6 +29,7 @@ from warpnerf.model.parameters import parameters_of
 from warpnerf.rendering.field import Field
 from warpnerf.rendering.render import Steps
 from warpnerf.runtime.parallel import Workers
+from warpnerf.scenes.frustum import Frustum
 from warpnerf.training.optim import NodesRule, WeightsRule, first_states
 from warpnerf.training.state import Progress, TrainingState
 
@@ -158,6 +159,15 @@ class _Training(msgspec.Struct, frozen=True):
     content_distances: list[float] | None = None
 
 
+class _Frustum(msgspec.Struct, frozen=True):
+    """``Frustum``, of a grid in normalised device coordinates."""
+
+    origin: tuple[float, float, float]
+    axes: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+    near: float
+    depth: float
+
+
 class _Header(msgspec.Struct, frozen=True):
     """Everything but the tensors."""
 
@@ -172,11 +182,12 @@ class _Header(msgspec.Struct, frozen=True):
     background: tuple[float, float, float]
     model: Model = Rgb()  # as in files of the version before, which do not name it
     training: _Training | None = None
+    frustum: _Frustum | None = None
 
 
 def _field_header(field: Field) -> dict[str, Any]:
-    grid = field.grid
-    return {
+    grid, frustum = field.grid, field.grid.frustum
+    header = {
         "model": to_json(field.model),
         "box_min": grid.box_min.tolist(),
         "box_max": grid.box_max.tolist(),
@@ -187,6 +198,14 @@ def _field_header(field: Field) -> dict[str, Any]:
         "steps": asdict(field.steps),
         "background": list(field.background),
     }
+    if frustum is not None:
+        header["frustum"] = {
+            "origin": frustum.origin.tolist(),
+            "axes": frustum.axes.tolist(),
+            "near": frustum.near,
+            "depth": frustum.depth,
+        }
+    return header
 
 
 def _field_tensors(field: Field) -> dict[str, np.ndarray]:
@@ -251,6 +270,7 @@ def _field(header: _Header, tensors: dict[str, np.ndarray], path: Path, workers:
         and free.dtype == np.uint8
         and all(low < high for low, high in zip(header.box_min, header.box_max, strict=True))
         and 0.0 <= header.border <= 1.0
+        and _frustum_fits(header)
         and steps.step > 0.0
         and steps.n_linear >= 0
         and steps.growth >= 0.0
@@ -272,6 +292,14 @@ def _field(header: _Header, tensors: dict[str, np.ndarray], path: Path, workers:
         border=header.border,
         density_shift=header.density_shift,
         density_scale=header.density_scale,
+        frustum=None
+        if header.frustum is None
+        else Frustum(
+            origin=np.array(header.frustum.origin),
+            axes=np.array(header.frustum.axes),
+            near=header.frustum.near,
+            depth=header.frustum.depth,
+        ),
     )
     return Field(
         model=model,
@@ -285,6 +313,20 @@ def _field(header: _Header, tensors: dict[str, np.ndarray], path: Path, workers:
         steps=steps,
         background=header.background,
         workers=workers,
+    )
+
+
+def _frustum_fits(header: _Header) -> bool:
+    """Whether there is a frustum where there has to be one, and it is one."""
+    frustum = header.frustum
+    if frustum is None or header.contraction != "ndc" or not header.steps.in_ndc:
+        return frustum is None and header.contraction != "ndc" and not header.steps.in_ndc
+    axes = np.array(frustum.axes)
+    return bool(
+        np.isfinite(frustum.origin).all()
+        and np.abs(axes @ axes.T - np.eye(3)).max() < 1e-6
+        and 0.0 < frustum.near < math.inf
+        and 0.0 < frustum.depth < math.inf
     )
 
 

@@ -121,7 +121,12 @@ def find_sight(
         steps=_steps(config),
         time_limit=None if limit is None else TIME_SHARE * limit / rounds,
         content_distance="auto" if isinstance(given, str) else given,
-        grid=replace(config.grid, voxels=min(VOXELS, config.grid.voxels), grow_at=()),
+        grid=replace(
+            config.grid,
+            voxels=min(VOXELS, config.grid.voxels),
+            contraction="auto" if config.grid.contraction == "ndc" else config.grid.contraction,
+            grow_at=(),
+        ),
     )
     sight, seconds = None, 0.0
     for done in range(rounds):

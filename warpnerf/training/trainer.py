@@ -22,6 +22,7 @@ from warpnerf.rendering.rays import PixelSampler
 from warpnerf.rendering.render import Steps, TrainingPass, march_struct
 from warpnerf.runtime.memory import give_back
 from warpnerf.runtime.parallel import Workers
+from warpnerf.scenes.frustum import fit_frustum
 from warpnerf.scenes.points import SeenExtent, seen_scene
 from warpnerf.scenes.scene import Scene
 from warpnerf.training.optim import RULES, adam_step, add_total_variation, first_states
@@ -116,7 +117,7 @@ class Trainer:
         self._updates = 0
         assert isinstance(config.model, Model)
         self.model = config.model
-        self.grid = self._first_grid(scene)
+        self.grid = self._first_grid(scene, None if resume is None else resume.field.grid)
         self.weights = first_weights(self.model, config.seed, self.workers)
         self.optimiser = first_states(self.parameters(), self.workers)
         self.free = FreeCells.none(self.workers)
@@ -315,7 +316,7 @@ class Trainer:
         march = self.config.march
         step = march.step_voxels * float(self.grid.voxel_size.min())
         half = float(0.5 * (self.grid.box_max - self.grid.box_min).max())
-        folded = self.grid.contraction != "none"
+        folded = self.grid.folded
         far = march.far
         if far is None:
             far = march.near + FAR_BOXES * half + self._reach if folded else math.inf
@@ -327,13 +328,19 @@ class Trainer:
             n_linear=n_linear if folded else 0,
             growth=march.growth if folded else 0.0,
             transmittance_min=march.transmittance_min,
+            in_ndc=self.grid.frustum is not None,
         )
 
-    def _first_grid(self, scene: Scene) -> VoxelGrid:
+    def _first_grid(self, scene: Scene, resumed: VoxelGrid | None) -> VoxelGrid:
         config = self.config.grid
         contraction = _contraction(scene, self.config)
-        border = 0.0 if contraction == "none" else config.border
-        extent = (scene.box_max - scene.box_min) * (1.0 + border)
+        border = config.border if contraction in ("linf", "l2") else 0.0
+        frustum, box = None, (scene.box_min, scene.box_max)
+        if resumed is not None and resumed.frustum is not None:
+            frustum, box = resumed.frustum, (resumed.box_min, resumed.box_max)
+        elif contraction == "ndc":
+            frustum, box = fit_frustum(scene, config.planes, config.voxels)
+        extent = (box[1] - box[0]) * (1.0 + border)
         final = grid_size(extent, config.voxels)
         require_memory(final, self.model.n_floats, self.workers.device)
         size = grid_size(extent, self._voxels(0))
@@ -342,13 +349,14 @@ class Trainer:
         return VoxelGrid(
             values=wp.zeros(n, dtype=vector(self.model.n_floats), device=self.workers.device),
             size=size,
-            box_min=scene.box_min,
-            box_max=scene.box_max,
+            box_min=box[0],
+            box_max=box[1],
             contraction=contraction,
             border=border,
             # softplus(shift) is the optical depth of a voxel of the final grid.
             density_shift=math.log(math.expm1(-math.log1p(-config.alpha_init))),
             density_scale=1.0 / voxel,
+            frustum=frustum,
         )
 
     def _voxels(self, grown: int) -> int:
@@ -410,7 +418,7 @@ class Trainer:
     def _tight_box(self) -> tuple[np.ndarray, np.ndarray]:
         """The box around what is occupied, where space is bounded; never larger than before."""
         box_min, box_max = self.grid.box_min, self.grid.box_max
-        if self.grid.contraction != "none":
+        if self.grid.folded:
             return box_min, box_max
         self._look_for_free_space()
         occupied = self.free.occupied_range()
@@ -474,6 +482,8 @@ def _require_samples(scene: Scene, config: TrainConfig) -> None:
     begin = float(np.linalg.norm(outside, axis=1).min())
     end = float(np.linalg.norm(across, axis=1).max())
     march = config.march
+    if _contraction(scene, config) == "ndc":
+        return  # the frustum begins before all content, and ends far behind it
     if _contraction(scene, config) != "none":
         begin = 0.0  # space outside the box is sampled too
     if march.near >= end:

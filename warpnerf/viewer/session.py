@@ -112,7 +112,7 @@ class Session:
         near, far = depths or (0.0, 2.5 * content_distance)
         settings = Settings(near=near, far=far, within=NEAR_SHARE * content_distance)
         grid = subjects[0].field().grid
-        box = grid.box_min, grid.box_max
+        box = grid.surroundings
         look = _before(box) if scene is None else first_look(scene.training_cameras)
         require_extra("viser", "viewer", "the viewer")
         self._warm_up(Viewpoint(c2w=look.c2w, fov=look.fov, width=4, height=3), settings)

@@ -83,7 +83,8 @@ def open_view(
     if scene is not None:
         distance = distance or scene.content_distance
     depths = None if scene is None else depth_range(first, scene.training_cameras)
-    half = 0.5 * float(np.linalg.norm(first.grid.box_max - first.grid.box_min))
+    low, high = first.grid.surroundings
+    half = 0.5 * float(np.linalg.norm(high - low))
     return Session(
         subjects,
         scene,

@@ -50,12 +50,28 @@ class Density:
 
 
 @wp.struct
+class Frustum:
+    """The frame of normalised device coordinates, see space.ndc; not used in others."""
+
+    origin: vec3  # centre of projection, scene units
+    axes: mat33  # rows: right, down, forward
+    near: real  # depth of the near plane, scene units
+    depth: real  # z of what is infinitely far
+    begin: real  # nothing is sampled nearer to the ray's origin than this, scene units
+    end: real  # nor at or beyond this
+
+
+@wp.struct
 class Box:
-    """The region that is trained, and how space outside of it is folded into a shell around it."""
+    """The region that is trained, and how space outside of it is folded into a shell around it.
+
+    Its coordinates are those of the scene, or those of the frustum.
+    """
 
     centre: vec3
     half: vec3  # half of its edges
     border: real  # width of the shell, in half edges; 0 without contraction
+    frustum: Frustum
 
 
 @wp.struct
@@ -81,8 +97,21 @@ def gradient_type(n_floats: int) -> type:
 
 
 @wp.struct
+class Line:
+    """Where a ray enters a frustum, see space.ndc; not used without one."""
+
+    t: real  # distance there from the ray's origin, scene units
+    w: real  # depth there, scene units
+    slope: real  # depth for each unit of distance
+    speed: real  # how long de/d(t' / w) is
+
+
+@wp.struct
 class Ray:
-    """A ray prepared for one box: q(t) = q_origin + t q_direction."""
+    """A ray prepared for one box: q(t) = q_origin + t q_direction.
+
+    In a frustum t is a length in its coordinates; samples have their distance in the scene.
+    """
 
     index: int  # in its launch
     q_origin: vec3
@@ -91,6 +120,7 @@ class Ray:
     offset: real  # where in its step a sample sits, [0, 1]; 0.5 is the midpoint
     begin: int  # first step that can lie in the box
     end: int  # one past the last
+    line: Line
 
 
 @wp.struct
@@ -98,7 +128,7 @@ class Sample:
     """A visited step."""
 
     step: int
-    t: real  # distance from the ray's origin
-    dt: real  # step length
+    t: real  # distance from the ray's origin, scene units
+    dt: real  # step length, in the coordinates of the box
     det_jacobian: real  # |det J| of the contraction, 1 without
     position: vec3  # folded coordinates c

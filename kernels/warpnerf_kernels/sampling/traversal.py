@@ -9,7 +9,8 @@ import warp as wp
 from ..base.parts import Sampler
 from ..base.simd import VECTORS
 from ..base.types import Box, FreeSpace, Ray, Sample, real, vec2, vec3
-from ..space.contraction import L2, NONE, contract, det_jacobian_of
+from ..space.contraction import L2, LINF, NDC, contract, det_jacobian_of, folds
+from ..space.ndc import LEAST, distance_at, enter, length_to, stretch_at
 
 wp.set_module_options({"enable_backward": False})
 
@@ -61,7 +62,7 @@ def cell_margin(m: real) -> real:
 def free_length(free: FreeSpace, ray: Ray, m: vec3, distance: int, contraction: int) -> real:
     """A distance along the ray through which nothing but free cells is met."""
     rings = real(distance - 1)
-    if contraction == NONE:
+    if not folds(contraction):
         speed = wp.cw_mul(ray.q_direction, free.to_cells)
         return wp.min(
             block_exit(m[0], speed[0], rings),
@@ -74,17 +75,34 @@ def free_length(free: FreeSpace, ray: Ray, m: vec3, distance: int, contraction: 
     return (rings + margin) / (real(2.0) * wp.length(ray.q_direction) * widest)
 
 
+@wp.func
+def distance_of(ray: Ray, t: real, contraction: int) -> real:
+    """How far from its origin a ray is at t, scene units."""
+    if contraction == NDC:
+        return distance_at(ray.line, t)
+    return t
+
+
+@wp.func
+def length_of(ray: Ray, distance: real, dt: real, contraction: int) -> real:
+    """How long a step dt at a distance is, scene units."""
+    if contraction == NDC:
+        return dt * stretch_at(ray.line, distance)
+    return dt
+
+
 @wp.func_native(
     VECTORS
     + r"""
 auto& pack = packs.data[slot];
-const vec t = load(pack.t);
+vec t = load(pack.t);
+const bool folds = contraction == LINF || contraction == L2;
 vec qx = ray.q_origin.c[0] + t * ray.q_direction.c[0];
 vec qy = ray.q_origin.c[1] + t * ray.q_direction.c[1];
 vec qz = ray.q_origin.c[2] + t * ray.q_direction.c[2];
 ivec visited = load_int(pack.visited);
 vec det_jacobian = all(1.0f);
-if (contraction == NONE) {
+if (!folds) {
     visited &= (magnitude(qx) <= 1.0f) & (magnitude(qy) <= 1.0f) & (magnitude(qz) <= 1.0f);
 } else {
     vec norm = contraction == L2
@@ -107,13 +125,21 @@ if (free.distance.shape[0] > 1) {
     for (int n = 0; n < LANES; ++n) distance[n] = free.distance.data[cell[n]];
     visited &= distance == 0;
 }
+if (contraction == NDC) {
+    const vec left = most(ray.line.speed - t * ray.line.slope, all(LEAST * ray.line.speed));
+    t = ray.line.t + t * ray.line.w / left;
+    visited &= t < box.frustum.end;
+}
 store_int(pack.visited, visited);
 store(pack.t, visited ? t : all(0.0f));
 store(pack.det_jacobian, det_jacobian);
 store(pack.x, qx);
 store(pack.y, qy);
 store(pack.z, qz);
-""".replace("NONE", str(NONE)).replace("L2", str(L2))
+""".replace("LINF", str(LINF))
+    .replace("L2", str(L2))
+    .replace("NDC", str(NDC))
+    .replace("LEAST", f"{LEAST!r}f")
 )
 def locate_pack(
     box: Box,
@@ -124,6 +150,23 @@ def locate_pack(
     slot: int,
 ):
     """What next_sample does with a step, for sixteen: where they are, and which are samples."""
+    ...
+
+
+@wp.func_native(
+    VECTORS
+    + r"""
+auto& pack = packs.data[slot];
+vec length = load(pack.dt);
+if (contraction == NDC) {
+    const vec w = ray.line.w + (load(pack.t) - ray.line.t) * ray.line.slope;
+    length *= w * w / (ray.line.w * ray.line.speed);
+}
+store(pack.length, length);
+""".replace("NDC", str(NDC))
+)
+def measure_pack(ray: Ray, contraction: int, packs: wp.array(dtype=Any), slot: int):
+    """length_of each sample of a pack, for losses."""
     ...
 
 
@@ -163,10 +206,17 @@ def traversal(sampler: Sampler) -> SimpleNamespace:
         ray.index = index
         ray.offset = offset
         ray.direction = direction
-        ray.q_origin = wp.cw_div(origin - box.centre, box.half)
-        ray.q_direction = wp.cw_div(direction, box.half)
         interval = vec2(march.near, march.far)
-        if contraction == NONE:
+        if contraction == NDC:
+            line, place, along = enter(box.frustum, origin, direction)
+            ray.line = line
+            ray.q_origin = wp.cw_div(place - box.centre, box.half)
+            ray.q_direction = wp.cw_div(along, box.half)
+            interval[1] = wp.min(interval[1], length_to(line, box.frustum.end))
+        else:
+            ray.q_origin = wp.cw_div(origin - box.centre, box.half)
+            ray.q_direction = wp.cw_div(direction, box.half)
+        if not folds(contraction):
             interval = slab(ray.q_origin[0], ray.q_direction[0], interval)
             interval = slab(ray.q_origin[1], ray.q_direction[1], interval)
             interval = slab(ray.q_origin[2], ray.q_direction[2], interval)
@@ -207,15 +257,17 @@ def traversal(sampler: Sampler) -> SimpleNamespace:
                 and wp.abs(q[1]) <= real(1.0)
                 and wp.abs(q[2]) <= real(1.0)
             )
-            if inside or contraction != NONE:
+            if inside or folds(contraction):
                 c = contract(q, box.border, contraction)
                 m = wp.cw_mul(c, free.to_cells) + real(0.5) * vec3(
                     real(free.size[0]), real(free.size[1]), real(free.size[2])
                 )
                 distance = free_distance(free, m)
                 if distance == 0:
+                    sample.t = distance_of(ray, t, contraction)
+                    if contraction == NDC and sample.t >= box.frustum.end:
+                        return sample
                     sample.step = step
-                    sample.t = t
                     sample.dt = dt
                     sample.det_jacobian = det_jacobian_of(q, box.border, contraction)
                     sample.position = c

@@ -16,6 +16,13 @@ from ..base.types import real, vec3
 NONE = 0
 LINF = 1
 L2 = 2
+NDC = 3  # no contraction of the box's coordinates: these are those of a frustum, see ndc.py
+
+
+@wp.func
+def folds(contraction: int) -> bool:
+    """Whether space outside the box is folded in, so that there is none outside."""
+    return contraction == LINF or contraction == L2
 
 
 @wp.func
@@ -28,8 +35,8 @@ def norm_of(q: vec3, contraction: int) -> real:
 
 @wp.func
 def contract(q: vec3, border: real, contraction: int) -> vec3:
-    """f(q); the identity for NONE."""
-    if contraction == NONE:
+    """f(q); the identity for NONE and NDC."""
+    if not folds(contraction):
         return q
     n = norm_of(q, contraction)
     if n <= real(1.0):
@@ -40,7 +47,7 @@ def contract(q: vec3, border: real, contraction: int) -> vec3:
 @wp.func
 def det_jacobian_of(q: vec3, border: real, contraction: int) -> real:
     """|det df/dq| = b ((1 + b) n - b)^2 / n^6 outside the box, 1 inside; for both norms."""
-    if contraction == NONE:
+    if not folds(contraction):
         return real(1.0)
     n = norm_of(q, contraction)
     if n <= real(1.0):

@@ -54,6 +54,7 @@ def pack_type(encoding: Encoding, head: Head, losses: Losses) -> type:
             **dict(encoding.vectors.pack_fields),
             **dict(head.vectors.pack_fields),
             **({"adj_weight": lanes} if loss is not NONE else {}),  # from the loss on the ray
+            **({"length": lanes} if loss is not NONE else {}),  # of steps, scene units; for it
             **({"adj_density": lanes} if loss.adj_density else {}),  # likewise, of raw densities
             **dict(vector_form(loss).pack_fields),
             **({"of_samples": wp.types.vector(2, wp.float32)} if losses.on_samples else {}),

@@ -86,7 +86,11 @@ def vector_form(loss: RayLoss) -> RayLossVectors:
         after = state
         for lane in range(LANES):
             if packs[slot].visited[lane] != 0:
-                weight, t, dt = packs[slot].weight[lane], packs[slot].t[lane], packs[slot].dt[lane]
+                weight, t, dt = (
+                    packs[slot].weight[lane],
+                    packs[slot].t[lane],
+                    packs[slot].length[lane],
+                )
                 after = add(params, after, weight, t, dt, packs[slot].raw[0, lane])
         return after
 
@@ -104,7 +108,11 @@ def vector_form(loss: RayLoss) -> RayLossVectors:
         adj, adj_raw = lanes(), lanes()
         for lane in range(LANES):
             if packs[slot].visited[lane] != 0:
-                weight, t, dt = packs[slot].weight[lane], packs[slot].t[lane], packs[slot].dt[lane]
+                weight, t, dt = (
+                    packs[slot].weight[lane],
+                    packs[slot].t[lane],
+                    packs[slot].length[lane],
+                )
                 adj[lane] = adj_value * adj_weight(params, total, after, weight, t, dt)
                 if wp.static(of_density):
                     adj_raw[lane] = adj_value * adj_density(params, t)

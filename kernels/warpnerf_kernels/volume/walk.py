@@ -16,7 +16,7 @@ import warp as wp
 from ..base.activation import adj_softplus, opacity_of
 from ..base.parts import Encoding, Head, Losses, Sampler
 from ..base.types import Ray, gradient_type, real, vec3, vector
-from ..sampling.traversal import traversal
+from ..sampling.traversal import distance_of, length_of, traversal
 from .compositing import matter_of, shed
 from .gradscale import distance_scale
 from .sample_loss import ColourSums, adj_sample_loss
@@ -90,8 +90,9 @@ def walk(sampler: Sampler, encoding: Encoding, head: Head, losses: Losses) -> Si
                     if wp.static(on_samples):
                         total.of_samples.weight += weight
                         total.of_samples.square += weight * wp.length_sq(channels)
+                length = length_of(ray, sample.t, sample.dt, contraction)
                 total.loss = add_loss(
-                    scene.loss.on_ray, total.loss, weight, sample.t, sample.dt, raw[0]
+                    scene.loss.on_ray, total.loss, weight, sample.t, length, raw[0]
                 )
                 total.depth += weight * sample.t
                 total.transmittance *= matter.attenuation
@@ -135,11 +136,12 @@ def walk(sampler: Sampler, encoding: Encoding, head: Head, losses: Losses) -> Si
             + adj_end * total.transmittance
             + adj_loss_value * weighted(on_ray, total.loss)
         )
+        end = distance_of(ray, edge(scene.march, ray, ray.end), contraction)
         limit = behind_limit(
             adj_end,
             adj_channels,
-            adj_depth * edge(scene.march, ray, ray.end),
-            adj_loss_value * loss_bound(on_ray, total.loss, edge(scene.march, ray, ray.end)),
+            adj_depth * end,
+            adj_loss_value * loss_bound(on_ray, total.loss, end),
         )
         before = State()
         transmittance = real(1.0)
@@ -154,10 +156,11 @@ def walk(sampler: Sampler, encoding: Encoding, head: Head, losses: Losses) -> Si
             scale = distance_scale(
                 sample.t, content_distance, sample.det_jacobian, scaling, jacobian
             )
+            length = length_of(ray, sample.t, sample.dt, contraction)
             adj_weight = adj_depth * sample.t + adj_loss_value * adj_loss(
-                on_ray, total.loss, before, weight, sample.t, sample.dt
+                on_ray, total.loss, before, weight, sample.t, length
             )
-            before = add_loss(on_ray, before, weight, sample.t, sample.dt, raw[0])
+            before = add_loss(on_ray, before, weight, sample.t, length, raw[0])
             adj_raw = Raw()
             if weight > real(weight_min):
                 channels = decode(scene.head, view, raw)

@@ -14,7 +14,7 @@ from ..base.parts import Encoding, Head, Losses, Sampler
 from ..base.simd import LANES, lanes
 from ..base.types import Ray
 from ..cpu.scatter import sink_type
-from ..sampling.traversal import locate_pack, traversal
+from ..sampling.traversal import distance_of, locate_pack, measure_pack, traversal
 from .gradscale import distance_scale
 from .pack import compositing, pack_type, row_type, weigh
 from .ray_loss import NONE, vector_form
@@ -126,6 +126,7 @@ def walk_packs(sampler: Sampler, encoding: Encoding, head: Head, losses: Losses)
                 channels += packs[k].sums
                 depth += packs[k].depth
                 if wp.static(has_loss):
+                    measure_pack(ray, contraction, packs, k)
                     state = add_pack(scene.loss.on_ray, state, packs, k)
                 if wp.static(on_samples):
                     of_samples.weight += packs[k].of_samples[0]
@@ -176,16 +177,13 @@ def walk_packs(sampler: Sampler, encoding: Encoding, head: Head, losses: Losses)
             + adj_end * rows[row].transmittance
         )
         of_loss = float(0.0)
+        far_end = distance_of(ray, edge(scene.march, ray, ray.end), contraction)
         if wp.static(has_loss):
             behind += adj_loss_value * weighted(on_ray, rows[row].loss)
-            of_loss = adj_loss_value * loss_bound(
-                on_ray, rows[row].loss, edge(scene.march, ray, ray.end)
-            )
+            of_loss = adj_loss_value * loss_bound(on_ray, rows[row].loss, far_end)
         if wp.static(on_samples):
             rows[row].sample_slope = 2.0 * scene.loss.on_samples * adj_loss_value
-        limit = behind_limit(
-            adj_end, adj_channels, adj_depth * edge(scene.march, ray, ray.end), of_loss
-        )
+        limit = behind_limit(adj_end, adj_channels, adj_depth * far_end, of_loss)
         before = State()
         short = rows[row].n_samples < 4 * LANES  # else adj_read_pack asks for all but the first two
         transmittance = float(1.0)
@@ -226,6 +224,8 @@ def walk_packs(sampler: Sampler, encoding: Encoding, head: Head, losses: Losses)
                 if short and n + slot - first < wp.static(max(n_packs, 2)):
                     fetch_pack(scene.field, packs, slot, worker, sink)
                 if wp.static(has_loss):
+                    if not kept:
+                        measure_pack(ray, contraction, packs, slot)
                     packs[slot].adj_weight = lanes()
                     if wp.static(of_density):
                         packs[slot].adj_density = lanes()

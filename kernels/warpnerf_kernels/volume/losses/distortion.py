@@ -108,7 +108,7 @@ OF_PACK = (
     + r"""
 auto& pack = packs.data[slot];
 const vec zero = all(0.0f), weight = load(pack.weight), t = load(pack.t);
-const vec half = 0.5f * load(pack.dt), end = t + half;
+const vec half = 0.5f * load(pack.length), end = t + half;
 const vec begin = t > half ? t - half : zero;
 const vec s = t / (params.unit + t);
 const vec h = params.unit * (end - begin) / ((params.unit + begin) * (params.unit + end));
