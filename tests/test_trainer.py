@@ -49,6 +49,19 @@ def ball() -> Scene:
     return scene
 
 
+def large_ball() -> Scene:
+    """The same on photographs four times as wide."""
+    scene = ball()
+    views = []
+    for view in scene.views:
+        c = view.camera
+        sizes = {"width": 4 * c.width, "height": 4 * c.height}
+        lens = {"fx": 4 * c.fx, "fy": 4 * c.fy, "cx": 4 * c.cx, "cy": 4 * c.cy}
+        image = view.image.repeat(4, axis=0).repeat(4, axis=1)
+        views.append(replace(view, camera=replace(c, **sizes, **lens), image=image))
+    return replace(scene, views=views)
+
+
 def tiny_config(**changes: Any) -> TrainConfig:
     return replace(
         TrainConfig(
@@ -271,6 +284,39 @@ def test_resumed_between_updates_of_several_steps_it_ends_the_same(
     for step in (4, 6, 10, 14, 18):
         begun = stopped_at(step, tmp_path / "begun", config, ball())
         resumed = stopped_at(STEPS, tmp_path / "resumed", config, ball(), begun)
+        assert_same_state(without_seconds(resumed), without_seconds(whole))
+
+
+# Rates at which most of the empty space is found within a few steps.
+QUICK: dict[str, Any] = {
+    "steps": 60,
+    "model": "rgb",
+    "optim": OptimConfig(learning_rate_density=3.0, accumulate_at=()),
+    "grid": GridConfig(voxels=20_000, grow_at=(), alpha_init=0.1),
+}
+
+
+def test_pixels_that_see_nothing_are_left_out_of_bounded_scenes(on_cpu: None) -> None:
+    def seen(scene: Scene, **changes: Any) -> tuple[float, float]:
+        config = tiny_config(**QUICK, **changes)
+        progress = train(scene, config).progress
+        return progress.seen, progress.samples_per_ray
+
+    share, samples = seen(large_ball())
+    assert 0.1 < share < 0.97
+    everywhere, fewer = seen(large_ball(), skip_empty_rays=False)
+    assert everywhere == 1.0 and samples > fewer
+    assert seen(replace(large_ball(), unbounded=True))[0] == 1.0
+
+
+def test_resumed_it_draws_from_the_same_pixels(tmp_path: Path, on_cpu: None) -> None:
+    config, scene = tiny_config(**QUICK), large_ball()
+    whole = stopped_at(60, tmp_path / "whole", config, scene)
+    assert whole.progress.seen < 0.97
+    for step in (52, 55):
+        begun = stopped_at(step, tmp_path / "begun", config, scene)
+        assert begun.progress.seen < 1.0
+        resumed = stopped_at(60, tmp_path / "resumed", config, scene, begun)
         assert_same_state(without_seconds(resumed), without_seconds(whole))
 
 

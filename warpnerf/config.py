@@ -209,6 +209,9 @@ class TrainConfig:
     (white when rendering); auto: white where photographs have alpha, else black."""
     occupancy_every: int = 100
     """Updates of the grid between two looks for free space, each of one or several steps."""
+    skip_empty_rays: bool = True
+    """Whether bounded scenes are trained without pixels whose rays meet free space only: they see
+    the background, whatever is trained."""
     alpha_min: float = 1e-2
     """A cell is free where the longest step that there can be would be less opaque than this."""
     seed: int = 0

@@ -34,13 +34,16 @@ class Progress:
     loss: float
     """Of the last update: mean over its rays of the squared error, summed over channels."""
     psnr: float
-    """Of the last update's rays, dB."""
+    """Of the last update's rays, dB: over what is seen, without the background around it."""
     samples_per_ray: float
     """Visited steps per ray of the last update."""
     size: tuple[int, int, int]
     """Nodes of the grid."""
     occupied: float
     """Share of cells that are not free, [0, 1]."""
+    seen: float = 1.0
+    """Share of the pixels, as blocks of them tell, that rays are drawn from, (0, 1]; those of all
+    others meet nothing."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

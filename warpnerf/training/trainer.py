@@ -118,6 +118,9 @@ class Trainer:
         if resume is not None:
             self._restore(resume)
         self._occupied = self.free.share()
+        self._seen = 1.0
+        if resume is not None and self.free.size != (1, 1, 1):
+            self._keep_to_what_is_seen()
         self._pass = self._training_pass()
 
     def run(
@@ -231,6 +234,7 @@ class Trainer:
             samples_per_ray=float(self._pass.n_samples.numpy()[:n_rays].mean()),
             size=self.grid.size,
             occupied=self._occupied,
+            seen=self._seen,
         )
         return self._progress
 
@@ -401,7 +405,7 @@ class Trainer:
         box_min, box_max = self.grid.box_min, self.grid.box_max
         if self.grid.contraction != "none":
             return box_min, box_max
-        self._look_for_free_space()
+        self._find_free_space()
         occupied = self.free.occupied_range()
         if occupied is None:
             return box_min, box_max
@@ -409,9 +413,21 @@ class Trainer:
         return box_min + occupied[0] * extent, box_min + occupied[1] * extent
 
     def _look_for_free_space(self) -> None:
-        """Find what need not be sampled; not in the first steps, when nothing has grown yet."""
+        """Find what need not be sampled, nor drawn.
+
+        Not in the first steps, when nothing has grown yet.
+        """
         if self.steps_done < FIRST_LOOK:
             return
+        self._find_free_space()
+        self._keep_to_what_is_seen()
+
+    def _keep_to_what_is_seen(self) -> None:
+        """Draw no pixels whose rays meet free space only; in folded space all see something."""
+        if self.config.skip_empty_rays and self.grid.contraction == "none":
+            self._seen = self._sampler.keep_to(self.grid, self.free)
+
+    def _find_free_space(self) -> None:
         model = self.config.model
         march = march_struct(model, "float32", self.march_steps(), self.workers)
         sampler = parts_of(model, "float32").sampler
