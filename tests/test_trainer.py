@@ -20,6 +20,7 @@ from warpnerf.rendering.adjoint import Gradients
 from warpnerf.scenes.scene import Scene
 from warpnerf.training import trainer as training
 from warpnerf.training.checkpoint import load_checkpoint, save_checkpoint
+from warpnerf.training.optim import adam_step
 from warpnerf.training.state import TrainingState
 from warpnerf.training.train import train
 from warpnerf.training.trainer import Trainer
@@ -317,6 +318,59 @@ def test_resumed_it_draws_from_the_same_pixels(tmp_path: Path, on_cpu: None) -> 
         begun = stopped_at(step, tmp_path / "begun", config, scene)
         assert begun.progress.seen < 1.0
         resumed = stopped_at(60, tmp_path / "resumed", config, scene, begun)
+        assert_same_state(without_seconds(resumed), without_seconds(whole))
+
+
+# As DVGO grows; each of the two changes what is trained.
+AS_DVGO: dict[str, Any] = {
+    "grid": replace(tiny_config().grid, shift_at_growth=1.0),
+    "optim": replace(tiny_config().optim, restart_at_growth=True),
+}
+
+
+def test_growth_takes_its_shift_from_densities(on_cpu: None) -> None:
+    trainer, plain = (Trainer(ball(), tiny_config(**c)) for c in (AS_DVGO, {}))
+    first = plain.grid.density_shift
+    for growths, step in enumerate((1, *(at + 1 for at in GROWING))):
+        while trainer.steps_done < step:
+            trainer.update()
+            plain.update()
+        assert trainer.grid.density_shift == pytest.approx(first - growths, abs=1e-12)
+        assert plain.grid.density_shift == first
+
+
+def test_growth_lets_the_optimiser_begin_anew(
+    monkeypatch: pytest.MonkeyPatch, on_cpu: None
+) -> None:
+    steps: dict[int, tuple[int, float, bool]] = {}
+
+    def watched(parameters: Any, states: Any, gradients: Any, update: int, *rest: Any) -> None:
+        fresh = not any(a.numpy().any() for s in states.values() for a in s.values())
+        steps[trainer.steps_done] = update, rest[0], fresh
+        adam_step(parameters, states, gradients, update, *rest)
+
+    monkeypatch.setattr(training, "adam_step", watched)
+    config = tiny_config(optim=AS_DVGO["optim"])
+    trainer = Trainer(ball(), config)
+    trainer.run()
+    decay = config.optim.decay
+    for step, (update, factor, fresh) in steps.items():
+        grown = sum(step > at for at in GROWING)
+        begun = (0, *GROWING)[grown]
+        assert update == step - begun and fresh == (update == 1)
+        since = (0.0, *config.grid.grow_at)[grown]
+        assert factor == pytest.approx(decay ** ((step - 1) / STEPS - since))
+    monkeypatch.setattr(training, "adam_step", adam_step)
+    assert len(steps) == STEPS
+
+
+def test_resumed_after_an_optimiser_that_began_anew(tmp_path: Path, on_cpu: None) -> None:
+    config = tiny_config(**AS_DVGO)
+    whole = stopped_at(STEPS, tmp_path / "whole", config, ball())
+    assert whole.restarted == GROWING[1]
+    for step in (6, 7, 8, 13, 14, 17):
+        begun = stopped_at(step, tmp_path / "begun", config, ball())
+        resumed = stopped_at(STEPS, tmp_path / "resumed", config, ball(), begun)
         assert_same_state(without_seconds(resumed), without_seconds(whole))
 
 

@@ -178,6 +178,7 @@ class PixelSampler:
         """From now on draw no pixels whose rays, and those of all around them, meet nothing.
 
         Such rays see the background, whatever is trained. Pixels are told apart in square blocks.
+        Batches have as many rays as had met something among all, on average.
 
         Args:
             grid: Without contraction.
@@ -203,27 +204,33 @@ class PixelSampler:
             self._block, self._covered = edge, covered
             device = self._workers.device
             self._first_blocks = wp.array(first[:-1], dtype=wp.int32, device=device)
-        return share or 1.0
+        share = share or 1.0
+        self._n_drawn = max(1, round(share * self._n_rays))
+        return share
 
     def _draw_anywhere(self) -> None:
         """No blocks are left out."""
+        self._n_drawn = self._n_rays
         self._block = 1
         self._first_blocks = wp.empty(0, dtype=wp.int32, device=self._workers.device)
         self._covered = wp.empty(0, dtype=wp.uint8, device=self._workers.device)
 
     def draw(self, step: int, n_steps: int = 1) -> RayBatch:
-        """The batches of some steps as one, each a function of its step and the seed.
+        """The batches of some steps as one.
+
+        What is drawn is a function of the steps, the seed, and of what ``keep_to`` was given. As
+        long as that has left nothing out, a batch of several steps is made of those of each.
 
         Args:
             step: The first.
             n_steps: How many.
 
         Returns:
-            n_steps times as many rays as a step has, in the same arrays from one call to the next
+            n_steps times as many rays as a step draws, in the same arrays from one call to the next
             as long as there are as many.
         """
-        if self._batch.count != n_steps * self._n_rays:
-            self._batch = _room(n_steps * self._n_rays, self._workers)
+        if self._batch.count != n_steps * self._n_drawn:
+            self._batch = _room(n_steps * self._n_drawn, self._workers)
         batch = self._batch
         self._workers.launch(
             kernels.sample_pixels,
@@ -258,7 +265,7 @@ def _n_blocks(camera: Camera, edge: int) -> int:
 def _block_edge(cameras: Sequence[Camera], grid: VoxelGrid, free: FreeCells) -> int:
     """Pixels along the edge of a block: a power of two from 4, which keeps to MOST_BLOCKS.
 
-    About half as wide as a cell in the middle of the box: cones are held against whole cells, so
+    At most as wide as a cell in the middle of the box: cones are held against whole cells, so
     smaller blocks would hardly leave out more.
     """
     cell = float(((grid.box_max - grid.box_min) / np.array(free.size)).min())
@@ -266,7 +273,7 @@ def _block_edge(cameras: Sequence[Camera], grid: VoxelGrid, free: FreeCells) -> 
     away = [float(np.linalg.norm(camera.position - centre)) for camera in cameras]
     pixels = [cell * c.fx / max(d, cell) for c, d in zip(cameras, away, strict=True)]
     edge = 4
-    while edge <= 0.25 * np.median(pixels):
+    while edge <= 0.5 * np.median(pixels):
         edge *= 2
     while sum(_n_blocks(camera, edge) for camera in cameras) > MOST_BLOCKS:
         edge *= 2

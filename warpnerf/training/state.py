@@ -34,7 +34,7 @@ class Progress:
     loss: float
     """Of the last update: mean over its rays of the squared error, summed over channels."""
     psnr: float
-    """Of the last update's rays, dB: over what is seen, without the background around it."""
+    """Of the last update's rays, dB."""
     samples_per_ray: float
     """Visited steps per ray of the last update."""
     size: tuple[int, int, int]
@@ -43,7 +43,7 @@ class Progress:
     """Share of cells that are not free, [0, 1]."""
     seen: float = 1.0
     """Share of the pixels, as blocks of them tell, that rays are drawn from, (0, 1]; those of all
-    others meet nothing."""
+    others meet nothing, and ``loss``, ``psnr`` and ``samples_per_ray`` do not count them."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -64,6 +64,8 @@ class TrainingState:
     """How often the grid has grown."""
     updates: int
     """How often the optimiser has updated the grid."""
+    restarted: int = 0
+    """Updates before the optimiser last began anew, see ``OptimConfig.restart_at_growth``."""
     progress: Progress
     """Where it stands: steps done, seconds, loss."""
     field: Field

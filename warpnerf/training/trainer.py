@@ -105,6 +105,7 @@ class Trainer:
         self._accumulation = config.optim.accumulation(scene.kind)
         self._grown = 0
         self._updates = 0
+        self._restarted = 0
         assert isinstance(config.model, Model)
         self.model = config.model
         self.grid = self._first_grid(scene)
@@ -185,7 +186,7 @@ class Trainer:
         before = self.steps_done
         n_steps = min(self._steps_an_update(fraction), config.steps - before)
         batch = self._sampler.draw(before, n_steps)
-        self._pass.run(self.free, batch, n_steps)
+        self._pass.run(self.free, batch, n_steps, self._seen)
         if self._updates % config.optim.tv_every == 0:
             add_total_variation(
                 self.parameters(),
@@ -202,8 +203,8 @@ class Trainer:
             self.parameters(),
             self.optimiser,
             self._pass.gradients,
-            self._updates,
-            config.optim.decay**fraction * n_steps**0.25,
+            self._updates - self._restarted,
+            config.optim.decay ** (fraction - self._decay_from()) * n_steps**0.25,
             config.optim,
             self.workers,
         )
@@ -262,6 +263,7 @@ class Trainer:
             reach=self._reach,
             grown=self._grown,
             updates=self._updates,
+            restarted=self._restarted,
             progress=progress,
             field=self.field(),
             optimiser=self.optimiser,
@@ -289,6 +291,7 @@ class Trainer:
         }
         self._grown = state.grown
         self._updates = state.updates
+        self._restarted = state.restarted
         self._progress = state.progress
         self.steps_done = state.progress.step
         self._seconds = state.progress.seconds
@@ -359,6 +362,12 @@ class Trainer:
         """Steps whose losses are added up for one, after that share of the training."""
         return 1 << sum(fraction >= at for at in self._accumulation)
 
+    def _decay_from(self) -> float:
+        """The share of the training at which learning rates were those of the start."""
+        if self._grown == 0 or not self.config.optim.restart_at_growth:
+            return 0.0
+        return self.config.grid.grow_at[self._grown - 1]
+
     def _training_pass(self) -> TrainingPass:
         return TrainingPass(
             self.config.rays_per_step << len(self._accumulation),
@@ -394,8 +403,12 @@ class Trainer:
             state = self.optimiser[parameter.name]
             resized = RULES[parameter.kind].resized(state, self.grid, grid, self.workers)
             self.optimiser[parameter.name] = resized
-        self.grid = grid
+        shift = (grown - self._grown) * self.config.grid.shift_at_growth
+        self.grid = replace(grid, density_shift=grid.density_shift - shift)
         self._grown = grown
+        if self.config.optim.restart_at_growth:
+            self.optimiser = first_states(self.parameters(), self.workers)
+            self._restarted = self._updates
         give_back()
         self._pass = self._training_pass()
         self._look_for_free_space()
