@@ -357,6 +357,17 @@ def test_tightening(tmp_path):
         assert f"{row['psnr']:.2f}" in printed
 
 
+@pytest.mark.slow
+def test_growth(tmp_path):
+    options = ("builtin:room-sparse", "--downscale", "8", "--steps", "320", "--voxels", "8000")
+    record, printed = run("growth.py", tmp_path / "record.json", *options, "--model", "rgb")
+    ways = ["carried over", "begun anew", "shifted", "both"]
+    assert [row["at_growth"] for row in record["rows"]] == ways
+    assert len({row["psnr"] for row in record["rows"]}) == 4  # each changes something
+    for row in record["rows"]:
+        assert row["psnr"] > 5 and row["seconds"] > 0 and f"{row['psnr']:.2f}" in printed
+
+
 def test_the_truth_of_meshes():
     """What photographs of the room show lies on surfaces that mesh.py measures distances to."""
     pytest.importorskip("scipy")

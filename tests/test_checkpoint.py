@@ -253,6 +253,7 @@ def in_config(old: str, new: str) -> Callable[[str], str]:
         (lambda text: text.replace('"border": 0.0', '"border": 7.0'), {}, "rendered"),
         (lambda text: text.replace('"grown": 2', '"grown": 9'), {}, "9 times"),
         (lambda text: text.replace('"updates": 5', '"updates": 6'), {}, "6 updates"),
+        (lambda text: text.replace('"restarted": 0', '"restarted": 7'), {}, "after 7"),
         (lambda text: text.replace('"seed": 0', '"seed": -1'), {}, "seed"),
         (lambda text: text.replace('"step": 5', '"step": "five"'), {}, "step"),
         (in_model('"deferred"', '"dreams"'), {}, "dreams"),

@@ -4,8 +4,11 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+import warp as wp
 from test_determinism import small_scene
+from warpnerf_kernels.base.types import vector
 
+from warpnerf.model.grid import FreeCells, VoxelGrid
 from warpnerf.rendering.rays import PixelSampler, RayBatch, camera_rays, runs_of
 from warpnerf.runtime.parallel import Workers
 from warpnerf.scenes.scene import View
@@ -102,6 +105,75 @@ def test_a_mask_of_all_pixels_changes_no_bit(device: str) -> None:
     one, other = (drawn(PixelSampler(v, *options).draw(5)) for v in (views, whole))
     for name, found in one.items():
         assert np.array_equal(found, other[name])
+
+
+MIDDLE = np.array([14, 10, 7])
+"""Of the cells that are occupied, which each view sees elsewhere."""
+
+
+def little_occupied(views: list[View]) -> tuple[VoxelGrid, FreeCells]:
+    """A grid around what the views look at, of whose cells 3 x 3 x 3 are occupied."""
+    steps = np.abs(np.indices((21, 21, 21)) - MIDDLE[:, None, None, None]).max(0)
+    distance = np.clip(steps - 1, 0, 9).astype(np.uint8)
+    grid = VoxelGrid(
+        values=wp.zeros(43**3, dtype=vector(4), device="cpu"),
+        size=(43, 43, 43),
+        box_min=np.full(3, -1.0),
+        box_max=np.full(3, 1.0),
+    )
+    assert len(views) == 3
+    cells = wp.array(distance.ravel(), dtype=wp.uint8, device="cpu")
+    return grid, FreeCells(distance=cells, size=(21, 21, 21), border=0.0)
+
+
+def test_pixels_around_what_is_there_are_not_drawn_and_all_others_alike(on_cpu: None) -> None:
+    views = masked_views()
+    n_rays = 400_000
+    options = ((0.0, 0.0, 0.0), n_rays, False, 3, Workers("cpu", 2))
+    sampler = PixelSampler(views, np.full(len(views), 2.0), *options)
+    before = drawn(sampler.draw(0))
+    share = sampler.keep_to(*little_occupied(views))
+    assert 0.02 < share < 0.6
+    batch = drawn(sampler.draw(0))
+    row, column, number = np.round(255.0 * batch["target_rgb"]).astype(int).T
+    height, width = views[0].image.shape[:2]
+    counts = np.zeros((len(views), height, width), int)
+    np.add.at(counts, (number, row, column), 1)
+    masks = np.stack([np.ones((height, width), bool) if v.mask is None else v.mask for v in views])
+    assert (counts[~masks] == 0).all()
+    # Whole blocks are drawn from, or left out.
+    pad = ((0, 0), (0, -height % 4), (0, -width % 4))
+    blocks = np.pad(counts, pad).reshape(3, -(-height // 4), 4, -(-width // 4), 4)
+    in_block = (blocks.sum((2, 4)) > 0).repeat(4, 1).repeat(4, 2)[:, :height, :width]
+    assert 0.0 < in_block[masks].mean() < 0.7
+    found = counts[in_block & masks]
+    assert len(batch["offsets"]) == round(share * n_rays) == counts.sum()
+    mean = counts.sum() / len(found)
+    scores = (found - mean) / np.sqrt(mean)
+    assert np.abs(scores).max() < 5.0 and scores.std() == pytest.approx(1.0, abs=0.2)
+    # No ray that passes the cell is left out.
+    for index, view in enumerate(views):
+        origins, directions = (a.numpy() for a in camera_rays(view.camera, Workers("cpu", 1)))
+        low, high = ((MIDDLE + edge) * 2 / 21 - 1 for edge in (-1, 2))
+        a, b = (low - origins) / directions, (high - origins) / directions
+        meets = np.maximum(a, b).min(1) >= np.minimum(a, b).max(1)
+        assert meets.any() and in_block[index].ravel()[meets].all()
+    # A ray whose pixel was drawn before is the same ray.
+    same = (before["directions"][: len(row)] == batch["directions"]).all(1)
+    assert 0.02 < same.mean() < 0.7
+
+
+def test_where_nothing_or_everything_is_seen_all_pixels_are_drawn(on_cpu: None) -> None:
+    views = masked_views()
+    options = ((0.0, 0.0, 0.0), 500, False, 3, Workers("cpu", 2))
+    sampler = PixelSampler(views, np.full(len(views), 2.0), *options)
+    before = drawn(sampler.draw(7))
+    grid, free = little_occupied(views)
+    for distance in (0, 9):
+        free.distance.fill_(distance)
+        assert sampler.keep_to(grid, free) == 1.0
+        for name, found in drawn(sampler.draw(7)).items():
+            assert np.array_equal(found, before[name])
 
 
 def test_runs_by_hand() -> None:

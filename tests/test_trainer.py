@@ -20,6 +20,7 @@ from warpnerf.rendering.adjoint import Gradients
 from warpnerf.scenes.scene import Scene
 from warpnerf.training import trainer as training
 from warpnerf.training.checkpoint import load_checkpoint, save_checkpoint
+from warpnerf.training.optim import adam_step
 from warpnerf.training.state import TrainingState
 from warpnerf.training.train import train
 from warpnerf.training.trainer import Trainer
@@ -47,6 +48,19 @@ def ball() -> Scene:
     for view in scene.views:
         view.image[..., 3] = 255 * inside
     return scene
+
+
+def large_ball() -> Scene:
+    """The same on photographs four times as wide."""
+    scene = ball()
+    views = []
+    for view in scene.views:
+        c = view.camera
+        sizes = {"width": 4 * c.width, "height": 4 * c.height}
+        lens = {"fx": 4 * c.fx, "fy": 4 * c.fy, "cx": 4 * c.cx, "cy": 4 * c.cy}
+        image = view.image.repeat(4, axis=0).repeat(4, axis=1)
+        views.append(replace(view, camera=replace(c, **sizes, **lens), image=image))
+    return replace(scene, views=views)
 
 
 def tiny_config(**changes: Any) -> TrainConfig:
@@ -302,6 +316,92 @@ def test_resumed_between_updates_of_several_steps_it_ends_the_same(
     whole = stopped_at(STEPS, tmp_path / "whole", config, ball())
     assert whole.updates == 10
     for step in (4, 6, 10, 14, 18):
+        begun = stopped_at(step, tmp_path / "begun", config, ball())
+        resumed = stopped_at(STEPS, tmp_path / "resumed", config, ball(), begun)
+        assert_same_state(without_seconds(resumed), without_seconds(whole))
+
+
+# Rates at which most of the empty space is found within a few steps.
+QUICK: dict[str, Any] = {
+    "steps": 60,
+    "model": "rgb",
+    "optim": OptimConfig(learning_rate_density=3.0, accumulate_at=()),
+    "grid": GridConfig(voxels=20_000, grow_at=(), alpha_init=0.1),
+}
+
+
+def test_pixels_that_see_nothing_are_left_out_of_bounded_scenes(on_cpu: None) -> None:
+    def seen(scene: Scene, **changes: Any) -> tuple[float, float]:
+        config = tiny_config(**QUICK, **changes)
+        progress = train(scene, config).progress
+        return progress.seen, progress.samples_per_ray
+
+    share, samples = seen(large_ball())
+    assert 0.1 < share < 0.97
+    everywhere, fewer = seen(large_ball(), skip_empty_rays=False)
+    assert everywhere == 1.0 and samples > fewer
+    assert seen(replace(large_ball(), unbounded=True))[0] == 1.0
+
+
+def test_resumed_it_draws_from_the_same_pixels(tmp_path: Path, on_cpu: None) -> None:
+    config, scene = tiny_config(**QUICK), large_ball()
+    whole = stopped_at(60, tmp_path / "whole", config, scene)
+    assert whole.progress.seen < 0.97
+    for step in (52, 55):
+        begun = stopped_at(step, tmp_path / "begun", config, scene)
+        assert begun.progress.seen < 1.0
+        resumed = stopped_at(60, tmp_path / "resumed", config, scene, begun)
+        assert_same_state(without_seconds(resumed), without_seconds(whole))
+
+
+# As DVGO grows; each of the two changes what is trained.
+AS_DVGO: dict[str, Any] = {
+    "grid": replace(tiny_config().grid, shift_at_growth=1.0),
+    "optim": replace(tiny_config().optim, restart_at_growth=True),
+}
+
+
+def test_growth_takes_its_shift_from_densities(on_cpu: None) -> None:
+    trainer, plain = (Trainer(ball(), tiny_config(**c)) for c in (AS_DVGO, {}))
+    first = plain.grid.density_shift
+    for growths, step in enumerate((1, *(at + 1 for at in GROWING))):
+        while trainer.steps_done < step:
+            trainer.update()
+            plain.update()
+        assert trainer.grid.density_shift == pytest.approx(first - growths, abs=1e-12)
+        assert plain.grid.density_shift == first
+
+
+def test_growth_lets_the_optimiser_begin_anew(
+    monkeypatch: pytest.MonkeyPatch, on_cpu: None
+) -> None:
+    steps: dict[int, tuple[int, float, bool]] = {}
+
+    def watched(parameters: Any, states: Any, gradients: Any, update: int, *rest: Any) -> None:
+        fresh = not any(a.numpy().any() for s in states.values() for a in s.values())
+        steps[trainer.steps_done] = update, rest[0], fresh
+        adam_step(parameters, states, gradients, update, *rest)
+
+    monkeypatch.setattr(training, "adam_step", watched)
+    config = tiny_config(optim=AS_DVGO["optim"])
+    trainer = Trainer(ball(), config)
+    trainer.run()
+    decay = config.optim.decay
+    for step, (update, factor, fresh) in steps.items():
+        grown = sum(step > at for at in GROWING)
+        begun = (0, *GROWING)[grown]
+        assert update == step - begun and fresh == (update == 1)
+        since = (0.0, *config.grid.grow_at)[grown]
+        assert factor == pytest.approx(decay ** ((step - 1) / STEPS - since))
+    monkeypatch.setattr(training, "adam_step", adam_step)
+    assert len(steps) == STEPS
+
+
+def test_resumed_after_an_optimiser_that_began_anew(tmp_path: Path, on_cpu: None) -> None:
+    config = tiny_config(**AS_DVGO)
+    whole = stopped_at(STEPS, tmp_path / "whole", config, ball())
+    assert whole.restarted == GROWING[1]
+    for step in (6, 7, 8, 13, 14, 17):
         begun = stopped_at(step, tmp_path / "begun", config, ball())
         resumed = stopped_at(STEPS, tmp_path / "resumed", config, ball(), begun)
         assert_same_state(without_seconds(resumed), without_seconds(whole))

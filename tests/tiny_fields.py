@@ -109,6 +109,7 @@ def assert_same_state(state: TrainingState, expected: TrainingState) -> None:
         "reach",
         "grown",
         "updates",
+        "restarted",
         "progress",
     ):
         assert getattr(state, name) == getattr(expected, name)

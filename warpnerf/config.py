@@ -47,6 +47,8 @@ class GridConfig:
     """Nodes of the final grid, in all."""
     grow_at: tuple[float, ...] = (0.3, 0.4, 0.5, 0.6)
     """Shares of the training at which the number of nodes doubles."""
+    shift_at_growth: float = 0.0
+    """Taken from all raw densities at each growth, before their activation; DVGO takes 1."""
     alpha_init: float = 1e-3
     """Opacity of one voxel's length before training."""
     contraction: Literal["auto", "none", "linf", "l2", "ndc"] = "auto"
@@ -72,6 +74,7 @@ class GridConfig:
         if not 0 < self.border <= 1:
             raise InputError(f"grid.border must be above 0 and at most 1, not {self.border}.")
         require_shares("grid.grow_at", self.grow_at)
+        require_at_least("grid.shift_at_growth", self.shift_at_growth, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,6 +126,9 @@ class OptimConfig:
     """The same of raw colours. Models with other features have rates of their own for them."""
     decay: float = 0.07
     """What is left of the learning rates at the end of training."""
+    restart_at_growth: bool = False
+    """Whether the optimiser begins anew where the grid grows, as DVGO's does: without moments, and
+    with the learning rates of the start, whose decay goes on from there at the same pace."""
     beta1: float = 0.9
     """Decay of the first moment."""
     beta2: float = 0.99
@@ -253,12 +259,15 @@ class TrainConfig:
     jacobian: Jacobian = "none"
     """Whether the scaling takes the contraction's change of volume into account."""
     rays_per_step: int = 4096
-    """Rays in a batch: what one step draws."""
+    """Rays in a batch: what one step draws, those counted that ``skip_empty_rays`` leaves out."""
     background: Background | tuple[float, float, float] = "auto"
     """What is seen behind the scene: a colour, rgb in [0, 1], or random colours while training
     (white when rendering); auto: white where photographs have alpha, else black."""
     occupancy_every: int = 100
     """Updates of the grid between two looks for free space, each of one or several steps."""
+    skip_empty_rays: bool = True
+    """Whether rays that meet free space only are left out of the batches of bounded scenes. They
+    see the background, whatever is trained: gradients are the same on average, for less work."""
     alpha_min: float = 1e-2
     """A cell is free where the longest step that there can be would be less opaque than this."""
     seed: int = 0

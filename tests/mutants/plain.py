@@ -9,6 +9,7 @@ ADAM = "test_kernel_adam.py"
 TILES = "test_kernel_tiles.py"
 OCCUPANCY = "test_kernel_occupancy.py"
 CAMERA = "test_kernel_camera.py"
+COVERAGE = "test_kernel_coverage.py"
 RAYS = "test_rays.py"
 GRADSCALE = "test_gradscale.py"
 VALUES = "test_kernel_render.py::test_values_and_visited_samples"
@@ -381,6 +382,27 @@ MUTANTS = [
            "views[middle].first_pixel <= pixel", "views[middle].first_pixel < pixel", CAMERA),
     Mutant("camera: the run before", "space/camera.py",
            "view.runs[middle][0] <= number", "view.runs[middle][0] < number", RAYS),
+    Mutant("camera: blocks of the first view", "space/camera.py",
+           "at = first_blocks[view] + ", "at = ", RAYS),
+    Mutant("camera: rows of blocks cut short", "space/camera.py",
+           "across = (width + block - 1) // block\n        at", "across = width // block + 1\n        at", RAYS),
+    Mutant("camera: draws from what is not covered", "space/camera.py",
+           "if covered[at] != wp.uint8(0):", "if covered[at] == wp.uint8(0):", RAYS),
+    # coverage.py
+    Mutant("coverage: a cone as wide as a ray", "sampling/coverage.py",
+           "spread = wp.max(spread, wp.length(pixel_direction(view, at_u, at_v) - ray.direction))",
+           "spread = real(0.0)", COVERAGE),
+    Mutant("coverage: wide in units of the scene", "sampling/coverage.py",
+           "* spread / edge))", "* spread))", COVERAGE),
+    Mutant("coverage: the box is no larger", "sampling/coverage.py",
+           "larger = real(1.0) + far * spread / box.half[axis]", "larger = real(1.0)", COVERAGE),
+    Mutant("coverage: as far as for a ray", "sampling/coverage.py",
+           "free_length(free, ray, m, distance - wide, NONE)",
+           "free_length(free, ray, m, distance, NONE)", COVERAGE),
+    Mutant("coverage: the middle at the block's corner", "sampling/coverage.py",
+           "u = real(i % across * block) + half", "u = real(i % across * block)", COVERAGE),
+    Mutant("coverage: over the blocks of another view", "sampling/coverage.py",
+           "out_covered[first_block + i] = covered", "out_covered[i] = covered", COVERAGE),
     Mutant("camera: runs begin at the row", "space/camera.py",
            "run[1] + number - run[0]", "run[1]", RAYS),
     Mutant("camera: 32 bits for many pixels", "space/camera.py",

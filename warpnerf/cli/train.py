@@ -364,7 +364,8 @@ def _absolute(source: str) -> str:
 def _text(progress: Progress) -> str:
     speed = progress.step / max(progress.seconds, 1e-6)
     size = " x ".join(str(n) for n in progress.size)
+    drawn = f" over {progress.seen:.0%} of pixels" if progress.seen < 1.0 else ""
     return (
-        f"step {progress.step}  loss {progress.loss:.5f}  PSNR {progress.psnr:.2f}  "
+        f"step {progress.step}  loss {progress.loss:.5f}  PSNR {progress.psnr:.2f}{drawn}  "
         f"grid {size}  {speed:.1f} steps/s"
     )

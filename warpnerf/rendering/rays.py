@@ -12,13 +12,18 @@ import numpy as np
 import warp as wp
 from warpnerf_kernels.base.types import mat33, real, vec2, vec3
 from warpnerf_kernels.launch import assembly
+from warpnerf_kernels.sampling import coverage
 from warpnerf_kernels.space import camera as kernels
 
-from warpnerf.runtime.parallel import LaunchCache, Workers
+from warpnerf.model.grid import FreeCells, VoxelGrid
+from warpnerf.runtime.parallel import RAYS, LaunchCache, Workers
 from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.fisheye import largest_angle
 from warpnerf.scenes.pixel_file import expect_random_reads
 from warpnerf.scenes.scene import View
+
+MOST_BLOCKS = 2**20
+"""Blocks of pixels in all photographs together: looking all of them over takes under a second."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -141,8 +146,10 @@ class PixelSampler:
         self._kept: list[np.ndarray] = []
         self._runs: list[wp.array] = []
         self._n_pixels = 0
-        structs = [self._add(view) for view in views]
-        self._views = wp.array(structs, dtype=kernels.View, device=workers.device)
+        self._cameras = [view.camera for view in views]
+        self._structs = [self._add(view) for view in views]
+        self._views = wp.array(self._structs, dtype=kernels.View, device=workers.device)
+        self._draw_anywhere()
         self._content_distances = wp.array(content_distances, dtype=real, device=workers.device)
         self._batch = _room(n_rays, workers)
         self._launches = LaunchCache()
@@ -170,25 +177,72 @@ class PixelSampler:
             self._n_pixels += int(np.count_nonzero(mask))
         return struct
 
+    def keep_to(self, grid: VoxelGrid, free: FreeCells) -> float:
+        """From now on draw no pixels whose rays, and those of all around them, meet nothing.
+
+        Such rays see the background, whatever is trained. Pixels are told apart in square blocks.
+        Batches have as many rays as had met something among all, on average.
+
+        Args:
+            grid: Without contraction.
+            free: Of this grid.
+
+        Returns:
+            The share of the blocks that are drawn from, (0, 1]: all where none shows anything.
+        """
+        self._draw_anywhere()
+        edge = _block_edge(self._cameras, grid, free)
+        counts = [_n_blocks(camera, edge) for camera in self._cameras]
+        first = np.cumsum([0, *counts])
+        covered = wp.empty(int(first[-1]), dtype=wp.uint8, device=self._workers.device)
+        for struct, before, count in zip(self._structs, first, counts, strict=False):
+            self._workers.launch(
+                coverage.cover_blocks,
+                count,
+                *(struct, edge, int(before), grid.box, free.struct, covered),
+                chunk=RAYS,
+            )
+        share = float(np.mean(covered.numpy()))
+        if 0.0 < share < 1.0:
+            self._block, self._covered = edge, covered
+            device = self._workers.device
+            self._first_blocks = wp.array(first[:-1], dtype=wp.int32, device=device)
+        share = share or 1.0
+        self._n_drawn = max(1, round(share * self._n_rays))
+        return share
+
+    def _draw_anywhere(self) -> None:
+        """No blocks are left out."""
+        self._n_drawn = self._n_rays
+        self._block = 1
+        self._first_blocks = wp.empty(0, dtype=wp.int32, device=self._workers.device)
+        self._covered = wp.empty(0, dtype=wp.uint8, device=self._workers.device)
+
     def draw(self, step: int, n_steps: int = 1) -> RayBatch:
-        """The batches of some steps as one, each a function of its step and the seed.
+        """The batches of some steps as one.
+
+        What is drawn is a function of the steps, the seed, and of what ``keep_to`` was given. As
+        long as that has left nothing out, a batch of several steps is made of those of each.
 
         Args:
             step: The first.
             n_steps: How many.
 
         Returns:
-            n_steps times as many rays as a step has, in the same arrays from one call to the next
+            n_steps times as many rays as a step draws, in the same arrays from one call to the next
             as long as there are as many.
         """
-        if self._batch.count != n_steps * self._n_rays:
-            self._batch = _room(n_steps * self._n_rays, self._workers)
+        if self._batch.count != n_steps * self._n_drawn:
+            self._batch = _room(n_steps * self._n_drawn, self._workers)
         batch = self._batch
         self._workers.launch(
             kernels.sample_pixels,
             batch.count,
             self._views,
             self._n_pixels,
+            self._block,
+            self._first_blocks,
+            self._covered,
             self._content_distances,
             self._seed,
             (step * self._n_rays) % 2**32,
@@ -204,6 +258,29 @@ class PixelSampler:
             cache=self._launches,
         )
         return batch
+
+
+def _n_blocks(camera: Camera, edge: int) -> int:
+    """Blocks of a photograph, those cut off by its edges included."""
+    return -(-camera.width // edge) * -(-camera.height // edge)
+
+
+def _block_edge(cameras: Sequence[Camera], grid: VoxelGrid, free: FreeCells) -> int:
+    """Pixels along the edge of a block: a power of two from 4, which keeps to MOST_BLOCKS.
+
+    At most as wide as a cell in the middle of the box: cones are held against whole cells, so
+    smaller blocks would hardly leave out more.
+    """
+    cell = float(((grid.box_max - grid.box_min) / np.array(free.size)).min())
+    centre = 0.5 * (grid.box_min + grid.box_max)
+    away = [float(np.linalg.norm(camera.position - centre)) for camera in cameras]
+    pixels = [cell * c.fx / max(d, cell) for c, d in zip(cameras, away, strict=True)]
+    edge = 4
+    while edge <= 0.5 * np.median(pixels):
+        edge *= 2
+    while sum(_n_blocks(camera, edge) for camera in cameras) > MOST_BLOCKS:
+        edge *= 2
+    return edge
 
 
 def runs_of(mask: np.ndarray) -> np.ndarray:

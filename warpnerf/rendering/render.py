@@ -367,13 +367,15 @@ class TrainingPass:
         self.gradients = Gradients.zeros(model, math.prod(grid.size), workers)
         """What batches have added up to since the last update."""
 
-    def run(self, free: FreeCells, batch: RayBatch, n_batches: int = 1) -> None:
+    def run(self, free: FreeCells, batch: RayBatch, n_batches: int = 1, share: float = 1.0) -> None:
         """Add the gradient of a batch to ``gradients``, or of several put together.
 
         Args:
             free: What of the grid is skipped.
             batch: The rays.
             n_batches: How many batches of as many rays each these are.
+            share: Of the rays that the mean is taken over; the others, which meet nothing, add
+                nothing to the gradient and are not among these.
         """
         self.n_rays = batch.count
         self._scene.free = free.struct
@@ -383,7 +385,7 @@ class TrainingPass:
             self._scene,
             batch.struct,
             batch.target_rgb,
-            n_batches / batch.count,
+            n_batches * share / batch.count,
             self._scratch,
             self.error,
             self.loss,

@@ -78,6 +78,7 @@ def save_checkpoint(path: str | Path, state: TrainingState) -> None:
         "reach": state.reach,
         "grown": state.grown,
         "updates": state.updates,
+        "restarted": state.restarted,
         "progress": asdict(state.progress),
     }
     header = {"format": TRAINING, "training": training} | _field_header(state.field)
@@ -126,6 +127,12 @@ def load_checkpoint(path: str | Path) -> TrainingState:
         _refuse(path, f"a grid cannot have been resized {training.grown} times")
     if not 0 <= training.updates <= training.progress.step:
         _refuse(path, f"{training.updates} updates do not fit {training.progress.step} steps")
+    if not 0 <= training.restarted <= training.updates:
+        _refuse(
+            path,
+            f"an optimiser of {training.updates} updates cannot begin anew after "
+            f"{training.restarted}",
+        )
     if (training.config.content_distance == "per-camera") != bool(training.content_distances):
         _refuse(path, "content distances of cameras are not as its configuration says")
     workers = Workers("cpu")
@@ -140,6 +147,7 @@ def load_checkpoint(path: str | Path) -> TrainingState:
         reach=training.reach,
         grown=training.grown,
         updates=training.updates,
+        restarted=training.restarted,
         progress=training.progress,
         field=field,
         optimiser=_optimiser(training.config, field, tensors, path, workers),
@@ -157,6 +165,7 @@ class _Training(msgspec.Struct, frozen=True):
     updates: int
     progress: Progress
     content_distances: list[float] | None = None
+    restarted: int = 0
 
 
 class _Frustum(msgspec.Struct, frozen=True):

@@ -41,6 +41,9 @@ class Progress:
     """Nodes of the grid."""
     occupied: float
     """Share of cells that are not free, [0, 1]."""
+    seen: float = 1.0
+    """Share of the pixels, as blocks of them tell, that rays are drawn from, (0, 1]; those of all
+    others meet nothing, and ``loss``, ``psnr`` and ``samples_per_ray`` do not count them."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -61,6 +64,8 @@ class TrainingState:
     """How often the grid has been resized: its box tightened, or its nodes doubled."""
     updates: int
     """How often the optimiser has updated the grid."""
+    restarted: int = 0
+    """Updates before the optimiser last began anew, see ``OptimConfig.restart_at_growth``."""
     progress: Progress
     """Where it stands: steps done, seconds, loss."""
     field: Field

@@ -115,6 +115,7 @@ class Trainer:
         self._resize_at = _resize_at(scene, config)
         self._grown = 0
         self._updates = 0
+        self._restarted = 0
         assert isinstance(config.model, Model)
         self.model = config.model
         self.grid = self._first_grid(scene, None if resume is None else resume.field.grid)
@@ -128,6 +129,9 @@ class Trainer:
         if resume is not None:
             self._restore(resume)
         self._occupied = self.free.share()
+        self._seen = 1.0
+        if resume is not None and self.free.size != (1, 1, 1):
+            self._keep_to_what_is_seen()
         self._pass = self._training_pass()
 
     def run(
@@ -192,7 +196,7 @@ class Trainer:
         before = self.steps_done
         n_steps = min(self._steps_an_update(fraction), config.steps - before)
         batch = self._sampler.draw(before, n_steps)
-        self._pass.run(self.free, batch, n_steps)
+        self._pass.run(self.free, batch, n_steps, self._seen)
         if self._updates % config.optim.tv_every == 0:
             add_total_variation(
                 self.parameters(),
@@ -209,8 +213,8 @@ class Trainer:
             self.parameters(),
             self.optimiser,
             self._pass.gradients,
-            self._updates,
-            config.optim.decay**fraction * n_steps**0.25,
+            self._updates - self._restarted,
+            config.optim.decay ** (fraction - self._decay_from()) * n_steps**0.25,
             config.optim,
             self.workers,
         )
@@ -241,6 +245,7 @@ class Trainer:
             samples_per_ray=float(self._pass.n_samples.numpy()[:n_rays].mean()),
             size=self.grid.size,
             occupied=self._occupied,
+            seen=self._seen,
         )
         return self._progress
 
@@ -268,6 +273,7 @@ class Trainer:
             reach=self._reach,
             grown=self._grown,
             updates=self._updates,
+            restarted=self._restarted,
             progress=progress,
             field=self.field(),
             optimiser=self.optimiser,
@@ -295,6 +301,7 @@ class Trainer:
         }
         self._grown = state.grown
         self._updates = state.updates
+        self._restarted = state.restarted
         self._progress = state.progress
         self.steps_done = state.progress.step
         self._seconds = state.progress.seconds
@@ -372,6 +379,12 @@ class Trainer:
         """Steps whose losses are added up for one, after that share of the training."""
         return 1 << sum(fraction >= at for at in self._accumulation)
 
+    def _decay_from(self) -> float:
+        """The share of the training at which learning rates were those of the start."""
+        if self._grown == 0 or not self.config.optim.restart_at_growth:
+            return 0.0
+        return self.config.grid.grow_at[self._grown - 1]
+
     def _training_pass(self) -> TrainingPass:
         return TrainingPass(
             self.config.rays_per_step << len(self._accumulation),
@@ -409,8 +422,12 @@ class Trainer:
             state = self.optimiser[parameter.name]
             resized = RULES[parameter.kind].resized(state, self.grid, grid, self.workers)
             self.optimiser[parameter.name] = resized
-        self.grid = grid
+        shift = (grown - self._grown) * self.config.grid.shift_at_growth
+        self.grid = replace(grid, density_shift=grid.density_shift - shift)
         self._grown = grown
+        if self.config.optim.restart_at_growth:
+            self.optimiser = first_states(self.parameters(), self.workers)
+            self._restarted = self._updates
         give_back()
         self._pass = self._training_pass()
         self._look_for_free_space()
@@ -420,7 +437,7 @@ class Trainer:
         box_min, box_max = self.grid.box_min, self.grid.box_max
         if self.grid.folded:
             return box_min, box_max
-        self._look_for_free_space()
+        self._find_free_space()
         occupied = self.free.occupied_range()
         if occupied is None:
             return box_min, box_max
@@ -428,9 +445,21 @@ class Trainer:
         return box_min + occupied[0] * extent, box_min + occupied[1] * extent
 
     def _look_for_free_space(self) -> None:
-        """Find what need not be sampled; not in the first steps, when nothing has grown yet."""
+        """Find what need not be sampled, nor drawn.
+
+        Not in the first steps, when nothing has grown yet.
+        """
         if self.steps_done < FIRST_LOOK:
             return
+        self._find_free_space()
+        self._keep_to_what_is_seen()
+
+    def _keep_to_what_is_seen(self) -> None:
+        """Draw no pixels whose rays meet free space only; in folded space all see something."""
+        if self.config.skip_empty_rays and self.grid.contraction == "none":
+            self._seen = self._sampler.keep_to(self.grid, self.free)
+
+    def _find_free_space(self) -> None:
         model = self.config.model
         march = march_struct(model, "float32", self.march_steps(), self.workers)
         sampler = parts_of(model, "float32").sampler

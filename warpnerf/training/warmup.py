@@ -11,7 +11,7 @@ import warp as wp
 from warpnerf_kernels.fields import dense, dense_bound
 from warpnerf_kernels.launch import assembly
 from warpnerf_kernels.optim import adam, total_variation
-from warpnerf_kernels.sampling import occupancy
+from warpnerf_kernels.sampling import coverage, occupancy
 from warpnerf_kernels.space import camera
 
 from warpnerf.config import PRESETS, Contraction, Jacobian, LossConfig, Scaling
@@ -59,6 +59,7 @@ def training_kernels(
         dense_bound.join_highest,
         occupancy.mark_occupied_kernel(variant.parts.sampler),
         occupancy.spread_distance,
+        coverage.cover_blocks,
         dense.resample_kernel(n_floats),
     ]
 

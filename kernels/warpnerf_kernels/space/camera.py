@@ -17,6 +17,9 @@ AHEAD = 8
 """Rays from the one that a CPU draws to the one whose pixel it asks for."""
 
 
+TRIES = 64
+"""Pixels drawn for a ray until one of them lies in a block that is covered."""
+
 MANY_PIXELS = 2**26
 """Up to so many, 32 random bits draw none more than 1/64 more often than another."""
 
@@ -249,12 +252,48 @@ def random_below(state: wp.uint32, n: wp.int64):
     return wp.int64(drawn % wp.uint64(n)), state
 
 
+@wp.func
+def draw_pixel(
+    views: wp.array(dtype=View),
+    n_pixels: wp.int64,
+    block: int,
+    first_blocks: wp.array(dtype=int),
+    covered: wp.array(dtype=wp.uint8),
+    seed: int,
+    ray: wp.uint32,
+):
+    """A ray's view, its pixel there, and the state of the ray's generator after that.
+
+    Where blocks are given, a pixel whose block is not covered is drawn again.
+    """
+    state = wp.rand_init(seed, int(ray))
+    view = int(0)
+    local = int(0)
+    tries = int(0)
+    while tries < wp.static(TRIES):
+        pixel, state = random_below(state, n_pixels)
+        view = view_of_pixel(views, pixel)
+        local = counting_pixel(views[view], int(pixel - views[view].first_pixel))
+        tries += 1
+        if covered.shape[0] == 0:
+            break
+        width = views[view].width
+        across = (width + block - 1) // block
+        at = first_blocks[view] + local // width // block * across + local % width // block
+        if covered[at] != wp.uint8(0):
+            break
+    return view, local, state
+
+
 @wp.kernel
 def sample_pixels(
     first: int,  # this launch makes rays first, first + 1, ...
     # photographs
     views: wp.array(dtype=View),  # [n_views], by first_pixel
     n_pixels: wp.int64,  # that count in all of them
+    block: int,  # edge of a block of pixels
+    first_blocks: wp.array(dtype=int),  # [n_views] how many the views before have
+    covered: wp.array(dtype=wp.uint8),  # [n_blocks] 0: nothing is drawn there; empty: draw anywhere
     content_distances: wp.array(dtype=real),  # [n_views] scene units
     # how
     seed: int,  # of the training
@@ -270,18 +309,16 @@ def sample_pixels(
     out_content_distance: wp.array(dtype=real),  # [n_rays] scene units
     out_target_rgb: wp.array(dtype=vec3),  # [n_rays] the pixel over its background, in [0, 1]
 ):
-    """A batch of rays through random pixels, all that count equally likely."""
+    """A batch of rays through random pixels, all that count and are covered equally likely."""
     i = first + wp.tid()
-    state = wp.rand_init(seed, int(rays_before + wp.uint32(i)))
-    pixel, state = random_below(state, n_pixels)
-    later = wp.rand_init(seed, int(rays_before + wp.uint32(i + wp.static(AHEAD))))
-    later_pixel, later = random_below(later, n_pixels)
-    later_view = views[view_of_pixel(views, later_pixel)]
-    later_local = counting_pixel(later_view, int(later_pixel - later_view.first_pixel))
-    prefetch(later_view.pixels, later_local * later_view.channels)
-    v = view_of_pixel(views, pixel)
+    ray = rays_before + wp.uint32(i)
+    later = ray + wp.uint32(wp.static(AHEAD))
+    later_v, later_local, _later = draw_pixel(
+        views, n_pixels, block, first_blocks, covered, seed, later
+    )
+    prefetch(views[later_v].pixels, later_local * views[later_v].channels)
+    v, local, state = draw_pixel(views, n_pixels, block, first_blocks, covered, seed, ray)
     view = views[v]
-    local = counting_pixel(view, int(pixel - view.first_pixel))
     out_origins[i] = view.position
     out_directions[i] = pixel_direction(
         view, real(local % view.width) + real(0.5), real(local // view.width) + real(0.5)
