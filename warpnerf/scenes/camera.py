@@ -157,7 +157,14 @@ class Camera:
         return points * scale[:, None], jacobian
 
     def moved_back(self, distance: float) -> Camera:
-        """The camera moved straight back, by a distance in scene units."""
+        """The camera moved straight back.
+
+        Args:
+            distance: By how much, scene units.
+
+        Returns:
+            The same camera at another place.
+        """
         c2w = self.c2w.copy()
         c2w[:, 3] -= distance * self.forward
         return replace(self, c2w=c2w)

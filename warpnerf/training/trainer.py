@@ -368,8 +368,12 @@ class Trainer:
 
     def _voxels(self, grown: int) -> int:
         """Nodes after the grid was resized so often."""
-        left = min(len(self._resize_at) - grown, len(self.config.grid.grow_at))
+        left = len(self.config.grid.grow_at) - self._growths(grown)
         return max(8, self.config.grid.voxels >> left)
+
+    def _growths(self, grown: int) -> int:
+        """In how many of so many resizings nodes doubled; the others, which come first, tighten."""
+        return max(0, grown - len(self._resize_at) + len(self.config.grid.grow_at))
 
     def parameters(self) -> tuple[Parameter, ...]:
         """What is trained."""
@@ -381,9 +385,10 @@ class Trainer:
 
     def _decay_from(self) -> float:
         """The share of the training at which learning rates were those of the start."""
-        if self._grown == 0 or not self.config.optim.restart_at_growth:
+        growths = self._growths(self._grown)
+        if growths == 0 or not self.config.optim.restart_at_growth:
             return 0.0
-        return self.config.grid.grow_at[self._grown - 1]
+        return self.config.grid.grow_at[growths - 1]
 
     def _training_pass(self) -> TrainingPass:
         return TrainingPass(
@@ -422,10 +427,11 @@ class Trainer:
             state = self.optimiser[parameter.name]
             resized = RULES[parameter.kind].resized(state, self.grid, grid, self.workers)
             self.optimiser[parameter.name] = resized
-        shift = (grown - self._grown) * self.config.grid.shift_at_growth
+        growths = self._growths(grown) - self._growths(self._grown)
+        shift = growths * self.config.grid.shift_at_growth
         self.grid = replace(grid, density_shift=grid.density_shift - shift)
         self._grown = grown
-        if self.config.optim.restart_at_growth:
+        if growths and self.config.optim.restart_at_growth:
             self.optimiser = first_states(self.parameters(), self.workers)
             self._restarted = self._updates
         give_back()
