@@ -25,6 +25,7 @@ from warpnerf.runtime.parallel import Workers
 from warpnerf.scenes.frustum import FARTHEST, fit_frustum
 from warpnerf.scenes.scene import Scene, View
 from warpnerf.training.checkpoint import load_checkpoint, load_field, save_checkpoint, save_field
+from warpnerf.training.extent import contraction_of
 from warpnerf.training.trainer import Trainer
 
 PLACES = [(x, 0.1 * x * z - 4.0, z) for x in (-0.6, 0.0, 0.7) for z in (-0.4, 0.5)]
@@ -129,6 +130,25 @@ def test_cameras_to_all_sides_are_refused() -> None:
     scene = replace(facing(), views=views, splits={"train": (0, 1)}, bounds=None)
     with pytest.raises(InputError, match="look to all sides"):
         wn.train(scene, config())
+
+
+@pytest.mark.parametrize(
+    ("scene", "changes", "chosen"),
+    [
+        (facing(), {}, "ndc"),
+        (facing(bounds=None), {}, "linf"),
+        (facing(bounds=(9.0, 2.5)), {}, "linf"),
+        (facing(turned=40.0), {}, "linf"),
+        (facing(), {"jacobian": "density"}, "linf"),
+        (replace(facing(), unbounded=False), {}, "none"),
+        (facing(), {"grid": wn.GridConfig(contraction="l2")}, "l2"),
+    ],
+    ids=["bounds", "no bounds", "bad bounds", "one looks away", "jacobian", "bounded", "asked"],
+)
+def test_captures_with_bounds_that_face_forward_are_trained_in_a_frustum(
+    scene: Scene, changes: dict[str, object], chosen: str
+) -> None:
+    assert contraction_of(scene, config(**({"grid": wn.GridConfig()} | changes))) == chosen
 
 
 def test_no_term_of_the_jacobian() -> None:

@@ -337,12 +337,14 @@ def _train(run: Run, scene: Scene, trainer: Trainer, session: Session | None) ->
 
 def _describe(scene: Scene, content_distance: float, config: TrainConfig) -> None:
     """What was understood of a scene."""
+    from warpnerf.training.extent import contraction_of
+
     train, test = len(scene.splits["train"]), len(scene.splits["test"])
     sizes = sorted({(c.width, c.height) for c in scene.cameras})
     shown = ", ".join(f"{w} x {h}" for w, h in sizes[:3]) + (", ..." if len(sizes) > 3 else "")
     extent = scene.box_max - scene.box_min
     outside = "space outside folded in" if scene.unbounded else "nothing outside"
-    if config.grid.contraction == "ndc":
+    if contraction_of(scene, config) == "ndc":
         outside = "but the grid is in normalised device coordinates"
     print(f"{scene.name}: {train} training and {test} test views, {shown} pixels")
     for warning in scene.warnings:

@@ -18,6 +18,9 @@ from warpnerf.scenes.undistort import directions
 MAX_ANGLE = math.radians(60.0)
 """Between the axis of a training camera and their mean."""
 
+ALIKE = math.radians(30.0)
+"""The same, of captures that are trained in such coordinates without being asked."""
+
 MAX_TANGENT = 4.0
 """Rays further from the mean axis, 76 degrees, may leave the grid at its sides."""
 
@@ -79,6 +82,27 @@ class Frustum:
     def depths(self, points: np.ndarray) -> np.ndarray:
         """w of points [..., 3], scene units."""
         return (points - self.origin) @ self.axes[2]
+
+
+def faces_forward(scene: Scene) -> bool:
+    """Whether a capture was made for normalised device coordinates.
+
+    Its file gives bounds of depth, as LLFF's does, and its training cameras look the same way. Such
+    captures are of a small area; others may look the same way from places far apart, before which
+    a frustum is mostly empty.
+    """
+    if scene.bounds is None:
+        return False
+    forward = np.array([camera.forward for camera in scene.training_cameras])
+    mean = forward.mean(axis=0)
+    cosines = forward @ mean / max(float(np.linalg.norm(mean)), 1e-9)
+    if float(cosines.min()) < math.cos(ALIKE):
+        return False
+    try:
+        fit_frustum(scene, 2, 8)
+    except InputError:  # bounds that make no sense
+        return False
+    return True
 
 
 def fit_frustum(

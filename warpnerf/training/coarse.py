@@ -26,6 +26,7 @@ from warpnerf.rendering.rays import camera_rays
 from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.points import SeenExtent, seen_extent
 from warpnerf.scenes.scene import Scene, View
+from warpnerf.training.extent import contraction_of
 from warpnerf.training.state import Progress, TrainingState
 from warpnerf.training.trainer import Trainer
 
@@ -116,6 +117,7 @@ def find_sight(
     """
     limit, given = config.time_limit, config.content_distance
     rounds = ROUNDS if scene.guessed else 1
+    contraction = contraction_of(scene, config)
     small = replace(
         config,
         steps=_steps(config),
@@ -124,7 +126,7 @@ def find_sight(
         grid=replace(
             config.grid,
             voxels=min(VOXELS, config.grid.voxels),
-            contraction="auto" if config.grid.contraction == "ndc" else config.grid.contraction,
+            contraction="linf" if contraction == "ndc" else contraction,
             grow_at=(),
         ),
     )

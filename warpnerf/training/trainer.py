@@ -9,11 +9,10 @@ from dataclasses import replace
 
 import numpy as np
 import warp as wp
-from warpnerf_kernels.base.types import vector
 
 from warpnerf.checks import InputError
-from warpnerf.config import Contraction, TrainConfig
-from warpnerf.model.grid import FreeCells, VoxelGrid, grid_size, require_memory
+from warpnerf.config import TrainConfig
+from warpnerf.model.grid import FreeCells, grid_size
 from warpnerf.model.interface import Model, parts_of
 from warpnerf.model.parameters import Parameter, first_weights, parameters_of
 from warpnerf.rendering.field import Field
@@ -22,9 +21,9 @@ from warpnerf.rendering.rays import PixelSampler
 from warpnerf.rendering.render import Steps, TrainingPass, march_struct
 from warpnerf.runtime.memory import give_back
 from warpnerf.runtime.parallel import Workers
-from warpnerf.scenes.frustum import fit_frustum
 from warpnerf.scenes.points import SeenExtent, seen_scene
 from warpnerf.scenes.scene import Scene
+from warpnerf.training import extent
 from warpnerf.training.optim import RULES, adam_step, add_total_variation, first_states
 from warpnerf.training.state import Progress, TrainingState, scene_digest
 from warpnerf.training.warmup import training_kernels
@@ -38,10 +37,6 @@ REPORT_EVERY = 25
 FIRST_LOOK = 200
 """Steps before the first look for free space and the first growth: what is left out then stays out,
 so densities must have had time to show."""
-
-
-TIGHTEN_AT = 0.1
-"""Share of the training at which the box of an object is tightened, before the grid first grows."""
 
 
 class Trainer:
@@ -83,10 +78,10 @@ class Trainer:
             scene = seen_scene(scene, sight)
         self.scene = scene
         """What it trains on, with the extent that a new training begins with."""
-        _require_samples(scene, config)
+        extent.require_samples(scene, config)
         if resume is None:
-            self.content_distance, distances = _content_distances(scene, config)
-            self._reach = _reach(scene)
+            self.content_distance, distances = extent.content_distances(scene, config)
+            self._reach = extent.reach(scene)
         else:  # estimates anew may be rounded otherwise
             self.content_distance, self._reach = resume.content_distance, resume.reach
             n_views = len(scene.splits["train"])
@@ -112,13 +107,19 @@ class Trainer:
             self.workers,
         )
         self._accumulation = config.optim.accumulation(scene.kind)
-        self._resize_at = _resize_at(scene, config)
+        self._resize_at = extent.resize_at(scene, config)
         self._grown = 0
         self._updates = 0
         self._restarted = 0
         assert isinstance(config.model, Model)
         self.model = config.model
-        self.grid = self._first_grid(scene, None if resume is None else resume.field.grid)
+        self.grid = extent.first_grid(
+            scene,
+            config,
+            self._voxels(0),
+            self.workers.device,
+            None if resume is None else resume.field.grid,
+        )
         self.weights = first_weights(self.model, config.seed, self.workers)
         self.optimiser = first_states(self.parameters(), self.workers)
         self.free = FreeCells.none(self.workers)
@@ -338,34 +339,6 @@ class Trainer:
             in_ndc=self.grid.frustum is not None,
         )
 
-    def _first_grid(self, scene: Scene, resumed: VoxelGrid | None) -> VoxelGrid:
-        config = self.config.grid
-        contraction = _contraction(scene, self.config)
-        border = config.border if contraction in ("linf", "l2") else 0.0
-        frustum, box = None, (scene.box_min, scene.box_max)
-        if resumed is not None and resumed.frustum is not None:
-            frustum, box = resumed.frustum, (resumed.box_min, resumed.box_max)
-        elif contraction == "ndc":
-            frustum, box = fit_frustum(scene, config.planes, config.voxels)
-        extent = (box[1] - box[0]) * (1.0 + border)
-        final = grid_size(extent, config.voxels)
-        require_memory(final, self.model.n_floats, self.workers.device)
-        size = grid_size(extent, self._voxels(0))
-        voxel = float((extent / (np.array(final) - 1)).min())
-        n = math.prod(size)
-        return VoxelGrid(
-            values=wp.zeros(n, dtype=vector(self.model.n_floats), device=self.workers.device),
-            size=size,
-            box_min=box[0],
-            box_max=box[1],
-            contraction=contraction,
-            border=border,
-            # softplus(shift) is the optical depth of a voxel of the final grid.
-            density_shift=math.log(math.expm1(-math.log1p(-config.alpha_init))),
-            density_scale=1.0 / voxel,
-            frustum=frustum,
-        )
-
     def _voxels(self, grown: int) -> int:
         """Nodes after the grid was resized so often."""
         left = len(self.config.grid.grow_at) - self._growths(grown)
@@ -419,8 +392,7 @@ class Trainer:
         if grown == self._grown or self.steps_done < FIRST_LOOK:
             return
         box = self._tight_box()
-        extent = (box[1] - box[0]) * (1.0 + self.grid.border)
-        size = grid_size(extent, self._voxels(grown))
+        size = grid_size((box[1] - box[0]) * (1.0 + self.grid.border), self._voxels(grown))
         del self._pass  # gives its memory back before more is asked for
         grid = self.grid.resized(self.workers, size, box)
         for parameter in self.parameters():
@@ -447,8 +419,8 @@ class Trainer:
         occupied = self.free.occupied_range()
         if occupied is None:
             return box_min, box_max
-        extent = box_max - box_min
-        return box_min + occupied[0] * extent, box_min + occupied[1] * extent
+        edges = box_max - box_min
+        return box_min + occupied[0] * edges, box_min + occupied[1] * edges
 
     def _look_for_free_space(self) -> None:
         """Find what need not be sampled, nor drawn.
@@ -474,68 +446,3 @@ class Trainer:
 
 
 _COLOURS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "random": (1.0, 1.0, 1.0)}
-
-
-def _contraction(scene: Scene, config: TrainConfig) -> Contraction:
-    if config.grid.contraction == "auto":
-        return "linf" if scene.unbounded else "none"
-    return config.grid.contraction
-
-
-def _resize_at(scene: Scene, config: TrainConfig) -> tuple[float, ...]:
-    """Shares of the training at which the grid gets another box or more nodes.
-
-    Around an object much of the first box is empty. What the first steps show of that suffices to
-    spend its nodes elsewhere; they need no training, and no grid, of their own.
-    """
-    grow_at = config.grid.grow_at
-    if scene.kind == "object" and grow_at and grow_at[0] > TIGHTEN_AT:
-        return (TIGHTEN_AT, *grow_at)
-    return grow_at
-
-
-def _content_distances(scene: Scene, config: TrainConfig) -> tuple[float, list[float]]:
-    """The content distance of the scene, and those of its training views."""
-    chosen, train = config.content_distance, scene.splits["train"]
-    if chosen == "per-camera":
-        if scene.content_distances is None:
-            raise InputError(
-                f"content_distance is per-camera, but {scene.name} brings no points, and no short "
-                "training has found what each camera sees: that takes 500 steps or more, time for "
-                "them, and photographs that show something opaque; use auto, or a number."
-            )
-        return scene.content_distance, [float(scene.content_distances[i]) for i in train]
-    one = scene.content_distance if chosen == "auto" else float(chosen)
-    return one, [one] * len(train)
-
-
-def _require_samples(scene: Scene, config: TrainConfig) -> None:
-    """Raise InputError where march.near and march.far leave no sample inside the box to any ray."""
-    positions = np.array([camera.position for camera in scene.training_cameras])
-    outside = np.maximum(0.0, np.maximum(scene.box_min - positions, positions - scene.box_max))
-    across = np.maximum(np.abs(scene.box_min - positions), np.abs(scene.box_max - positions))
-    begin = float(np.linalg.norm(outside, axis=1).min())
-    end = float(np.linalg.norm(across, axis=1).max())
-    march = config.march
-    if _contraction(scene, config) == "ndc":
-        return  # the frustum begins before all content, and ends far behind it
-    if _contraction(scene, config) != "none":
-        begin = 0.0  # space outside the box is sampled too
-    if march.near >= end:
-        raise InputError(
-            f"march.near is {march.near:g}, but the scene's box ends {end:.4g} scene units from "
-            "the farthest camera, so nothing of it would be sampled; use a smaller --near."
-        )
-    if march.far is not None and march.far <= begin:
-        raise InputError(
-            f"march.far is {march.far:g}, but the scene's box begins {begin:.4g} scene units from "
-            "the nearest camera, so nothing of it would be sampled; use a larger one."
-        )
-
-
-def _reach(scene: Scene) -> float:
-    """Distance from the outermost training camera to the farthest corner of the box."""
-    corner = 0.5 * float(np.linalg.norm(scene.box_max - scene.box_min))
-    centre = 0.5 * (scene.box_min + scene.box_max)
-    cameras = [scene.views[i].camera.position for i in scene.splits["train"]]
-    return corner + max(float(np.linalg.norm(p - centre)) for p in cameras)

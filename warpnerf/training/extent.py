@@ -1,0 +1,130 @@
+"""What a training begins with: the warp of space, the first grid, content distances."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import warp as wp
+from warpnerf_kernels.base.types import vector
+
+from warpnerf.checks import InputError
+from warpnerf.config import Contraction, TrainConfig
+from warpnerf.model.grid import VoxelGrid, grid_size, require_memory
+from warpnerf.model.interface import Model
+from warpnerf.scenes.frustum import faces_forward, fit_frustum
+from warpnerf.scenes.scene import Scene
+
+TIGHTEN_AT = 0.1
+"""Share of the training at which the box of an object is tightened, before the grid first grows."""
+
+
+def contraction_of(scene: Scene, config: TrainConfig) -> Contraction:
+    """How space outside the box is held: what is configured, auto decided for a scene."""
+    if config.grid.contraction != "auto":
+        return config.grid.contraction
+    if not scene.unbounded:
+        return "none"
+    return "ndc" if config.jacobian == "none" and faces_forward(scene) else "linf"
+
+
+def first_grid(
+    scene: Scene, config: TrainConfig, n_voxels: int, device: wp.Device, resumed: VoxelGrid | None
+) -> VoxelGrid:
+    """The grid before the first update, all raw values 0.
+
+    Args:
+        scene: Its box, or what its frustum is fitted to.
+        config: The rest.
+        n_voxels: Nodes, about; the final grid has ``config.grid.voxels``.
+        device: Where it lies.
+        resumed: The grid of a training to be resumed: a frustum anew might be rounded otherwise.
+
+    Raises:
+        InputError: The final grid would not fit the memory, or the scene has no frustum.
+    """
+    assert isinstance(config.model, Model)
+    contraction, n_floats = contraction_of(scene, config), config.model.n_floats
+    border = config.grid.border if contraction in ("linf", "l2") else 0.0
+    frustum, box = None, (scene.box_min, scene.box_max)
+    if resumed is not None and resumed.frustum is not None:
+        frustum, box = resumed.frustum, (resumed.box_min, resumed.box_max)
+    elif contraction == "ndc":
+        frustum, box = fit_frustum(scene, config.grid.planes, config.grid.voxels)
+    extent = (box[1] - box[0]) * (1.0 + border)
+    final = grid_size(extent, config.grid.voxels)
+    require_memory(final, n_floats, device)
+    size = grid_size(extent, n_voxels)
+    voxel = float((extent / (np.array(final) - 1)).min())
+    return VoxelGrid(
+        values=wp.zeros(math.prod(size), dtype=vector(n_floats), device=device),
+        size=size,
+        box_min=box[0],
+        box_max=box[1],
+        contraction=contraction,
+        border=border,
+        # softplus(shift) is the optical depth of a voxel of the final grid.
+        density_shift=math.log(math.expm1(-math.log1p(-config.grid.alpha_init))),
+        density_scale=1.0 / voxel,
+        frustum=frustum,
+    )
+
+
+def resize_at(scene: Scene, config: TrainConfig) -> tuple[float, ...]:
+    """Shares of the training at which the grid gets another box or more nodes.
+
+    Around an object much of the first box is empty. What the first steps show of that suffices to
+    spend its nodes elsewhere; they need no training, and no grid, of their own.
+    """
+    grow_at = config.grid.grow_at
+    if scene.kind == "object" and grow_at and grow_at[0] > TIGHTEN_AT:
+        return (TIGHTEN_AT, *grow_at)
+    return grow_at
+
+
+def content_distances(scene: Scene, config: TrainConfig) -> tuple[float, list[float]]:
+    """The content distance of the scene, and those of its training views."""
+    chosen, train = config.content_distance, scene.splits["train"]
+    if chosen == "per-camera":
+        if scene.content_distances is None:
+            raise InputError(
+                f"content_distance is per-camera, but {scene.name} brings no points, and no short "
+                "training has found what each camera sees: that takes 500 steps or more, time for "
+                "them, and photographs that show something opaque; use auto, or a number."
+            )
+        return scene.content_distance, [float(scene.content_distances[i]) for i in train]
+    one = scene.content_distance if chosen == "auto" else float(chosen)
+    return one, [one] * len(train)
+
+
+def require_samples(scene: Scene, config: TrainConfig) -> None:
+    """Raise InputError where march.near and march.far leave no sample inside the box to any ray."""
+    positions = np.array([camera.position for camera in scene.training_cameras])
+    outside = np.maximum(0.0, np.maximum(scene.box_min - positions, positions - scene.box_max))
+    across = np.maximum(np.abs(scene.box_min - positions), np.abs(scene.box_max - positions))
+    begin = float(np.linalg.norm(outside, axis=1).min())
+    end = float(np.linalg.norm(across, axis=1).max())
+    march = config.march
+    contraction = contraction_of(scene, config)
+    if contraction == "ndc":
+        return  # the frustum begins before all content, and ends far behind it
+    if contraction != "none":
+        begin = 0.0  # space outside the box is sampled too
+    if march.near >= end:
+        raise InputError(
+            f"march.near is {march.near:g}, but the scene's box ends {end:.4g} scene units from "
+            "the farthest camera, so nothing of it would be sampled; use a smaller --near."
+        )
+    if march.far is not None and march.far <= begin:
+        raise InputError(
+            f"march.far is {march.far:g}, but the scene's box begins {begin:.4g} scene units from "
+            "the nearest camera, so nothing of it would be sampled; use a larger one."
+        )
+
+
+def reach(scene: Scene) -> float:
+    """Distance from the outermost training camera to the farthest corner of the box."""
+    corner = 0.5 * float(np.linalg.norm(scene.box_max - scene.box_min))
+    centre = 0.5 * (scene.box_min + scene.box_max)
+    cameras = [scene.views[i].camera.position for i in scene.splits["train"]]
+    return corner + max(float(np.linalg.norm(p - centre)) for p in cameras)
