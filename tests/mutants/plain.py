@@ -377,7 +377,7 @@ MUTANTS = [
     Mutant("camera: beyond a fisheye's rim", "space/camera.py",
            "high = view.angle_max", "high = real(3.0)", CAMERA),
     Mutant("camera: each step draws the same", "space/camera.py",
-           "wp.rand_init(seed, int(rays_before + wp.uint32(i)))", "wp.rand_init(seed, i)", RAYS),
+           "ray = rays_before + wp.uint32(i)", "ray = wp.uint32(i)", RAYS),
     Mutant("camera: the view before", "space/camera.py",
            "views[middle].first_pixel <= pixel", "views[middle].first_pixel < pixel", CAMERA),
     Mutant("camera: the run before", "space/camera.py",
