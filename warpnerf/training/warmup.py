@@ -132,6 +132,6 @@ def _words(
     name = str(kernel.key).rpartition("__")[2].replace("_", " ")
     if not name.startswith("render"):
         return name
-    space = "" if contraction == "none" else ", space folded in"
+    space = {"none": "", "ndc": ", in NDC"}.get(contraction, ", space folded in")
     kinds = "".join(f", {kind}" for kind in losses.kinds)
     return name + space + (f", scaling {scaling}" if scaling else "") + kinds
