@@ -25,8 +25,9 @@ from turns import take_turns
 
 import warpnerf as wn
 from warpnerf.checks import InputError
-from warpnerf.config import PRESETS, TrainConfig, config_to_json
+from warpnerf.config import TrainConfig, config_to_json
 from warpnerf.model.models import model_of
+from warpnerf.presets import PRESETS
 from warpnerf.runtime.parallel import Workers
 from warpnerf.training import coarse
 

@@ -19,7 +19,7 @@ from tiny_fields import assert_same_state
 from tiny_scenes import picture, save, write_transforms
 
 from warpnerf.cli import train
-from warpnerf.config import PRESETS
+from warpnerf.presets import PRESETS
 from warpnerf.training.checkpoint import load_checkpoint
 from warpnerf.training.run import Run
 
@@ -158,8 +158,9 @@ def test_a_time_limit_takes_the_place_of_the_presets_steps(tmp_path: Path) -> No
         train.train_command("builtin:room", output=tmp_path / "a", time_limit=9.0)
         train.train_command("builtin:room", output=tmp_path / "a", time_limit=9.0, steps=7)
         train.train_command("builtin:room", output=tmp_path / "a")
-    assert [config.steps for config in begun] == [train.STEPS_OF_TIMED, 7, 2]
-    assert [config.time_limit for config in begun] == [9.0, 9.0, None]
+        train.train_command("builtin:room", output=tmp_path / "a", preset="quality", steps=7)
+    assert [config.steps for config in begun] == [train.STEPS_OF_TIMED, 7, 2, 7]
+    assert [config.time_limit for config in begun] == [9.0, 9.0, None, None]
 
 
 def test_files_that_are_no_run_are_never_touched(tmp_path: Path) -> None:

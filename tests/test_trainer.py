@@ -354,6 +354,19 @@ def test_resumed_it_draws_from_the_same_pixels(tmp_path: Path, on_cpu: None) -> 
         assert_same_state(without_seconds(resumed), without_seconds(whole))
 
 
+def test_total_variation_ends_when_it_is_told_to(tmp_path: Path, on_cpu: None) -> None:
+    def values(**changes: Any) -> np.ndarray:
+        optim = replace(tiny_config().optim, **changes)
+        trainer = Trainer(ball(), tiny_config(optim=optim))
+        trainer.run()
+        return trainer.grid.values.numpy()
+
+    without = values(tv_density=0.0, tv_rgb=0.0)
+    assert np.array_equal(values(tv_until=0.0), without)
+    half, whole = values(tv_until=0.5), values()
+    assert not np.array_equal(half, without) and not np.array_equal(half, whole)
+
+
 # As DVGO grows; each of the two changes what is trained.
 AS_DVGO: dict[str, Any] = {
     "grid": replace(tiny_config().grid, shift_at_growth=1.0),

@@ -17,8 +17,9 @@ from served import DISTANCE_OF_CONTENT, serving
 from tiny_fields import tiny_field
 from tiny_scenes import ring, tiny_scene
 
-from warpnerf.config import PRESETS, TrainConfig
+from warpnerf.config import TrainConfig
 from warpnerf.media.pictures import to_bytes
+from warpnerf.presets import PRESETS
 from warpnerf.rendering.field import Field
 from warpnerf.training.trainer import Trainer
 from warpnerf.viewer.painter import KINDS, LAYOUTS, Subject

@@ -14,14 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from warpnerf.checks import InputError
-    from warpnerf.config import (
-        PRESETS,
-        GridConfig,
-        LossConfig,
-        MarchConfig,
-        OptimConfig,
-        TrainConfig,
-    )
+    from warpnerf.config import GridConfig, LossConfig, MarchConfig, OptimConfig, TrainConfig
     from warpnerf.evaluation.evaluate import Evaluation, evaluate
     from warpnerf.evaluation.inspection import Inspection, inspect
     from warpnerf.exporting.export import export
@@ -35,6 +28,7 @@ if TYPE_CHECKING:
     from warpnerf.media.scene_plan import plan_picture
     from warpnerf.model.interface import Model
     from warpnerf.model.models import Deferred, Features, Rgb, SphericalHarmonics
+    from warpnerf.presets import PRESETS
     from warpnerf.rendering.field import Field, Rendering
     from warpnerf.scenes.camera import Camera
     from warpnerf.scenes.load import load_scene
@@ -62,7 +56,7 @@ _HOMES = {
     "save_checkpoint": "training.checkpoint",
     "save_field": "training.checkpoint",
     "InputError": "checks",
-    "PRESETS": "config",
+    "PRESETS": "presets",
     "GridConfig": "config",
     "LossConfig": "config",
     "MarchConfig": "config",

@@ -87,7 +87,7 @@ class MarchConfig:
     """Nothing is sampled nearer to the camera than this, scene units."""
     far: float | None = None
     """Nothing is sampled at or beyond this, scene units; None: where the box or the world ends."""
-    growth: float = 0.02
+    growth: float = 0.1
     """Beyond the box of an unbounded scene, each step is this share longer than the one before."""
     transmittance_min: float = 1e-3
     """A ray ends where less light than this would pass."""
@@ -141,6 +141,8 @@ class OptimConfig:
     grid; of coarser ones as much more as the face between two nodes is larger."""
     tv_rgb: float = 3e-10
     """The same of raw colours and of all other features."""
+    tv_until: float = 1.0
+    """Share of the training after which there is no total variation."""
     tv_every: int = 8
     """Updates from one total-variation gradient to the next, which counts that many times."""
     accumulate_at: Literal["auto"] | tuple[float, ...] = "auto"
@@ -158,6 +160,8 @@ class OptimConfig:
         require_at_least("optim.tv_density", self.tv_density, 0.0)
         require_at_least("optim.tv_rgb", self.tv_rgb, 0.0)
         require_whole("optim.tv_every", self.tv_every, 1)
+        if not 0 <= self.tv_until <= 1:
+            raise InputError(f"optim.tv_until must lie in [0, 1], not {self.tv_until}.")
         if isinstance(self.accumulate_at, str):
             if self.accumulate_at != "auto":
                 raise InputError(
@@ -326,20 +330,6 @@ class TrainConfig:
             math.isfinite(c) and 0 <= c <= 1 for c in self.background
         ):
             raise InputError(f"background must be rgb in [0, 1], not {self.background}.")
-
-
-PRESETS: dict[str, TrainConfig] = {
-    # Minutes on two cores.
-    "fast": TrainConfig(),
-    # An hour on two cores, or minutes on a GPU.
-    "quality": TrainConfig(
-        steps=20_000,
-        rays_per_step=8192,
-        grid=GridConfig(voxels=224**3),
-        march=MarchConfig(step_voxels=0.5),
-    ),
-}
-"""Starting points by name; change one with ``dataclasses.replace``."""
 
 
 def config_to_json(config: TrainConfig) -> dict[str, Any]:

@@ -15,7 +15,8 @@ import numpy as np
 from nerfbaselines import register
 
 from warpnerf.checks import InputError
-from warpnerf.config import PRESETS, TrainConfig
+from warpnerf.config import TrainConfig
+from warpnerf.presets import PRESETS
 from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.points import Points, extent_by_points, usable
 from warpnerf.scenes.scene import Scene, View, estimate_extent

@@ -9,7 +9,7 @@ import tyro
 from warpnerf.checks import InputError, cannot_write, require_at_least
 from warpnerf.cli.machine import require_writable, write_json
 from warpnerf.cli.model_options import chosen_model
-from warpnerf.config import PRESETS
+from warpnerf.presets import PRESETS
 from warpnerf.runtime.memory import usable_cores
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from warpnerf.checks import InputError, cannot_write
 from warpnerf.cli.model_options import chosen_model
-from warpnerf.config import PRESETS
+from warpnerf.presets import PRESETS
 
 if TYPE_CHECKING:
     from warpnerf.evaluation.verify import Result

@@ -17,7 +17,8 @@ from warpnerf.cli.model_options import chosen_model
 from warpnerf.cli.pose import with_poses
 from warpnerf.cli.progress import ProgressBar
 from warpnerf.cli.view import PageOptions, training_page
-from warpnerf.config import PRESETS, Scaling, TrainConfig
+from warpnerf.config import Scaling, TrainConfig
+from warpnerf.presets import PRESETS
 from warpnerf.runtime.signals import Stopped, StopRequest
 from warpnerf.training import lock
 
@@ -38,7 +39,7 @@ def train_command(
     /,
     output: Path | None = None,
     resume: Path | None = None,
-    preset: Literal["fast", "quality"] | None = None,
+    preset: Literal["fast", "quality", "dvgo", "dvgo-unbounded", "dvgo-llff"] | None = None,
     model: str | None = None,
     model_options: tuple[str, ...] = (),
     loss: tuple[str, ...] = (),
@@ -69,7 +70,9 @@ def train_command(
             poses are then estimated first, as by `warpnerf pose`.
         output: Folder for the configuration, the field, the log, the figures and the pictures.
         resume: Go on with the run in this folder, as it was begun; scene only if it has moved.
-        preset: Starting point, by default fast; the options below replace its values.
+        preset: Starting point, by default fast, which takes a minute or three on two cores; quality
+            takes a quarter of an hour; dvgo, dvgo-unbounded and dvgo-llff are the published
+            hyperparameters of DirectVoxGO, and take hours. The options below replace its values.
         model: What the grid holds: deferred (features and a small MLP for each ray, by default),
             features (DVGO's: an MLP for each sample), sh (spherical harmonics), or rgb (colour
             that is the same from all sides).
@@ -146,6 +149,8 @@ def train_command(
     config = changed(PRESETS[preset or "fast"])
     if time_limit is not None and steps is None:
         config = dataclasses.replace(config, steps=STEPS_OF_TIMED)
+    if steps is not None and time_limit is None:
+        config = dataclasses.replace(config, time_limit=None)
     if config.loss.kinds:  # before photographs are posed or read; loads Warp
         from warpnerf.rendering.losses import parts_with
 

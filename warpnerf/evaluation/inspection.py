@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 
 from warpnerf.checks import InputError, require_at_least, require_positive
-from warpnerf.config import PRESETS, TRAINING_BYTES, SceneKind, TrainConfig
+from warpnerf.config import TRAINING_BYTES, SceneKind, TrainConfig
 from warpnerf.model.interface import Model
 from warpnerf.model.models import to_json
+from warpnerf.presets import EVERYDAY, PRESETS
 from warpnerf.runtime.memory import usable_cores
 from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.fisheye import angle_of
@@ -220,8 +221,7 @@ def inspect(
         focus=_focus(scene.training_cameras),
         oddities=(*scene.warnings, *oddities(scene, found, distance, near)),
         costs={
-            name: _cost(scene, replace(preset, model=model), threads)
-            for name, preset in PRESETS.items()
+            name: _cost(scene, replace(PRESETS[name], model=model), threads) for name in EVERYDAY
         },
         model=model,
     )
@@ -343,7 +343,8 @@ def _cost(scene: Scene, config: TrainConfig, threads: int) -> Cost:
     step = config.rays_per_step * (SECONDS_PER_RAY + finer * samples * SECONDS_PER_SAMPLE)
     step += float((nodes / steps_an_update).mean()) * occupied * SECONDS_PER_NODE
     step *= config.model.relative_time
-    return Cost(memory=memory, seconds=config.steps * step / threads, threads=threads)
+    seconds = min(config.steps * step / threads, config.time_limit or math.inf)
+    return Cost(memory=memory, seconds=seconds, threads=threads)
 
 
 def _sizes(cameras: Sequence[Camera]) -> list[tuple[tuple[int, int], int]]:

@@ -198,7 +198,7 @@ class Trainer:
         n_steps = min(self._steps_an_update(fraction), config.steps - before)
         batch = self._sampler.draw(before, n_steps)
         self._pass.run(self.free, batch, n_steps, self._seen)
-        if self._updates % config.optim.tv_every == 0:
+        if self._updates % config.optim.tv_every == 0 and fraction < config.optim.tv_until:
             add_total_variation(
                 self.parameters(),
                 self.grid,

@@ -14,8 +14,9 @@ from warpnerf_kernels.optim import adam, total_variation
 from warpnerf_kernels.sampling import coverage, occupancy
 from warpnerf_kernels.space import camera
 
-from warpnerf.config import PRESETS, Contraction, Jacobian, LossConfig, Scaling
+from warpnerf.config import Contraction, Jacobian, LossConfig, Scaling, TrainConfig
 from warpnerf.model.interface import Model
+from warpnerf.presets import EVERYDAY, PRESETS
 from warpnerf.rendering.losses import PLAIN
 from warpnerf.rendering.render import variant_of
 from warpnerf.runtime import kernel_cache
@@ -76,7 +77,7 @@ def warm_up(
     on_kernel: Callable[[Warmed], None] = lambda kernel: None,
     model: Model | None = None,
 ) -> list[Warmed]:
-    """Compile whatever training and rendering with the presets need, in every scaling.
+    """Compile whatever training and rendering with the everyday presets need, in every scaling.
 
     Args:
         device: Where they are to run: cpu, cuda, cuda:1, ...
@@ -95,7 +96,7 @@ def warm_up(
     for contraction in _contractions():
         for kernel in rendering_kernels(model, contraction, workers.device):
             wanted.setdefault(kernel.module, (_words(kernel, contraction), kernel))
-        for jacobian, losses in dict.fromkeys((p.jacobian, p.loss) for p in PRESETS.values()):
+        for jacobian, losses in dict.fromkeys((p.jacobian, p.loss) for p in _presets()):
             for scaling in get_args(Scaling):
                 for kernel in training_kernels(
                     model, contraction, scaling, jacobian, workers.device, losses
@@ -113,12 +114,16 @@ def warm_up(
     return done
 
 
+def _presets() -> list[TrainConfig]:
+    return [PRESETS[name] for name in EVERYDAY]
+
+
 def _contractions() -> list[Contraction]:
-    """Those of the presets; "auto" is none for bounded scenes and linf for others."""
+    """Those of the presets; "auto" is none for bounded scenes, and linf or ndc for others."""
     found: dict[Contraction, None] = {}
-    for preset in PRESETS.values():
+    for preset in _presets():
         chosen = preset.grid.contraction
-        found |= dict.fromkeys(("none", "linf") if chosen == "auto" else (chosen,))
+        found |= dict.fromkeys(("none", "linf", "ndc") if chosen == "auto" else (chosen,))
     return list(found)
 
 

@@ -1,0 +1,64 @@
+"""Presets train, and those of DVGO are made of what was published."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from test_frustum import facing
+from test_trainer import ball
+from tiny_scenes import ring, tiny_scene
+
+import warpnerf as wn
+from warpnerf.presets import EVERYDAY, PRESETS
+from warpnerf.scenes.scene import Scene
+from warpnerf.training.trainer import Trainer
+
+
+def smaller(name: str, **changes: Any) -> wn.TrainConfig:
+    """A preset at a size for tests: what it is made of, on fewer nodes, rays and steps."""
+    preset = PRESETS[name]
+    values = {
+        "steps": 40,
+        "rays_per_step": 128,
+        "time_limit": None,
+        "threads": 1,
+        "grid": replace(preset.grid, voxels=4096, planes=16),
+    }
+    return replace(preset, **(values | changes))
+
+
+@pytest.mark.slow  # compiles networks as wide as DVGO's
+@pytest.mark.parametrize(
+    ("name", "scene"),
+    [
+        ("fast", ball()),
+        ("quality", ball()),
+        ("dvgo", ball()),
+        ("dvgo-unbounded", tiny_scene(ring(4))),
+        ("dvgo-llff", facing()),
+    ],
+)
+def test_presets_train(name: str, scene: Scene) -> None:
+    losses = []
+    trainer = Trainer(scene, smaller(name))
+    trainer.run(lambda progress: losses.append(progress.loss))
+    assert np.isfinite(losses).all() and trainer.steps_done == 40
+    assert losses[-1] < losses[0]
+
+
+def test_those_of_dvgo_are_all_there_and_the_others_are_everyday() -> None:
+    dvgo = {"dvgo", "dvgo-unbounded", "dvgo-llff"}
+    assert set(PRESETS) == {*EVERYDAY, *dvgo}
+    for name in dvgo:
+        config = PRESETS[name]
+        assert config.model.name == "features" and not config.model.residual
+        assert config.optim.restart_at_growth and config.grid.shift_at_growth == 1.0
+        assert config.loss.entropy == pytest.approx(3 * 1e-3)
+        assert config.loss.sample_colour == pytest.approx(3 * 1e-2)
+        assert (config.loss.distortion > 0.0) == (name != "dvgo")
+        # Learning rates fall by ten in 20 000 steps, or in 80 000 of the unbounded one.
+        pace = 80_000 if name == "dvgo-unbounded" else 20_000
+        assert config.optim.decay == pytest.approx(0.1 ** (config.steps / pace))

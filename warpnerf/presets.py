@@ -1,0 +1,103 @@
+"""Configurations to begin with, by name.
+
+``fast`` and ``quality`` are what warpnerf reaches in a minute or three and in a quarter of an hour
+on two cores; docs/benchmarks.md says how they were chosen. The others are the published
+hyperparameters of DirectVoxGO, to compare with; they take hours on two cores.
+
+Source of these: Sun et al. 2022 (CVPR), Sun et al. 2022 (arXiv 2206.05085), and the configurations
+in their repository: default.py, nerf_unbounded_default.py, llff_default.py. Different here:
+
+- Their coarse stage gives box and free space. Here the grid's own first steps do.
+- Their squared error is the mean over red, green and blue, here it is the sum: weights of other
+  losses are three times theirs.
+- Their total variation has the weight w / rays * longest axis / 128 / 6 for each pair of nodes; it
+  is given here as it is for the final grid.
+- Their near clip needs a distance for each scene; the distance scaling takes its place.
+- Their planes in normalised device coordinates begin with a density each; here all begin with one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from warpnerf.config import GridConfig, LossConfig, MarchConfig, OptimConfig, TrainConfig
+from warpnerf.model.models import Features
+
+_DVGO = TrainConfig(
+    steps=20_000,
+    rays_per_step=8192,
+    coarse_steps=0,
+    occupancy_every=1000,
+    alpha_min=1e-4,
+    model=Features(width=128, residual=False, learning_rate_features=0.1, learning_rate_mlp=1e-3),
+    grid=GridConfig(
+        voxels=160**3,
+        grow_at=(0.05, 0.1, 0.15, 0.2),
+        shift_at_growth=1.0,
+        alpha_init=1e-2,
+    ),
+    march=MarchConfig(step_voxels=0.5, jitter=False),
+    optim=OptimConfig(
+        learning_rate_density=0.1,
+        learning_rate_rgb=0.1,
+        decay=0.1,
+        restart_at_growth=True,
+        tv_density=0.0,
+        tv_rgb=0.0,
+        accumulate_at=(),
+    ),
+    loss=LossConfig(entropy=3e-3, sample_colour=3e-2),
+)
+
+PRESETS: dict[str, TrainConfig] = {
+    "fast": TrainConfig(),
+    "quality": TrainConfig(
+        steps=200_000,
+        time_limit=900.0,
+        grid=GridConfig(voxels=224**3),
+    ),
+    "dvgo": _DVGO,
+    "dvgo-unbounded": replace(
+        _DVGO,
+        steps=40_000,
+        rays_per_step=4096,
+        background="random",
+        grid=GridConfig(
+            voxels=320**3,
+            grow_at=(0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4),
+            shift_at_growth=1.0,
+            alpha_init=1e-4,
+            contraction="linf",
+        ),
+        optim=replace(_DVGO.optim, decay=0.1**0.5, tv_density=3e-10, tv_rgb=3e-11, tv_until=0.5),
+        loss=LossConfig(distortion=3e-2, entropy=3e-3, sample_colour=3e-2),
+    ),
+    "dvgo-llff": replace(
+        _DVGO,
+        steps=30_000,
+        rays_per_step=4096,
+        model=Features(
+            features=9,
+            frequencies=0,
+            width=64,
+            residual=False,
+            threshold=1e-3,
+            learning_rate_features=0.1,
+            learning_rate_mlp=1e-3,
+        ),
+        grid=GridConfig(
+            voxels=256**3,
+            planes=128,
+            grow_at=(1 / 15, 2 / 15, 3 / 15, 4 / 15),
+            shift_at_growth=1.0,
+            alpha_init=1 / 128,
+            contraction="ndc",
+        ),
+        optim=replace(_DVGO.optim, decay=0.1**1.5, tv_density=4e-9, tv_rgb=4e-10),
+        loss=LossConfig(distortion=3e-2, entropy=3e-3, sample_colour=3e-2),
+    ),
+}
+"""By name; change one with ``dataclasses.replace``."""
+
+EVERYDAY = ("fast", "quality")
+"""Those that every command knows the cost of, and that ``warmup`` compiles for."""
