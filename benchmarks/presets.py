@@ -27,7 +27,7 @@ import warpnerf as wn
 from warpnerf.checks import InputError
 from warpnerf.config import TrainConfig, config_to_json
 from warpnerf.model.models import model_of
-from warpnerf.presets import PRESETS
+from warpnerf.presets import EVERYDAY, PRESETS
 from warpnerf.runtime.parallel import Workers
 from warpnerf.training import coarse
 
@@ -49,7 +49,7 @@ def main() -> None:
     limit = args.time_limit or (None if args.steps else 180.0)
     fixed = {"steps": args.steps or 10_000_000, "time_limit": limit, "device": args.device}
     candidates = {
-        text: replace(configured(text), **fixed) for text in args.candidate or list(PRESETS)
+        text: replace(configured(text), **fixed) for text in args.candidate or list(EVERYDAY)
     }
     rows = []
     for name in args.scenes:

@@ -22,10 +22,9 @@ from warpnerf.exporting.volume import volume_of
 from warpnerf.model.nodes import nodes_of, points_of
 from warpnerf.rendering.rays import camera_rays
 from warpnerf.runtime.parallel import Workers
-from warpnerf.scenes.frustum import FARTHEST, fit_frustum
+from warpnerf.scenes.frustum import FARTHEST, contraction_of, fit_frustum
 from warpnerf.scenes.scene import Scene, View
 from warpnerf.training.checkpoint import load_checkpoint, load_field, save_checkpoint, save_field
-from warpnerf.training.extent import contraction_of
 from warpnerf.training.trainer import Trainer
 
 PLACES = [(x, 0.1 * x * z - 4.0, z) for x in (-0.6, 0.0, 0.7) for z in (-0.4, 0.5)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -12,6 +12,7 @@ from test_trainer import ball
 from tiny_scenes import ring, tiny_scene
 
 import warpnerf as wn
+from warpnerf.cli import train
 from warpnerf.presets import EVERYDAY, PRESETS
 from warpnerf.scenes.scene import Scene
 from warpnerf.training.trainer import Trainer
@@ -47,6 +48,12 @@ def test_presets_train(name: str, scene: Scene) -> None:
     trainer.run(lambda progress: losses.append(progress.loss))
     assert np.isfinite(losses).all() and trainer.steps_done == 40
     assert losses[-1] < losses[0]
+
+
+def test_the_command_knows_all() -> None:
+    hints = get_type_hints(train.train_command, include_extras=True)
+    literal = get_args(hints["preset"])[0]
+    assert get_args(literal) == tuple(PRESETS)
 
 
 def test_those_of_dvgo_are_all_there_and_the_others_are_everyday() -> None:

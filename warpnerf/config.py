@@ -52,8 +52,9 @@ class GridConfig:
     alpha_init: float = 1e-3
     """Opacity of one voxel's length before training."""
     contraction: Literal["auto", "none", "linf", "l2", "ndc"] = "auto"
-    """How space outside the box is folded in; auto: linf for unbounded scenes, else none. ndc: the
-    grid lies in normalised device coordinates instead, for cameras that look the same way."""
+    """How space outside the box is folded in. ndc: the grid lies in normalised device coordinates
+    instead, for cameras that look the same way. auto: ndc for captures of LLFF that do, linf for
+    other unbounded scenes, else none."""
     planes: int = 64
     """Nodes of the final grid along the depth of normalised device coordinates; with ndc only."""
     border: float = 0.2
@@ -338,5 +339,8 @@ def config_to_json(config: TrainConfig) -> dict[str, Any]:
 
 
 def config_from_json(tree: dict[str, Any]) -> dict[str, Any]:
-    """What to decode as a TrainConfig: where no model is named, there was only one, rgb."""
-    return {"model": {"name": "rgb"}} | tree
+    """What to decode as a TrainConfig: fields of later versions are as what was there before them.
+
+    Where no model is named, there was only one, rgb, and all rays were drawn.
+    """
+    return {"model": {"name": "rgb"}, "skip_empty_rays": False} | tree

@@ -148,7 +148,7 @@ class WarpnerfMethod:
         trainer = self._trainer
         if trainer is None:
             raise InputError("this was opened to render; give the dataset to train.")
-        while trainer.steps_done <= step:
+        while trainer.steps_done <= step and trainer.fraction < 1.0:
             trainer.update()
         if not trainer.report_due:
             return {"num_rays": self._config.rays_per_step}
@@ -215,13 +215,16 @@ def configured(overrides: dict[str, Any], background: np.ndarray | None) -> Trai
             raise InputError(f"--set {name}: there is no such option; use {', '.join(OPTIONS)}.")
         kind = OPTIONS[name]
         try:
-            given[name] = value if value == "auto" else kind(value)
+            words = ("auto", "per-camera") if name == "content_distance" else ()
+            given[name] = value if value in words else kind(value)
         except ValueError:
             raise InputError(f"--set {name} must be {kind.__name__}, not {value!r}.") from None
     preset = given.pop("preset", "fast")
     if preset not in PRESETS:
         raise InputError(f"--set preset must be {' or '.join(PRESETS)}, not {preset!r}.")
     config = PRESETS[preset]
+    if "steps" in given:
+        config = replace(config, time_limit=None)
     if "voxels" in given:
         given["grid"] = replace(config.grid, voxels=given.pop("voxels"))
     if background is not None:

@@ -59,7 +59,7 @@ def check_command(device: str = "cpu", threads: int | None = None, json: Path | 
 def warmup_command(
     device: str = "cpu", model: str | None = None, model_options: tuple[str, ...] = ()
 ) -> int:
-    """Compile all kernels that training and evaluation with the presets need.
+    """Compile all kernels that training and evaluation with fast and quality need.
 
     Args:
         device: Where they are to run: cpu, cuda, cuda:1, ...

@@ -89,7 +89,8 @@ def train_command(
             each camera what it sees, as points or a short training tell.
         voxels: Nodes of the final grid, in all; memory goes with their number.
         contraction: How space outside the box is held: none, folded in (linf, l2), or ndc, for
-            cameras that look the same way; by default folded in where photographs have no alpha.
+            cameras that look the same way; by default ndc for LLFF's captures that do, else folded
+            in (linf) where photographs have no alpha.
         near: Nothing is sampled nearer to the camera than this, in the scene's units.
         downscale: Average blocks of so many pixels squared; by default 1, as they are.
         masks: Folder of images named after the photographs, white where pixels count and black
@@ -342,15 +343,13 @@ def _train(run: Run, scene: Scene, trainer: Trainer, session: Session | None) ->
 
 def _describe(scene: Scene, content_distance: float, config: TrainConfig) -> None:
     """What was understood of a scene."""
-    from warpnerf.training.extent import contraction_of
+    from warpnerf.scenes.frustum import HELD, contraction_of
 
     train, test = len(scene.splits["train"]), len(scene.splits["test"])
     sizes = sorted({(c.width, c.height) for c in scene.cameras})
     shown = ", ".join(f"{w} x {h}" for w, h in sizes[:3]) + (", ..." if len(sizes) > 3 else "")
     extent = scene.box_max - scene.box_min
-    outside = "space outside folded in" if scene.unbounded else "nothing outside"
-    if contraction_of(scene, config) == "ndc":
-        outside = "but the grid is in normalised device coordinates"
+    outside = HELD[contraction_of(scene, config)]
     print(f"{scene.name}: {train} training and {test} test views, {shown} pixels")
     for warning in scene.warnings:
         print(f"  warning: {warning}")

@@ -21,6 +21,7 @@ from warpnerf.presets import EVERYDAY, PRESETS
 from warpnerf.runtime.memory import usable_cores
 from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.fisheye import angle_of
+from warpnerf.scenes.frustum import HELD, contraction_of
 from warpnerf.scenes.load import load_scene
 from warpnerf.scenes.scene import Scene, find_focus, share_aimed_at, up_direction
 from warpnerf.scenes.survey import Survey, survey
@@ -39,10 +40,11 @@ AMD EPYC."""
 SAMPLES_AND_OCCUPIED: dict[SceneKind, tuple[int, float]] = {
     "object": (12, 0.3),
     "bounded": (50, 0.8),
-    "unbounded": (190, 0.6),
+    "unbounded": (140, 0.6),
 }
-"""Samples per ray, and the share of nodes in use: means of lego, builtin:room-sparse and fox late
-in training with the preset fast."""
+SAMPLES_IN_NDC = (60, 0.6)
+"""Samples per ray, and the share of nodes in use: means of lego, builtin:room-sparse, fox and, in
+normalised device coordinates, fern, late in training with the preset fast."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,8 +147,7 @@ class Inspection:
             ("up", "  ".join(f"{value:.3g}" for value in facts["up"])),
             (
                 "box",
-                f"{box} scene units, "
-                + ("space outside folded in" if scene.unbounded else "nothing outside"),
+                f"{box} scene units, {HELD[contraction_of(scene, PRESETS['fast'])]}",
             ),
             ("content distance", f"{self.content_distance:.4g} scene units"),
         ]
@@ -335,7 +336,8 @@ def _cost(scene: Scene, config: TrainConfig, threads: int) -> Cost:
     images = sum(v.camera.width * v.camera.height * v.channels for v in scene.views)
     memory = TRAINING_BYTES * config.model.n_floats * voxels + images
 
-    samples, occupied = SAMPLES_AND_OCCUPIED[scene.kind]
+    in_ndc = contraction_of(scene, config) == "ndc"
+    samples, occupied = SAMPLES_IN_NDC if in_ndc else SAMPLES_AND_OCCUPIED[scene.kind]
     finer = (voxels / PRESETS["fast"].grid.voxels) ** (1.0 / 3.0) / config.march.step_voxels
     share = (np.arange(1000) + 0.5)[:, None] / 1000  # of the training, evenly
     nodes = voxels * 0.5 ** (share < config.grid.grow_at).sum(axis=1)

@@ -147,6 +147,7 @@ class PixelSampler:
         self._runs: list[wp.array] = []
         self._n_pixels = 0
         self._cameras = [view.camera for view in views]
+        self._masks = [view.mask for view in views]
         self._structs = [self._add(view) for view in views]
         self._views = wp.array(self._structs, dtype=kernels.View, device=workers.device)
         self._draw_anywhere()
@@ -188,7 +189,7 @@ class PixelSampler:
             free: Of this grid.
 
         Returns:
-            The share of the blocks that are drawn from, (0, 1]: all where none shows anything.
+            The share of the pixels that are drawn from, (0, 1]: all where none shows anything.
         """
         self._draw_anywhere()
         edge = _block_edge(self._cameras, grid, free)
@@ -202,7 +203,13 @@ class PixelSampler:
                 *(struct, edge, int(before), grid.box, free.struct, covered),
                 chunk=RAYS,
             )
-        share = float(np.mean(covered.numpy()))
+        n_pixels = np.concatenate(
+            [
+                _pixels_of_blocks(*size, edge)
+                for size in zip(self._cameras, self._masks, strict=True)
+            ]
+        )
+        share = float(n_pixels[covered.numpy() != 0].sum()) / self._n_pixels
         if 0.0 < share < 1.0:
             self._block, self._covered = edge, covered
             device = self._workers.device
@@ -263,6 +270,19 @@ class PixelSampler:
 def _n_blocks(camera: Camera, edge: int) -> int:
     """Blocks of a photograph, those cut off by its edges included."""
     return -(-camera.width // edge) * -(-camera.height // edge)
+
+
+def _pixels_of_blocks(camera: Camera, mask: np.ndarray | None, edge: int) -> np.ndarray:
+    """How many pixels of each block count, [n_blocks], block by block, row by row."""
+    rows, columns = (np.arange(0, n, edge) for n in (camera.height, camera.width))
+    if mask is None:
+        heights, widths = (
+            np.minimum(edge, camera.height - rows),
+            np.minimum(edge, camera.width - columns),
+        )
+        return np.outer(heights, widths).ravel()
+    of_rows = np.add.reduceat(mask.astype(np.int64), rows, axis=0)
+    return np.add.reduceat(of_rows, columns, axis=1).ravel()
 
 
 def _block_edge(cameras: Sequence[Camera], grid: VoxelGrid, free: FreeCells) -> int:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from warpnerf.checks import InputError
+from warpnerf.config import Contraction, TrainConfig
 from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.scene import Scene
 from warpnerf.scenes.undistort import directions
@@ -103,6 +104,24 @@ def faces_forward(scene: Scene) -> bool:
     except InputError:  # bounds that make no sense
         return False
     return True
+
+
+HELD: dict[Contraction, str] = {
+    "none": "nothing outside",
+    "linf": "space outside folded in",
+    "l2": "space outside folded in",
+    "ndc": "but the grid is in normalised device coordinates",
+}
+"""What of space outside the box becomes, in words."""
+
+
+def contraction_of(scene: Scene, config: TrainConfig) -> Contraction:
+    """How space outside the box is held: what is configured, auto decided for a scene."""
+    if config.grid.contraction != "auto":
+        return config.grid.contraction
+    if not scene.unbounded:
+        return "none"
+    return "ndc" if config.jacobian == "none" and faces_forward(scene) else "linf"
 
 
 def fit_frustum(

@@ -23,10 +23,12 @@ from warpnerf.model.grid import VoxelGrid
 from warpnerf.model.nodes import points_of
 from warpnerf.rendering.field import Field
 from warpnerf.rendering.rays import camera_rays
+from warpnerf.runtime.parallel import Workers
 from warpnerf.scenes.camera import Camera
+from warpnerf.scenes.frustum import contraction_of
 from warpnerf.scenes.points import SeenExtent, seen_extent
 from warpnerf.scenes.scene import Scene, View
-from warpnerf.training.extent import contraction_of
+from warpnerf.training.extent import require_grid
 from warpnerf.training.state import Progress, TrainingState
 from warpnerf.training.trainer import Trainer
 
@@ -78,6 +80,7 @@ def begin(
     """
     sight, seconds = None, 0.0
     if resume is None and is_needed(scene, config):
+        require_grid(scene, config, Workers(config.device, config.threads).device)
         sight, seconds = find_sight(scene, config, on_progress)
         if sight is None:
             scene = replace(scene, notes=(*scene.notes, NOTHING_SEEN))

@@ -9,23 +9,19 @@ import warp as wp
 from warpnerf_kernels.base.types import vector
 
 from warpnerf.checks import InputError
-from warpnerf.config import Contraction, TrainConfig
+from warpnerf.config import TrainConfig
 from warpnerf.model.grid import VoxelGrid, grid_size, require_memory
 from warpnerf.model.interface import Model
-from warpnerf.scenes.frustum import faces_forward, fit_frustum
+from warpnerf.scenes.frustum import FARTHEST, contraction_of, fit_frustum
 from warpnerf.scenes.scene import Scene
 
 TIGHTEN_AT = 0.1
 """Share of the training at which the box of an object is tightened, before the grid first grows."""
 
 
-def contraction_of(scene: Scene, config: TrainConfig) -> Contraction:
-    """How space outside the box is held: what is configured, auto decided for a scene."""
-    if config.grid.contraction != "auto":
-        return config.grid.contraction
-    if not scene.unbounded:
-        return "none"
-    return "ndc" if config.jacobian == "none" and faces_forward(scene) else "linf"
+def require_grid(scene: Scene, config: TrainConfig, device: wp.Device) -> None:
+    """Raise InputError where the final grid has no place in memory, or the scene no frustum."""
+    first_grid(scene, config, 8, device, None)
 
 
 def first_grid(
@@ -86,6 +82,12 @@ def content_distances(scene: Scene, config: TrainConfig) -> tuple[float, list[fl
     """The content distance of the scene, and those of its training views."""
     chosen, train = config.content_distance, scene.splits["train"]
     if chosen == "per-camera":
+        if scene.content_distances is None and not config.coarse_steps:
+            raise InputError(
+                f"content_distance is per-camera, but {scene.name} brings no points, and with "
+                "coarse_steps 0, as DVGO's presets have it, none are looked for; use auto, or a "
+                "number."
+            )
         if scene.content_distances is None:
             raise InputError(
                 f"content_distance is per-camera, but {scene.name} brings no points, and no short "
@@ -105,20 +107,23 @@ def require_samples(scene: Scene, config: TrainConfig) -> None:
     begin = float(np.linalg.norm(outside, axis=1).min())
     end = float(np.linalg.norm(across, axis=1).max())
     march = config.march
-    contraction = contraction_of(scene, config)
+    contraction, what = contraction_of(scene, config), "box"
     if contraction == "ndc":
-        return  # the frustum begins before all content, and ends far behind it
-    if contraction != "none":
+        frustum, _ = fit_frustum(scene, config.grid.planes, config.grid.voxels)
+        depths, what = frustum.depths(positions), "frustum"
+        begin = frustum.near - float(depths.max())
+        end = FARTHEST * frustum.near - float(depths.min())
+    elif contraction != "none":
         begin = 0.0  # space outside the box is sampled too
     if march.near >= end:
         raise InputError(
-            f"march.near is {march.near:g}, but the scene's box ends {end:.4g} scene units from "
+            f"march.near is {march.near:g}, but the scene's {what} ends {end:.4g} scene units from "
             "the farthest camera, so nothing of it would be sampled; use a smaller --near."
         )
     if march.far is not None and march.far <= begin:
         raise InputError(
-            f"march.far is {march.far:g}, but the scene's box begins {begin:.4g} scene units from "
-            "the nearest camera, so nothing of it would be sampled; use a larger one."
+            f"march.far is {march.far:g}, but the scene's {what} begins {begin:.4g} scene units "
+            "from the nearest camera, so nothing of it would be sampled; use a larger one."
         )
 
 

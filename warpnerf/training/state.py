@@ -32,9 +32,9 @@ class Progress:
     seconds: float
     """Of training, those before a resumption included; compiling does not count."""
     loss: float
-    """Of the last update: mean over its rays of the squared error, summed over channels."""
+    """Of the last update: mean over its rays of what is minimised."""
     psnr: float
-    """Of the last update's rays, dB."""
+    """Of the squared error of the last update's rays, dB."""
     samples_per_ray: float
     """Visited steps per ray of the last update."""
     size: tuple[int, int, int]
