@@ -150,6 +150,12 @@ def test_captures_with_bounds_that_face_forward_are_trained_in_a_frustum(
     assert contraction_of(scene, config(**({"grid": wn.GridConfig()} | changes))) == chosen
 
 
+@pytest.mark.parametrize(("march", "says"), [({"near": 1e6}, "near"), ({"far": 1e-3}, "far")])
+def test_clip_distances_that_leave_nothing_are_refused(march: dict[str, float], says: str) -> None:
+    with pytest.raises(InputError, match=f"march.{says} is .*frustum"):
+        Trainer(facing(), config(march=wn.MarchConfig(**march)))
+
+
 def test_no_term_of_the_jacobian() -> None:
     with pytest.raises(InputError, match=r"jacobian must be none with grid\.contraction ndc"):
         config(jacobian="density")

@@ -163,6 +163,25 @@ def test_pixels_around_what_is_there_are_not_drawn_and_all_others_alike(on_cpu: 
     assert 0.02 < same.mean() < 0.7
 
 
+def test_the_share_that_is_drawn_is_of_pixels_that_count(on_cpu: None) -> None:
+    """Masks that keep only what meets something leave nothing out."""
+    views = small_scene().views[:3]
+    options = (np.full(3, 2.0), (0.0, 0.0, 0.0), 1000, False, 3, Workers("cpu", 2))
+    whole = PixelSampler(views, *options)
+    share = whole.keep_to(*little_occupied(views))
+    drawn_from = drawn(whole.draw(0))
+    assert 0.02 < share < 0.6 and len(drawn_from["offsets"]) == round(1000 * share)
+    covered = whole._covered.numpy() != 0
+    first = whole._first_blocks.numpy()
+    masked = []
+    for view, begin in zip(views, first, strict=True):
+        height, width = view.image.shape[:2]
+        across, edge = -(-width // whole._block), whole._block
+        rows, columns = np.mgrid[:height, :width] // edge
+        masked.append(replace(view, mask=covered[begin + rows * across + columns]))
+    assert PixelSampler(masked, *options).keep_to(*little_occupied(views)) == 1.0
+
+
 def test_where_nothing_or_everything_is_seen_all_pixels_are_drawn(on_cpu: None) -> None:
     views = masked_views()
     options = ((0.0, 0.0, 0.0), 500, False, 3, Workers("cpu", 2))

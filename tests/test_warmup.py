@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 from test_determinism import small_scene
+from test_frustum import facing
 
 from warpnerf.config import GridConfig, OptimConfig, TrainConfig
 from warpnerf.model.interface import Model
@@ -21,6 +22,7 @@ from warpnerf.training.warmup import rendering_kernels, training_kernels, warm_u
         ("none", "quadratic", Deferred()),
         ("none", "clamped", Deferred()),
         ("linf", "clamped", Deferred()),
+        ("ndc", "clamped", Deferred()),
         ("none", "clamped", Rgb()),
         ("none", "clamped", Features()),
     ],
@@ -37,17 +39,18 @@ def test_a_training_loads_no_other_kernels(
         grid=GridConfig(voxels=600, grow_at=(0.5,), contraction=contraction),
         optim=OptimConfig(accumulate_at=()),
     )
-    trainer = Trainer(small_scene(), config)
+    scene = facing() if contraction == "ndc" else small_scene()
+    trainer = Trainer(scene, config)
     assert not trainer.workers._loaded  # a scene is described before anything is compiled
     where = trainer.workers.device
     needed = training_kernels(model, contraction, scaling, "none", where, config.loss)
     trainer.update()
     assert trainer.workers._loaded == set(needed)
     trainer.run()
-    assert trainer.grid.size != Trainer(small_scene(), config).grid.size
+    assert trainer.grid.size != Trainer(scene, config).grid.size
     modules = {kernel.module for kernel in needed}
     assert {kernel.module for kernel in trainer.workers._loaded} == modules
-    trainer.field().render(small_scene().cameras[0])
+    trainer.field().render(scene.cameras[0])
     modules |= {kernel.module for kernel in rendering_kernels(model, contraction, where)}
     assert {kernel.module for kernel in trainer.workers._loaded} == modules
 
@@ -61,6 +64,7 @@ def test_warm_up_covers_the_presets_and_is_done_once(device: str) -> None:
     for scaling in ("none", "quadratic", "clamped"):
         assert f"render train, scaling {scaling}" in names
         assert f"render train, space folded in, scaling {scaling}" in names
+        assert f"render train, in NDC, scaling {scaling}" in names
     assert {"render forward", "render forward, space folded in", "adam step"} < set(names)
     again = warm_up(device)
     assert [kernel.name for kernel in again] == names
