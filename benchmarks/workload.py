@@ -88,6 +88,9 @@ MODELS: dict[ModelName, Model] = {
 }
 """Those of warpnerf as they are by default, and `features` as DVGO has it."""
 
+EVERYDAY = tuple(name for name in MODELS if name != "dvgo")
+"""Those that are compared by default; dvgo_step.py is about the other one."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Workload:

@@ -101,7 +101,8 @@ def summary(
 
 def nothing_placed(source: Path, found: Mapping[str, Any], n: int) -> str:
     """Why no photograph of a source could be placed, and the way out: a sentence."""
-    poor = [name for name, features in found["features"].items() if features < FEW_FEATURES]
+    # COLMAP's order is that in which its threads were done.
+    poor = sorted(name for name, n_found in found["features"].items() if n_found < FEW_FEATURES)
     if 2 * len(poor) > n:
         return (
             f"{source}: none of {n} photographs could be placed: {len(poor)} of them show too "
