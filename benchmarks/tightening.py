@@ -23,7 +23,7 @@ import warpnerf as wn
 from warpnerf.model.grid import FreeCells
 from warpnerf.rendering.render import march_struct
 from warpnerf.runtime.parallel import Workers
-from warpnerf.training import trainer as training
+from warpnerf.training import extent
 from warpnerf.training.trainer import Trainer
 
 SMALL_STEPS, SMALL_VOXELS = 250, 48**3
@@ -76,7 +76,7 @@ def main() -> None:
 
 def race(scene: wn.Scene, config: wn.TrainConfig) -> dict[str, dict[str, float]]:
     """Train in each of the ways, in turns."""
-    with mock.patch.object(training, "TIGHTEN_AT", 1.0):
+    with mock.patch.object(extent, "TIGHTEN_AT", 1.0):
         trainers = {"at growth": Trainer(scene, config), "own grid": from_small(scene, config)}
     trainers["early"] = Trainer(scene, config)
     take_turns(trainers, lambda name, seconds: None)
