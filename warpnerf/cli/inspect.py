@@ -57,7 +57,11 @@ def inspect_command(
         masks=masks,
         content_distance=content_distance,
         near=near,
-        model=chosen_model(PRESETS["fast"].model, model, model_options),
+        model=(
+            chosen_model(PRESETS["fast"].model, model, model_options)
+            if model or model_options
+            else None
+        ),
         threads=threads or usable_cores(),
     )
     print(found)

@@ -213,7 +213,6 @@ def inspect(
         named = ", ".join(others[:5]) + (", ..." if len(others) > 5 else "")
         raise InputError(f"{error} Poses refused likewise: {len(others)} more ({named}).") from None
     distance = scene.content_distance if content_distance is None else content_distance
-    model = model or PRESETS["fast"].model
     return Inspection(
         scene=scene,
         format=found.format,
@@ -222,9 +221,10 @@ def inspect(
         focus=_focus(scene.training_cameras),
         oddities=(*scene.warnings, *oddities(scene, found, distance, near)),
         costs={
-            name: _cost(scene, replace(PRESETS[name], model=model), threads) for name in EVERYDAY
+            name: _cost(scene, replace(PRESETS[name], model=model or PRESETS[name].model), threads)
+            for name in EVERYDAY
         },
-        model=model,
+        model=model or PRESETS["fast"].model,
     )
 
 
