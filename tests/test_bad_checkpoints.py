@@ -21,8 +21,9 @@ from tiny_fields import tiny_state
 
 from warpnerf.checks import InputError
 from warpnerf.config import TrainConfig
-from warpnerf.training.checkpoint import DamagedFileError, load_checkpoint, load_field
+from warpnerf.training.checkpoint import load_checkpoint, load_field
 from warpnerf.training.run import Run
+from warpnerf.training.tensor_file import DamagedFileError
 
 COMMANDS = {"eval": ("eval",), "resume": ("train", "--resume")}
 EITHER = pytest.mark.parametrize("command", COMMANDS)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -19,15 +20,9 @@ from warpnerf.checks import InputError
 from warpnerf.config import Contraction, GridConfig, MarchConfig, OptimConfig, TrainConfig
 from warpnerf.model.interface import Model, n_weights
 from warpnerf.model.models import Deferred, Features, Rgb, SphericalHarmonics
-from warpnerf.training import checkpoint
-from warpnerf.training.checkpoint import (
-    DamagedFileError,
-    load_checkpoint,
-    load_field,
-    save_checkpoint,
-    save_field,
-    write_atomically,
-)
+from warpnerf.training.checkpoint import load_checkpoint, load_field, save_checkpoint, save_field
+from warpnerf.training.tensor_file import DamagedFileError, digest_of
+from warpnerf.writing import write_atomically
 
 
 @pytest.fixture
@@ -43,7 +38,7 @@ def rewrite(path: Path, header: Any = None, **tensors: np.ndarray) -> None:
         text = file.metadata()["header"]
     contents = load_file(path) | tensors
     text = text if header is None else header(text)
-    digest = checkpoint._digest(text, contents)
+    digest = digest_of(text, contents)
     save_file(contents, path, metadata={"header": text, "sha256": digest})
 
 
@@ -208,7 +203,7 @@ def test_the_file_is_as_the_package_writes_it(tmp_path: Path, file: Path) -> Non
 
 
 def test_a_short_write_is_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write = checkpoint.os.write
+    write = os.write
     monkeypatch.setattr("os.write", lambda file, data: write(file, data[:3]))
     write_atomically(tmp_path / "file", b"abcdefgh", b"", memoryview(b"ijk"))
     assert (tmp_path / "file").read_bytes() == b"abcdefghijk"
@@ -311,6 +306,6 @@ def test_another_version_is_not_called_damage(file: Path) -> None:
 
 
 def test_a_pipe_is_refused_unopened(tmp_path: Path) -> None:
-    checkpoint.os.mkfifo(tmp_path / "pipe")
+    os.mkfifo(tmp_path / "pipe")
     with pytest.raises(InputError, match="pipe is not a file"):
         load_field(tmp_path / "pipe")

@@ -16,7 +16,8 @@ from tiny_scenes import camera_at, ring
 from warpnerf.checks import InputError
 from warpnerf.config import MarchConfig, TrainConfig
 from warpnerf.model.models import Rgb
-from warpnerf.training.checkpoint import DamagedFileError, load_checkpoint, load_field
+from warpnerf.training.checkpoint import load_checkpoint, load_field
+from warpnerf.training.tensor_file import DamagedFileError
 
 OLD_FIELD = {
     "background": [0.1, 0.6, 0.9],

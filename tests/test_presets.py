@@ -8,8 +8,8 @@ from typing import Any, get_args, get_type_hints
 import numpy as np
 import pytest
 from test_frustum import facing
-from test_trainer import ball
 from tiny_scenes import ring, tiny_scene
+from tiny_trainings import ball
 
 import warpnerf as wn
 from warpnerf.cli import train
@@ -17,12 +17,14 @@ from warpnerf.presets import EVERYDAY, PRESETS
 from warpnerf.scenes.scene import Scene
 from warpnerf.training.trainer import Trainer
 
+STEPS = 120
+
 
 def smaller(name: str, **changes: Any) -> wn.TrainConfig:
     """A preset at a size for tests: what it is made of, on fewer nodes, rays and steps."""
     preset = PRESETS[name]
     values = {
-        "steps": 40,
+        "steps": STEPS,
         "rays_per_step": 128,
         "time_limit": None,
         "threads": 1,
@@ -43,12 +45,14 @@ def smaller(name: str, **changes: Any) -> wn.TrainConfig:
     ],
 )
 def test_presets_train(name: str, scene: Scene) -> None:
-    losses = []
     trainer = Trainer(scene, smaller(name))
-    trainer.run(lambda progress: losses.append(progress.loss))
-    assert np.isfinite(losses).all() and trainer.steps_done == 40
+    before = wn.evaluate(trainer.field(), scene, split="training").mean["psnr"]
+    trainer.run()
+    assert trainer.steps_done == STEPS
+    assert wn.evaluate(trainer.field(), scene, split="training").mean["psnr"] > before + 1.0
     for parameter in trainer.parameters():
-        assert parameter.values.numpy().any()
+        values = parameter.values.numpy()
+        assert values.any() and np.isfinite(values).all()
 
 
 def test_the_command_knows_all() -> None:

@@ -15,9 +15,9 @@ import pytest
 from test_determinism import small_scene
 from tiny_fields import assert_same_state, tiny_state
 
+from warpnerf import writing
 from warpnerf.checks import InputError
 from warpnerf.config import TrainConfig
-from warpnerf.training import checkpoint
 from warpnerf.training.run import Run
 from warpnerf.training.state import Progress, TrainingState
 
@@ -107,7 +107,7 @@ def in_child(act: Callable[[], Any]) -> int:
 
 @pytest.fixture(autouse=True)
 def several_writes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(checkpoint, "CHUNK", 3000)
+    monkeypatch.setattr(writing, "CHUNK", 3000)
 
 
 def require_old_or_new(folder: Path, old: int, new: int) -> None:

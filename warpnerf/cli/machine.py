@@ -95,7 +95,7 @@ def write_json(path: Path, text: str) -> None:
     Raises:
         InputError: It cannot be written.
     """
-    from warpnerf.training.checkpoint import write_atomically
+    from warpnerf.writing import write_atomically
 
     try:
         write_atomically(path, text.encode())

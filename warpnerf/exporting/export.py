@@ -12,7 +12,7 @@ from warpnerf.exporting import mesh, page, splats, surface, volume
 from warpnerf.exporting.sight import look
 from warpnerf.rendering.field import Field
 from warpnerf.scenes.scene import Scene, up_direction
-from warpnerf.training.checkpoint import write_atomically
+from warpnerf.writing import write_atomically
 
 SURFACES = (".glb", ".obj", ".ply", ".points.ply", "")
 SPLATS = (".splat.ply", ".html")

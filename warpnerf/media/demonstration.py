@@ -26,9 +26,9 @@ from warpnerf.scenes.builtin.room import first_hit, photograph
 from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.load import load_scene
 from warpnerf.scenes.scene import Scene
-from warpnerf.training.checkpoint import write_atomically
 from warpnerf.training.state import Progress
 from warpnerf.training.train import train
+from warpnerf.writing import write_atomically
 
 SCALINGS: dict[Scaling, str] = {"none": "without scaling", "clamped": "with scaling"}
 """What is compared, and what it is called."""

@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from warpnerf.rendering.field import Rendering
-from warpnerf.training.checkpoint import write_atomically
+from warpnerf.writing import write_atomically
 
 _COLOURS = (
     "ffef6d fdd654 febe3e fea430 fc8b2e f67337 ec5b47 de4656 cd3365"

@@ -18,7 +18,7 @@ from PIL import Image
 
 from warpnerf.checks import InputError, require_positive
 from warpnerf.media.pictures import png
-from warpnerf.training.checkpoint import write_atomically
+from warpnerf.writing import write_atomically
 
 QUALITY = "18"
 """Constant rate factor of H.264: hardly to be told from the original."""

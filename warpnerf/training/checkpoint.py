@@ -1,26 +1,22 @@
 """Fields, and whole trainings between two updates, in files. No pickle.
 
-A file is safetensors, written whole or not at all. Its metadata hold a header in JSON (format
-version, how to render, and for a training its configuration and progress) and the SHA-256 over
-header and tensors. A training's file is a field's file and more, so a field is read from either.
+A file is tensors with a header: format version, how to render, and for a training its configuration
+and progress. A training's file is a field's file and more, so a field is read from either.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
-import os
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import msgspec
 import numpy as np
 import warp as wp
 from warpnerf_kernels.base.types import vector
 
-from warpnerf.checks import InputError, way_out
+from warpnerf.checks import InputError
 from warpnerf.config import Contraction, TrainConfig, config_from_json, config_to_json
 from warpnerf.model.grid import FreeCells, VoxelGrid
 from warpnerf.model.interface import Model, n_weights
@@ -32,19 +28,13 @@ from warpnerf.runtime.parallel import Workers
 from warpnerf.scenes.frustum import Frustum
 from warpnerf.training.optim import NodesRule, WeightsRule, first_states
 from warpnerf.training.state import Progress, TrainingState
+from warpnerf.training.tensor_file import read_tensors, refuse, write_tensors
 
 FIELD = "warpnerf-field-2"
 TRAINING = "warpnerf-training-6"
 """What a file holds, and the version of its format."""
 OLDER = {"warpnerf-field-1": FIELD, "warpnerf-training-5": TRAINING}
 """Formats of the version before, which had one model, rgb; they are read."""
-
-CHUNK = 1 << 24
-"""Bytes per write: signals such as Ctrl-C wait for one to end."""
-
-
-class DamagedFileError(InputError):
-    """A file is not what was written: cut off, altered, or of another kind altogether."""
 
 
 def save_field(path: str | Path, field: Field) -> None:
@@ -57,7 +47,7 @@ def save_field(path: str | Path, field: Field) -> None:
     Raises:
         OSError: The file cannot be written; an older one is then left as it was.
     """
-    _write(path, {"format": FIELD} | _field_header(field), _field_tensors(field))
+    write_tensors(path, {"format": FIELD} | _field_header(field), _field_tensors(field))
 
 
 def save_checkpoint(path: str | Path, state: TrainingState) -> None:
@@ -82,7 +72,7 @@ def save_checkpoint(path: str | Path, state: TrainingState) -> None:
         "progress": asdict(state.progress),
     }
     header = {"format": TRAINING, "training": training} | _field_header(state.field)
-    _write(path, header, _optimiser_tensors(state) | _field_tensors(state.field))
+    write_tensors(path, header, _optimiser_tensors(state) | _field_tensors(state.field))
 
 
 def load_field(path: str | Path, device: str = "cpu", threads: int | None = None) -> Field:
@@ -124,21 +114,21 @@ def load_checkpoint(path: str | Path) -> TrainingState:
             f"{path} holds a field but no training to go on with; name a checkpoint, or train anew."
         )
     if not 0 <= training.grown <= 1 + len(training.config.grid.grow_at):
-        _refuse(path, f"a grid cannot have been resized {training.grown} times")
+        refuse(path, f"a grid cannot have been resized {training.grown} times")
     if not 0 <= training.updates <= training.progress.step:
-        _refuse(path, f"{training.updates} updates do not fit {training.progress.step} steps")
+        refuse(path, f"{training.updates} updates do not fit {training.progress.step} steps")
     if not 0 <= training.restarted <= training.updates:
-        _refuse(
+        refuse(
             path,
             f"an optimiser of {training.updates} updates cannot begin anew after "
             f"{training.restarted}",
         )
     if (training.config.content_distance == "per-camera") != bool(training.content_distances):
-        _refuse(path, "content distances of cameras are not as its configuration says")
+        refuse(path, "content distances of cameras are not as its configuration says")
     workers = Workers("cpu")
     field = _field(header, tensors, path, workers)
     if training.config.model != field.model:
-        _refuse(path, "its configuration names another model than its field")
+        refuse(path, "its configuration names another model than its field")
     return TrainingState(
         config=training.config,
         scene_digest=training.scene_digest,
@@ -257,7 +247,7 @@ def _optimiser(
             elif fits:
                 fits = bool(np.isfinite(tensor).all())
             if not fits:
-                _refuse(path, f"its tensor '{parameter}.{name}' does not fit its values")
+                refuse(path, f"its tensor '{parameter}.{name}' does not fit its values")
             arrays[name] = wp.array(tensor, dtype=array.dtype, device=workers.device)
     return states
 
@@ -287,7 +277,7 @@ def _field(header: _Header, tensors: dict[str, np.ndarray], path: Path, workers:
         and np.isfinite(values).all()
     )
     if not fits:
-        _refuse(path, "it holds values that cannot be rendered")
+        refuse(path, "it holds values that cannot be rendered")
     grid = VoxelGrid(
         values=wp.array(
             values.reshape(-1, model.n_floats),
@@ -339,69 +329,10 @@ def _frustum_fits(header: _Header) -> bool:
     )
 
 
-def _write(path: str | Path, header: dict[str, Any], tensors: dict[str, np.ndarray]) -> None:
-    text = json.dumps(header, sort_keys=True)
-    metadata = {"header": text, "sha256": _digest(text, tensors)}
-    write_atomically(path, *_safetensors(metadata, tensors))
-
-
-def _safetensors(
-    metadata: dict[str, str], tensors: dict[str, np.ndarray]
-) -> list[bytes | memoryview]:
-    """The pieces of a safetensors file, without the copies of all tensors that ``save`` makes.
-
-    Format: https://github.com/huggingface/safetensors#format. Wide types come first, so that all
-    tensors are aligned.
-    """
-    dtypes = {np.dtype(np.float32): "F32", np.dtype(np.uint32): "U32", np.dtype(np.uint8): "U8"}
-    table: dict[str, Any] = {"__metadata__": metadata}
-    pieces, end = [], 0
-    for name, tensor in sorted(tensors.items(), key=lambda item: (-item[1].itemsize, item[0])):
-        offsets = [end, end := end + tensor.nbytes]
-        table[name] = {
-            "dtype": dtypes[tensor.dtype],
-            "shape": tensor.shape,
-            "data_offsets": offsets,
-        }
-        pieces.append(np.ascontiguousarray(tensor).data.cast("B"))
-    text = json.dumps(table).encode()
-    text += b" " * (-len(text) % 8)
-    return [len(text).to_bytes(8, "little"), text, *pieces]
-
-
 def _read(path: Path) -> tuple[_Header, dict[str, np.ndarray]]:
-    """Header and tensors, checked against the digest; what is not ours is refused."""
-    from safetensors import SafetensorError, safe_open
-
-    if not path.exists():
-        raise InputError(f"{path} does not exist; train first, or name another file.")
-    if not path.is_file():  # reading from a pipe would never end
-        raise InputError(f"{path} is not a file; name a field or a checkpoint.")
-    try:
-        path.open("rb").close()
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}; {way_out(error)}.") from None
-    try:
-        with safe_open(path, framework="numpy") as file:
-            metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in sorted(file.keys())}
-        with path.open("rb") as file:
-            _strict_json(file.read(int.from_bytes(file.read(8), "little")))
-    except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
-        _refuse(path, f"it is not readable as safetensors ({error})")
-    try:
-        tree = _strict_json(metadata.get("header", "{}"))
-        kind = tree.get("format")
-    except (ValueError, RecursionError, AttributeError) as error:
-        _refuse(path, f"its header is not what was written ({error})")
-    if kind not in (FIELD, TRAINING, *OLDER):
-        raise InputError(
-            f"{path} has format {kind!r}, but this version reads "
-            f"{', '.join(map(repr, (FIELD, TRAINING, *OLDER)))}; use the version of warpnerf that "
-            "wrote it, or train again."
-        )
-    if metadata.get("sha256") != _digest(metadata["header"], tensors):
-        _refuse(path, "its content does not match its SHA-256")
+    """Header and tensors of a field or a training; what is not ours is refused."""
+    tree, tensors = read_tensors(path, (FIELD, TRAINING, *OLDER))
+    kind = tree["format"]
     if isinstance(model := tree.get("model"), dict) and model.get("name") not in MODELS:
         raise InputError(
             f"{path} holds a field of the model {model.get('name')!r}, but this version knows "
@@ -412,7 +343,7 @@ def _read(path: Path) -> tuple[_Header, dict[str, np.ndarray]]:
             tree["training"] = training | {"config": config_from_json(training["config"])}
         header = msgspec.convert(tree, _Header, dec_hook=decode)
     except (msgspec.ValidationError, TypeError) as error:
-        _refuse(path, f"its header does not fit: {error}")
+        refuse(path, f"its header does not fit: {error}")
     if kind in OLDER:
         kind = OLDER[kind]
         if "moments" in tensors and "values.moments" not in tensors:
@@ -426,72 +357,5 @@ def _read(path: Path) -> tuple[_Header, dict[str, np.ndarray]]:
             for name in rule.state_names
         }
     if set(tensors) != names or (header.training is not None) != (kind == TRAINING):
-        _refuse(
-            path, f"it holds {', '.join(sorted(tensors))} instead of {', '.join(sorted(names))}"
-        )
+        refuse(path, f"it holds {', '.join(sorted(tensors))} instead of {', '.join(sorted(names))}")
     return header, tensors
-
-
-def _refuse(path: Path, why: str) -> NoReturn:
-    raise DamagedFileError(f"{path} is damaged: {why}; train again.")
-
-
-def _strict_json(text: str | bytes) -> Any:
-    """JSON without NaN, infinity and keys given twice, of which other readers take either one."""
-
-    def number(text: str) -> float:
-        value = float(text)
-        if not math.isfinite(value):
-            raise ValueError(f"{text} is not a finite number")
-        return value
-
-    return json.loads(text, object_pairs_hook=_distinct, parse_float=number, parse_constant=number)
-
-
-def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    table = dict(pairs)
-    if len(table) < len(pairs):
-        names = [name for name, _ in pairs]
-        twice = next(name for name in names if names.count(name) > 1)
-        raise ValueError(f"the key {twice!r} is given twice")
-    return table
-
-
-def write_atomically(path: str | Path, *pieces: bytes | memoryview) -> None:
-    """Write a file so that its name always leads to all of the old content or all of the new.
-
-    Raises:
-        OSError: It cannot be written.
-    """
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | getattr(os, "O_BINARY", 0)
-        file = os.open(temporary, flags, 0o666)
-        try:
-            for piece in pieces:
-                view = memoryview(piece)
-                while view:
-                    view = view[os.write(file, view[:CHUNK]) :]
-            os.fsync(file)
-        finally:
-            os.close(file)
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-    if os.name == "posix":
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
-
-
-def _digest(header: str, tensors: dict[str, np.ndarray]) -> str:
-    digest = hashlib.sha256(header.encode())
-    for name in sorted(tensors):
-        tensor = tensors[name]
-        digest.update(f"{name}{tensor.dtype}{tensor.shape}".encode())
-        digest.update(np.ascontiguousarray(tensor).data)
-    return digest.hexdigest()

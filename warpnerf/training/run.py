@@ -20,22 +20,20 @@ import re
 import shlex
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import msgspec
 import numpy as np
 
 from warpnerf.checks import InputError, cannot_write
-from warpnerf.config import TrainConfig, config_from_json, config_to_json
+from warpnerf.config import TrainConfig
 from warpnerf.evaluation.evaluate import Evaluation, evaluate
 from warpnerf.media.contact_sheet import SheetRow, contact_sheet, spread
 from warpnerf.media.filming import depth_range, range_of
 from warpnerf.media.pictures import comparison, picture_files, write_png
-from warpnerf.model import models
 from warpnerf.rendering.field import Field, Rendering
-from warpnerf.scenes.files import read_json
 from warpnerf.scenes.scene import Scene, View, require_split
 from warpnerf.sfm.scene_files import (
     IN_RUN,
@@ -47,58 +45,20 @@ from warpnerf.sfm.scene_files import (
 )
 from warpnerf.training import lock
 from warpnerf.training.checkpoint import (
-    DamagedFileError,
     load_checkpoint,
     load_field,
     save_checkpoint,
     save_field,
-    write_atomically,
 )
+from warpnerf.training.run_config import RunConfig, describe, read_run_config
 from warpnerf.training.state import Progress, TrainingState, differences
+from warpnerf.training.tensor_file import DamagedFileError
+from warpnerf.writing import write_atomically
 
 KEPT = 2
 """Checkpoints: should the last turn out to be damaged, there is the one before."""
 
 T = TypeVar("T")
-
-
-class FoundExtent(msgspec.Struct, frozen=True):
-    """What the short trainings found, in scene units; see ``training.coarse``."""
-
-    content_distance: float
-    box_min: tuple[float, float, float]
-    box_max: tuple[float, float, float]
-
-
-class RunConfig(msgspec.Struct, frozen=True):
-    """What config.json says, as far as it is read again."""
-
-    scene: str
-    """Path, in the file relative to the run's folder if it lies there; or built-in name."""
-    downscale: int
-    """Pixels of the photographs averaged, in each direction."""
-    content_distance: float
-    """The one in use, scene units."""
-    train: TrainConfig
-    """What was asked for."""
-    masks: str | None = None
-    """Absolute path of the folder of masks that was given for all photographs; None: none was."""
-    pictures: list[str] | None = None
-    """File names of the pictures in test/; None in runs of the version before, which wrote all."""
-    found: FoundExtent | None = None
-    """In place of the scene's own extent, where the cameras did not tell."""
-
-    def as_trained(self, scene: Scene) -> Scene:
-        """A scene, as it was read, with the extent that the run has found for it."""
-        if self.found is None:
-            return scene
-        return replace(
-            scene,
-            content_distance=self.found.content_distance,
-            box_min=np.array(self.found.box_min),
-            box_max=np.array(self.found.box_max),
-            guessed=False,
-        )
 
 
 class Run:
@@ -186,23 +146,7 @@ class Run:
             InputError: The folder cannot be made or written to.
         """
         stored = self._stored(source)
-        content = {
-            "scene": stored,
-            "downscale": downscale,
-            "masks": masks,
-            "content_distance": content_distance,
-            "box_min": scene.box_min.tolist(),
-            "box_max": scene.box_max.tolist(),
-            "notes": [*scene.warnings, *scene.notes],
-            "pictures": sorted(picture_files([view.name for view in scene.views]).values()),
-            "train": config_to_json(config),
-        }
-        if found:
-            content["found"] = {
-                "content_distance": scene.content_distance,
-                "box_min": scene.box_min.tolist(),
-                "box_max": scene.box_max.tolist(),
-            }
+        content = describe(scene, stored, downscale, content_distance, config, masks, found)
         try:
             (self.folder / "test").mkdir(parents=True, exist_ok=True)
             self._set_aside(in_use=Path(source))
@@ -226,13 +170,7 @@ class Run:
         path = self.folder / "config.json"
         if not path.exists():
             raise InputError(f"{path} does not exist; name the folder of a run.")
-
-        def prepare(tree: Any) -> Any:
-            if isinstance(tree, dict) and isinstance(tree.get("train"), dict):
-                return tree | {"train": config_from_json(tree["train"])}
-            return tree
-
-        config = read_json(path, RunConfig, prepare, models.decode)
+        config = read_run_config(path)
         if config.scene.startswith("builtin:"):
             return config
         return msgspec.structs.replace(config, scene=str(self.folder / config.scene))

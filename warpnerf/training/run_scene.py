@@ -7,7 +7,7 @@ from pathlib import Path
 from warpnerf.checks import InputError
 from warpnerf.scenes.load import load_scene
 from warpnerf.scenes.scene import Scene
-from warpnerf.training.run import RunConfig
+from warpnerf.training.run_config import RunConfig
 
 
 def load_run_scene(config: RunConfig, moved: str | None = None) -> Scene:

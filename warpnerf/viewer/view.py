@@ -11,7 +11,8 @@ from warpnerf.checks import InputError, require_extra
 from warpnerf.media.filming import depth_range
 from warpnerf.rendering.field import Field
 from warpnerf.scenes.scene import Scene
-from warpnerf.training.run import Run, RunConfig
+from warpnerf.training.run import Run
+from warpnerf.training.run_config import RunConfig
 from warpnerf.training.run_scene import load_run_scene
 from warpnerf.viewer.painter import Subject
 from warpnerf.viewer.session import Session
