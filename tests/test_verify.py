@@ -14,7 +14,8 @@ import pytest
 from warpnerf.checks import InputError
 from warpnerf.evaluation import verify as checks
 from warpnerf.evaluation.gradient_check import Found, ProblemKernels
-from warpnerf.evaluation.verify import Result, relative_error, report, verify
+from warpnerf.evaluation.gradient_errors import relative_error
+from warpnerf.evaluation.verify import Result, report, verify
 from warpnerf.model.interface import Model
 from warpnerf.model.models import Deferred
 from warpnerf.runtime.parallel import Workers

@@ -11,11 +11,18 @@ import numpy as np
 import warp as wp
 from warpnerf_kernels.base import precision, tiles
 
-from warpnerf.config import Contraction, Scaling
-from warpnerf.model.grid import box_struct, density_struct, free_struct, grid_struct
+from warpnerf.config import Contraction, LossConfig, Scaling
+from warpnerf.model.grid import (
+    box_struct,
+    density_struct,
+    free_struct,
+    frustum_struct,
+    grid_struct,
+)
 from warpnerf.model.interface import Model, n_weights
 from warpnerf.model.models import Rgb
 from warpnerf.rendering.adjoint import AdjointLaunch, gradient_struct, n_tiles
+from warpnerf.rendering.losses import PLAIN, Minimised
 from warpnerf.rendering.rays import rays_struct
 from warpnerf.rendering.render import (
     KEPT_PACKS,
@@ -26,8 +33,10 @@ from warpnerf.rendering.render import (
     variant_of,
 )
 from warpnerf.runtime.parallel import Workers
+from warpnerf.scenes.frustum import Frustum
 
 DENSITY_SHIFT = 0.3
+BOX_MIN, BOX_MAX = np.array([-1.0, -0.8, -1.1]), np.array([1.2, 0.9, 1.0])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -37,7 +46,7 @@ class RayProblem:
     raw: np.ndarray
     """[X, Y, Z, n_floats] raw density, raw features, padding."""
     origins: np.ndarray
-    """[n_rays, 3] scene units; the box is [-1, 1.2] x [-0.8, 0.9] x [-1.1, 1]."""
+    """[n_rays, 3] scene units."""
     directions: np.ndarray
     """[n_rays, 3] unit vectors."""
     background: np.ndarray
@@ -58,8 +67,14 @@ class RayProblem:
     """[n_rays] scene units."""
     free: np.ndarray = field(default_factory=lambda: np.zeros((1, 1, 1), np.uint8))
     """[MX, MY, MZ] cells to the nearest occupied one."""
+    box_min: np.ndarray = field(default_factory=lambda: BOX_MIN)
+    """[3] scene units, or coordinates in the frustum."""
+    box_max: np.ndarray = field(default_factory=lambda: BOX_MAX)
+    """[3]"""
     contraction: Contraction = "none"
-    """How space outside the box is folded in."""
+    """How space outside the box is folded in, or ndc."""
+    frustum: Frustum | None = None
+    """Of normalised device coordinates."""
     border: float = 0.0
     """Width of the shell that holds it, in half edges of the box."""
     density_scale: float = 1.0
@@ -68,6 +83,8 @@ class RayProblem:
     """What raw values mean."""
     weights: np.ndarray = field(default_factory=lambda: np.zeros(0))
     """[n_weights] of the model's MLP."""
+    minimised: Minimised = PLAIN
+    """What the training launch minimises."""
 
     @property
     def n_rays(self) -> int:
@@ -83,9 +100,6 @@ class RayProblem:
             if isinstance(value, np.ndarray) and value.dtype == np.float64
         }
         return RayProblem(**exact)
-
-
-BOX_MIN, BOX_MAX = np.array([-1.0, -0.8, -1.1]), np.array([1.2, 0.9, 1.0])
 
 
 def make_problem(seed: int, n_rays: int = 24, size: tuple[int, int, int] = (7, 8, 6)) -> RayProblem:
@@ -128,6 +142,27 @@ def folded(problem: RayProblem, contraction: Contraction = "linf") -> RayProblem
     """The same in folded space, with steps that grow outside the box."""
     steps = replace(problem.steps, far=40.0, n_linear=12, growth=0.09)
     return replace(problem, contraction=contraction, border=0.2, steps=steps)
+
+
+def in_frustum(problem: RayProblem) -> RayProblem:
+    """The same rays through a frustum, turned against the axes: some go away, some come back."""
+    rng = np.random.default_rng(5)
+    axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    axes *= np.sign(np.linalg.det(axes))
+    return replace(
+        problem,
+        contraction="ndc",
+        frustum=Frustum(origin=-1.4 * axes[2], axes=axes, near=0.6, depth=1.3),
+        box_min=np.array([-1.1, -0.8, 0.06]),
+        box_max=np.array([0.9, 1.0, 1.3 * 0.999]),
+        steps=replace(problem.steps, far=40.0, step=0.043, in_ndc=True),
+    )
+
+
+def with_losses(problem: RayProblem, sample_colour: float = 0.0) -> RayProblem:
+    """The same with losses besides the squared error, in a launch that trains."""
+    losses = LossConfig(distortion=0.3, entropy=0.2, sample_colour=sample_colour)
+    return replace(problem, minimised=Minimised(config=losses, content_distance=1.3))
 
 
 def of_model(problem: RayProblem, model: Model) -> RayProblem:
@@ -286,7 +321,13 @@ class ProblemKernels:
 
     def _variant(self, problem: RayProblem, scaling: Scaling) -> Any:
         return variant_of(
-            problem.model, self._name, problem.contraction, scaling, "none", packed=self._packed
+            problem.model,
+            self._name,
+            problem.contraction,
+            scaling,
+            "none",
+            self._packed,
+            problem.minimised.config,
         )
 
     def _grid(self, values: np.ndarray, border: float) -> Any:
@@ -298,16 +339,21 @@ class ProblemKernels:
     def _scene(self, problem: RayProblem, workers: Workers) -> Any:
         x, y, z = problem.free.shape
         distance = wp.array(problem.free.ravel(), dtype=wp.uint8, device=self._workers.device)
+        box = box_struct(self._types, problem.box_min, problem.box_max, problem.border)
+        if problem.frustum is not None:
+            near, far = problem.steps.near, problem.steps.far
+            box.frustum = frustum_struct(self._types, problem.frustum, near, far)
         return scene_struct(
             problem.model,
             self._name,
-            box=box_struct(self._types, BOX_MIN, BOX_MAX, problem.border),
+            box=box,
             free=free_struct(self._types, distance, (x, y, z), problem.border),
             steps=problem.steps,
             grid=self._grid(problem.raw, problem.border),
             density=density_struct(self._types, DENSITY_SHIFT, problem.density_scale),
             weights=self._array(problem.weights),
             workers=workers,
+            minimised=problem.minimised,
         )
 
     def _rays(self, problem: RayProblem) -> Any:
@@ -331,7 +377,7 @@ class ProblemKernels:
         )
 
     def _adjoint(self, problem: RayProblem, kernel: wp.Kernel, variant: Any) -> AdjointLaunch:
-        length = float(np.linalg.norm(BOX_MAX - BOX_MIN))
+        length = float(np.linalg.norm(problem.box_max - problem.box_min))
         return AdjointLaunch(
             kernel,
             variant,

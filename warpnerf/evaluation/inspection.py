@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -47,12 +47,18 @@ SAMPLES_IN_NDC = (60, 0.6)
 normalised device coordinates, fern, late in training with the preset fast."""
 
 
+PROCESS_BYTES = 250_000_000
+"""What a training takes besides grid and photographs: Python, Warp, compiled kernels, pictures."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Cost:
-    """What training with a preset takes on the CPU."""
+    """What a training takes on the CPU."""
 
+    model: Model
+    """That is trained."""
     memory: int
-    """Bytes, of grid, optimiser, gradients and photographs; a run needs some more."""
+    """Bytes, of grid, optimiser, gradients, photographs and the process itself."""
     seconds: float
     """Within a factor of two or three: machines and scenes differ."""
     threads: int
@@ -76,9 +82,7 @@ class Inspection:
     oddities: tuple[str, ...]
     """What may be a mistake, a sentence each."""
     costs: dict[str, Cost]
-    """By preset."""
-    model: Model
-    """The one that costs are of."""
+    """By preset, or what else the configuration is called."""
 
     def facts(self) -> dict[str, Any]:
         """All of it in plain numbers and texts, for JSON."""
@@ -113,8 +117,15 @@ class Inspection:
             else _range(list(scene.content_distances[list(scene.splits["train"])])),
             "near_content": scene.near_content,
             "how": list(scene.notes),
-            "model": to_json(self.model),
-            "costs": {preset: asdict(cost) for preset, cost in self.costs.items()},
+            "costs": {
+                name: {
+                    "model": to_json(cost.model),
+                    "memory": cost.memory,
+                    "seconds": cost.seconds,
+                    "threads": cost.threads,
+                }
+                for name, cost in self.costs.items()
+            },
             "odd": list(self.oddities),
         }
 
@@ -160,11 +171,11 @@ class Inspection:
                 )
             )
         rows += [("how", note) for note in scene.notes]
-        for preset, cost in self.costs.items():
+        for name, cost in self.costs.items():
             rows.append(
                 (
-                    f"training, {preset}",
-                    f"model {self.model.name}: at least {cost.memory / 2**30:.2g} GiB of memory; "
+                    f"training, {name}",
+                    f"model {cost.model.name}: about {cost.memory / 2**30:.2g} GiB of memory; "
                     f"very roughly {_duration(cost.seconds)} on {cost.threads} CPU threads",
                 )
             )
@@ -179,7 +190,7 @@ def inspect(
     masks: str | Path | None = None,
     content_distance: float | None = None,
     near: float = 0.0,
-    model: Model | None = None,
+    configs: Mapping[str, TrainConfig] | None = None,
     threads: int = 2,
 ) -> Inspection:
     """Look a scene over: what was understood, what is odd, and what training would take.
@@ -190,7 +201,7 @@ def inspect(
         masks: As for ``load_scene``.
         content_distance: The one that training will be given, scene units; None: the estimate.
         near: The near plane that training will be given, scene units.
-        model: That will be trained; None: that of the presets.
+        configs: Trainings whose costs to estimate, by name; None: the presets fast and quality.
         threads: CPU threads that training would have.
 
     Returns:
@@ -202,6 +213,8 @@ def inspect(
     require_at_least("near", near, 0.0)
     if content_distance is not None:
         require_positive("content_distance", content_distance)
+    if configs is None:
+        configs = {name: PRESETS[name] for name in EVERYDAY}
     found = survey(path)
     try:
         scene = load_scene(path, downscale=downscale, masks=masks, images="files")
@@ -219,12 +232,8 @@ def inspect(
         content_distance=distance,
         up=up_direction(scene.training_cameras),
         focus=_focus(scene.training_cameras),
-        oddities=(*scene.warnings, *oddities(scene, found, distance, near)),
-        costs={
-            name: _cost(scene, replace(PRESETS[name], model=model or PRESETS[name].model), threads)
-            for name in EVERYDAY
-        },
-        model=model or PRESETS["fast"].model,
+        oddities=(*scene.warnings, *oddities(scene, found, distance, near, looked=False)),
+        costs={name: _cost(scene, config, threads) for name, config in configs.items()},
     )
 
 
@@ -235,7 +244,16 @@ def _read_once(scene: Scene) -> None:
             pass
 
 
-def oddities(scene: Scene, found: Survey, content_distance: float, near: float) -> list[str]:
+GUESSED = {
+    False: "; training looks for better ones first, if it has time",
+    True: ": give a distance, or poses with points, as COLMAP writes them",
+}
+"""What may become of guesses, before training and where it has looked in vain."""
+
+
+def oddities(
+    scene: Scene, found: Survey, content_distance: float, near: float, *, looked: bool
+) -> list[str]:
     """What may be a mistake, besides what the scene warns of.
 
     Args:
@@ -243,6 +261,7 @@ def oddities(scene: Scene, found: Survey, content_distance: float, near: float) 
         found: In its files.
         content_distance: That training will use, scene units.
         near: The near plane that training will use, scene units.
+        looked: Whether training has begun: what it has not found by now it will not find.
 
     Returns:
         A sentence each.
@@ -257,7 +276,7 @@ def oddities(scene: Scene, found: Survey, content_distance: float, near: float) 
         )
     cameras = scene.training_cameras
     if not found.built_in:  # they look everywhere, and know their true distances
-        odd += _odd_directions(cameras, scene.content_distances is not None)
+        odd += _odd_directions(cameras, scene.content_distances is not None, looked)
     odd += _odd_places(scene)
     nearest = max(near, _distance_to_box(scene))
     if nearest >= content_distance:
@@ -276,7 +295,7 @@ def _focus(cameras: Sequence[Camera]) -> np.ndarray | None:
     return None if focus.guessed else focus.point
 
 
-def _odd_directions(cameras: Sequence[Camera], known: bool) -> list[str]:
+def _odd_directions(cameras: Sequence[Camera], known: bool, looked: bool) -> list[str]:
     """Cameras that have nothing in common to look at, unless points tell what they see."""
     odd = []
     aimed = share_aimed_at(cameras, find_focus(cameras).point)
@@ -289,8 +308,7 @@ def _odd_directions(cameras: Sequence[Camera], known: bool) -> list[str]:
     elif _focus(cameras) is None and not known:
         odd.append(
             f"no common focus: {aimed:.0%} of the training cameras have one point in the middle of "
-            "their image, so content distance and box are guesses, unless a training of 500 steps "
-            "or more looks for better ones first"
+            f"their image, so content distance and box are guesses{GUESSED[looked]}"
         )
     return odd
 
@@ -334,7 +352,7 @@ def _distance_to_box(scene: Scene) -> float:
 def _cost(scene: Scene, config: TrainConfig, threads: int) -> Cost:
     voxels = config.grid.voxels
     images = sum(v.camera.width * v.camera.height * v.channels for v in scene.views)
-    memory = TRAINING_BYTES * config.model.n_floats * voxels + images
+    memory = TRAINING_BYTES * config.model.n_floats * voxels + images + PROCESS_BYTES
 
     in_ndc = contraction_of(scene, config) == "ndc"
     samples, occupied = SAMPLES_IN_NDC if in_ndc else SAMPLES_AND_OCCUPIED[scene.kind]
@@ -346,7 +364,7 @@ def _cost(scene: Scene, config: TrainConfig, threads: int) -> Cost:
     step += float((nodes / steps_an_update).mean()) * occupied * SECONDS_PER_NODE
     step *= config.model.relative_time
     seconds = min(config.steps * step / threads, config.time_limit or math.inf)
-    return Cost(memory=memory, seconds=seconds, threads=threads)
+    return Cost(model=config.model, memory=memory, seconds=seconds, threads=threads)
 
 
 def _sizes(cameras: Sequence[Camera]) -> list[tuple[tuple[int, int], int]]:
