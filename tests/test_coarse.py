@@ -121,8 +121,9 @@ def test_it_is_for_scenes_without_points() -> None:
     assert not is_needed(scene, replace(SHORT, grid=replace(SHORT.grid, contraction="none")))
     assert not is_needed(scene, replace(SHORT, coarse_steps=0))
     assert not is_needed(scene, replace(SHORT, steps=400))  # too short to see anything first
-    with pytest.raises(wn.InputError, match="coarse_steps"):
-        replace(SHORT, coarse_steps=-1)
+    for steps in (-1, 1, 49):
+        with pytest.raises(wn.InputError, match="coarse_steps"):
+            replace(SHORT, coarse_steps=steps)
 
 
 def test_a_given_content_distance_leaves_only_a_guessed_box_to_look_for() -> None:
@@ -308,6 +309,14 @@ def test_the_command_says_that_nothing_was_found(tmp_path: Path) -> None:
     assert f"note: {coarse.NOTHING_SEEN}" in done.out
     config = json.loads((done.run / "config.json").read_text())
     assert "found" not in config and coarse.NOTHING_SEEN in config["notes"]
+
+
+def test_the_command_refuses_photographs_that_show_nothing(tmp_path: Path) -> None:
+    scene = black_scene(tmp_path)
+    longer = (*FEW[:-1], "2000")
+    done = command("train", scene, "--output", "run", *longer, folder=tmp_path, limit=None)
+    assert done.code == 2 and "200 steps of a short training met nothing opaque" in done.err
+    assert not done.run.exists()
 
 
 def test_the_command_refuses_distances_of_cameras_that_see_nothing(tmp_path: Path) -> None:

@@ -64,7 +64,7 @@ def test_a_run_keeps_its_losses(tmp_path: Path) -> None:
 
 
 def test_configurations_are_read_back_and_older_ones_have_the_squared_error() -> None:
-    config = TrainConfig(loss=LossConfig(photometric="huber", distortion=1, near_clip_distance=2))
+    config = TrainConfig(loss=LossConfig(photometric="huber", huber_delta=0.2, distortion=1))
     tree = json.loads(json.dumps(config_to_json(config)))
     assert read(tree) == config
     del tree["loss"]

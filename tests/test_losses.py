@@ -184,9 +184,10 @@ def test_light_that_is_all_there_or_gone_has_no_entropy(kernels64: Kernels) -> N
 @pytest.mark.parametrize("name", ["none", *LOSSES])
 def test_weights_are_no_constants_of_kernels(name: str) -> None:
     losses = LOSSES.get(name, LossConfig())
-    changed = {
-        field: 2.0 * getattr(losses, field) for field in vars(losses) if field != "photometric"
-    }
+    fields = vars(losses).keys() - {"photometric"}
+    if losses.photometric != "huber":
+        fields -= {"huber_delta"}
+    changed = {field: 2.0 * getattr(losses, field) for field in fields}
     variants = [
         variant_of(Rgb(), "float32", "none", "clamped", "none", True, config)
         for config in (losses, replace(losses, **changed), LossConfig())
@@ -211,6 +212,8 @@ def test_a_loss_on_samples_wants_colours_of_samples() -> None:
         ({"sample_colour": float("inf")}, "loss.sample_colour must be a finite number"),
         ({"near_clip": -1.0}, "loss.near_clip must be"),
         ({"near_clip": 1.0}, "loss.near_clip needs loss.near_clip_distance"),
+        ({"near_clip_distance": 1.0}, "loss.near_clip_distance does nothing while loss.near_clip"),
+        ({"huber_delta": 0.2}, "loss.huber_delta is 0.2, but loss.photometric is squared"),
         ({"photometric": "l1"}, "loss.photometric must be one of squared, huber"),
         ({"photometric": "huber", "huber_delta": 0.0}, "loss.huber_delta must be"),
     ],

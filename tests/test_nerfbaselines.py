@@ -178,6 +178,8 @@ def test_options(method: Any) -> None:
     assert config.background == (1.0, 0.0, 0.2)
     assert config.march == wn.PRESETS["quality"].march
     assert method.configured({"content_distance": "auto"}, None).content_distance == "auto"
+    same = method.configured({"preset": "quality", "model": "deferred"}, None)
+    assert same.model == wn.PRESETS["quality"].model
     for wrong, message in (
         ({"stepz": "1"}, "stepz: there is no such option"),
         ({"steps": "many"}, "steps must be int, not 'many'"),

@@ -35,6 +35,10 @@ where photographs have alpha, updates take more steps, and earlier."""
 MAX_VOXELS = 2**31
 """Nodes are counted in 32 bits."""
 
+MIN_COARSE_STEPS = 50
+"""Of a short training that looks for the content distance: after fewer nothing has settled, and
+distances come out several times too large."""
+
 TRAINING_BYTES = 12
 """Memory that a number of a node takes: value, two moments together, and gradient, 4 each."""
 
@@ -194,22 +198,25 @@ class OptimConfig:
         return ACCUMULATE_AT[kind]
 
 
+HUBER_DELTA = 0.1
+
+
 @dataclass(frozen=True, kw_only=True)
 class LossConfig:
     """What training minimises: the mean over rays of the photometric loss, which is a sum over the
     three channels, and of the others, each times its weight. A weight of 0 leaves a loss out.
 
-    Systems that take the mean over the channels give a third of these weights.
+    Systems that take the mean over the channels give a third of these weights, but for near_clip.
     """
 
     photometric: Literal["squared", "huber"] = "squared"
     """How a ray's colour is held against its pixel. huber: as squared up to huber_delta in a
     channel, from there on a line."""
-    huber_delta: float = 0.1
+    huber_delta: float = HUBER_DELTA
     """Where that line begins, of colours in [0, 1]."""
     distortion: float = 0.0
     """Weight of the distortion loss: matter of a ray comes together. Distances count as
-    t / (D + t), with D the scene's content distance."""
+    t / (D + t), with D the content distance in use; with per-camera, the scene's."""
     entropy: float = 0.0
     """Weight of the entropy of the remaining light: a ray ends in matter, or meets none."""
     sample_colour: float = 0.0
@@ -217,7 +224,8 @@ class LossConfig:
     all but deferred."""
     near_clip: float = 0.0
     """Weight of the sum of raw densities nearer to the camera than near_clip_distance, as DVGO
-    pushes them down; for comparison."""
+    pushes them down; for comparison. DVGO does not divide by the rays of a step: its weight 1 is
+    3 rays_per_step here."""
     near_clip_distance: float = 0.0
     """How near that is, scene units."""
 
@@ -227,6 +235,16 @@ class LossConfig:
         require_positive("loss.huber_delta", self.huber_delta)
         for name in ("distortion", "entropy", "sample_colour", "near_clip", "near_clip_distance"):
             require_at_least(f"loss.{name}", getattr(self, name), 0.0)
+        if self.photometric != "huber" and self.huber_delta != HUBER_DELTA:
+            raise InputError(
+                f"loss.huber_delta is {self.huber_delta:g}, but loss.photometric is squared; set "
+                "that to huber, or leave huber_delta out."
+            )
+        if self.near_clip == 0.0 and self.near_clip_distance > 0.0:
+            raise InputError(
+                "loss.near_clip_distance does nothing while loss.near_clip is 0; give both, or "
+                "leave near_clip_distance out."
+            )
         if self.near_clip > 0.0 and self.near_clip_distance == 0.0:
             raise InputError(
                 "loss.near_clip needs loss.near_clip_distance, the distance up to which raw "
@@ -303,6 +321,11 @@ class TrainConfig:
             raise InputError(f"model must be a name or a model, not {self.model!r}.")
         require_whole("steps", self.steps, 1)
         require_whole("coarse_steps", self.coarse_steps, 0)
+        if 0 < self.coarse_steps < MIN_COARSE_STEPS:
+            raise InputError(
+                f"coarse_steps must be 0, for none, or at least {MIN_COARSE_STEPS}, not "
+                f"{self.coarse_steps}: fewer find nothing."
+            )
         require_whole("rays_per_step", self.rays_per_step, 1)
         require_whole("occupancy_every", self.occupancy_every, 1)
         require_at_least("alpha_min", self.alpha_min, 0.0)

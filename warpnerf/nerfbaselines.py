@@ -227,6 +227,8 @@ def configured(overrides: dict[str, Any], background: np.ndarray | None) -> Trai
         config = replace(config, time_limit=None)
     if "voxels" in given:
         given["grid"] = replace(config.grid, voxels=given.pop("voxels"))
+    if given.get("model") == config.model.name:  # as the preset has it, not by default
+        del given["model"]
     if background is not None:
         given["background"] = tuple(float(c) / 255.0 for c in background)
     return replace(config, **given)

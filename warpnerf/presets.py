@@ -85,6 +85,7 @@ PRESETS: dict[str, TrainConfig] = {
         _DVGO,
         steps=30_000,
         rays_per_step=4096,
+        alpha_min=1e-3,
         model=Features(
             features=9,
             frequencies=0,

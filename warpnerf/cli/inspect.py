@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import tyro
@@ -9,7 +10,7 @@ import tyro
 from warpnerf.checks import InputError, cannot_write, require_at_least
 from warpnerf.cli.machine import require_writable, write_json
 from warpnerf.cli.model_options import chosen_model
-from warpnerf.presets import PRESETS
+from warpnerf.presets import EVERYDAY, PRESETS
 from warpnerf.runtime.memory import usable_cores
 
 
@@ -57,11 +58,12 @@ def inspect_command(
         masks=masks,
         content_distance=content_distance,
         near=near,
-        model=(
-            chosen_model(PRESETS["fast"].model, model, model_options)
-            if model or model_options
-            else None
-        ),
+        configs={
+            name: replace(
+                PRESETS[name], model=chosen_model(PRESETS[name].model, model, model_options)
+            )
+            for name in EVERYDAY
+        },
         threads=threads or usable_cores(),
     )
     print(found)

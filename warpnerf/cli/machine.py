@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from warpnerf.checks import InputError, cannot_write
 from warpnerf.cli.model_options import chosen_model
-from warpnerf.presets import PRESETS
+from warpnerf.presets import EVERYDAY, PRESETS
 
 if TYPE_CHECKING:
     from warpnerf.evaluation.verify import Result
@@ -73,7 +73,8 @@ def warmup_command(
         print(f"{kernel.name}: {how}", flush=True)
 
     start = time.perf_counter()
-    chosen = chosen_model(PRESETS["fast"].model, model, model_options)
+    presets = [PRESETS[name] for name in EVERYDAY]
+    chosen = dict.fromkeys(chosen_model(p.model, model, model_options) for p in presets)
     kernels = warm_up(device, shown, chosen)
     compiled = sum(kernel.compiled for kernel in kernels)
     seconds = time.perf_counter() - start

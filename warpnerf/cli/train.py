@@ -221,12 +221,12 @@ def _begin_alone(
         trainer = begin(scene, config)
     trained = trainer.scene  # in which box and distance may be other ones
     _describe(trained, trainer.content_distance, config)
-    for oddity in oddities(trained, survey(source), trainer.content_distance, config.march.near):
+    distance, near = trainer.content_distance, config.march.near
+    for oddity in oddities(trained, survey(source), distance, near, looked=True):
         print(f"  odd: {oddity}", flush=True)
     run = Run(output)
     with training_page(page, trained, trainer) as session:
         folder = None if masks is None else str(masks.resolve())
-        distance = trainer.content_distance
         found = trainer.sight is not None
         run.create(trained, _absolute(source), downscale, distance, config, folder, found)
         return _train(run, trained, trainer, session)

@@ -16,8 +16,9 @@ from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.scene import Scene
 from warpnerf.scenes.undistort import directions
 
-MAX_ANGLE = math.radians(60.0)
-"""Between the axis of a training camera and their mean."""
+MAX_ANGLE = math.radians(45.0)
+"""Between the axis of a training camera and their mean: a camera looks 25 to 35 degrees to each
+side of its axis, and the grid ends at MAX_TANGENT."""
 
 ALIKE = math.radians(30.0)
 """The same, of captures that are trained in such coordinates without being asked."""
@@ -91,6 +92,9 @@ def faces_forward(scene: Scene) -> bool:
     Its file gives bounds of depth, as LLFF's does, and its training cameras look the same way. Such
     captures are of a small area; others may look the same way from places far apart, before which
     a frustum is mostly empty.
+
+    Raises:
+        InputError: They look the same way, but bounds make no sense.
     """
     if scene.bounds is None:
         return False
@@ -99,11 +103,24 @@ def faces_forward(scene: Scene) -> bool:
     cosines = forward @ mean / max(float(np.linalg.norm(mean)), 1e-9)
     if float(cosines.min()) < math.cos(ALIKE):
         return False
+    _require_bounds(scene)
     try:
         fit_frustum(scene, 2, 8)
-    except InputError:  # bounds that make no sense
+    except InputError:  # content beside the cameras or behind them
         return False
     return True
+
+
+def _require_bounds(scene: Scene) -> None:
+    assert scene.bounds is not None
+    for index in scene.splits["train"]:
+        near, far = scene.bounds[index]
+        if not 0.0 < near < far < math.inf:
+            raise InputError(
+                f"{scene.name}: the bounds of {scene.views[index].name} must be two depths above "
+                f"0, the nearer first, not {near:g} and {far:g}; correct them, or use "
+                "--contraction linf, which does not need them."
+            )
 
 
 HELD: dict[Contraction, str] = {
@@ -188,14 +205,7 @@ def _nearest(scene: Scene, frustum: Frustum) -> float:
     places = frustum.depths(np.array([c.position for c in cameras]))
     facing = np.array([c.forward for c in cameras]) @ frustum.axes[2]
     if scene.bounds is not None:
-        for index in scene.splits["train"]:
-            near, far = scene.bounds[index]
-            if not 0.0 < near < far < math.inf:
-                raise InputError(
-                    f"{scene.name}: the bounds of {scene.views[index].name} must be two depths "
-                    f"above 0, the nearer first, not {near:g} and {far:g}; correct them, or use "
-                    "--contraction linf, which does not need them."
-                )
+        _require_bounds(scene)
         away = scene.bounds[list(scene.splits["train"]), 0]
     elif scene.near_content is not None:
         away = np.full(len(cameras), scene.near_content)

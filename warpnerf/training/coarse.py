@@ -18,7 +18,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from warpnerf.config import TrainConfig
+from warpnerf.checks import InputError
+from warpnerf.config import MIN_COARSE_STEPS, TrainConfig
 from warpnerf.model.grid import VoxelGrid
 from warpnerf.model.nodes import points_of
 from warpnerf.rendering.field import Field
@@ -35,8 +36,6 @@ from warpnerf.training.trainer import Trainer
 ROUNDS = 2
 """Where cameras look at no common point; elsewhere one."""
 VOXELS = 48**3
-MIN_STEPS = 50
-"""Of a round; after fewer nothing has settled, and distances come out several times too large."""
 STEPS_SHARE = 0.1
 """Of a training's steps, that a round takes at most."""
 TIME_SHARE = 0.12
@@ -94,7 +93,7 @@ def is_needed(scene: Scene, config: TrainConfig) -> bool:
         scene: Where it brings points, these tell.
         config: Where it says a content distance, only a box that is a guess is looked for.
     """
-    if scene.content_distances is not None or _steps(config) < MIN_STEPS:
+    if scene.content_distances is not None or _steps(config) < MIN_COARSE_STEPS:
         return False
     if config.content_distance == "per-camera":
         return True
@@ -115,8 +114,11 @@ def find_sight(
         on_progress: Called with each report of these, its fraction that of all of them.
 
     Returns:
-        What they see, None where nothing opaque has grown or time was too short; seconds of
+        What they see, None where nothing opaque has grown in fewer than all steps; seconds of
         training, to which compiling and looking at depths do not count.
+
+    Raises:
+        InputError: Nothing opaque has grown in all steps, and no content distance is given.
     """
     limit, given = config.time_limit, config.content_distance
     rounds = ROUNDS if scene.guessed else 1
@@ -133,7 +135,7 @@ def find_sight(
             grow_at=(),
         ),
     )
-    sight, seconds = None, 0.0
+    sight, seconds, all_steps = None, 0.0, False
     for done in range(rounds):
 
         def report(progress: Progress, done: int = done) -> None:
@@ -143,12 +145,19 @@ def find_sight(
         trainer = Trainer(scene, small, sight=sight)
         leave_out_near(trainer.grid, scene.training_cameras, config.march.near)
         seconds += trainer.run(report).seconds
-        done_enough = trainer.steps_done >= MIN_STEPS
+        done_enough = trainer.steps_done >= MIN_COARSE_STEPS
+        all_steps = trainer.steps_done == config.coarse_steps
         found = sight_of(scene, trainer.field()) if done_enough else None
         del trainer  # its copy of the photographs, before the next one makes its own
         if found is None:
             break
         sight = found
+    if sight is None and all_steps and isinstance(given, str):
+        raise InputError(
+            f"{scene.name}: {config.coarse_steps} steps of a short training met nothing opaque, so "
+            "photographs and poses show no common surface; look at them with `warpnerf inspect`, "
+            "or give a content distance (--content-distance) to train all the same."
+        )
     return sight, seconds
 
 

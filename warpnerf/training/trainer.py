@@ -281,9 +281,10 @@ class Trainer:
         )
 
     def _not_finite(self, what: str) -> FloatingPointError:
+        smaller = "smaller weights of losses, " if self.config.loss.kinds else ""
         return FloatingPointError(
             f"{what} not finite after step {self.steps_done}; choose a content distance that fits "
-            "the scene, the clamped scaling, or lower learning rates."
+            f"the scene, the clamped scaling, {smaller}or lower learning rates."
         )
 
     def _restore(self, state: TrainingState) -> None:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, fields
+from itertools import product
 from typing import get_args
 
 import warp as wp
@@ -75,14 +76,14 @@ def rendering_kernels(model: Model, contraction: Contraction, device: wp.Device)
 def warm_up(
     device: str = "cpu",
     on_kernel: Callable[[Warmed], None] = lambda kernel: None,
-    model: Model | None = None,
+    models: Collection[Model] | None = None,
 ) -> list[Warmed]:
     """Compile whatever training and rendering with the everyday presets need, in every scaling.
 
     Args:
         device: Where they are to run: cpu, cuda, cuda:1, ...
         on_kernel: Called with each kernel that is ready.
-        model: For which model; None: that of the presets.
+        models: For which; None: those of the presets.
 
     Returns:
         All of them.
@@ -91,17 +92,20 @@ def warm_up(
         InputError: The device does not exist, or kernels can be kept nowhere.
     """
     workers = Workers(device, 1)
-    model = model or PRESETS["fast"].model
+    models = dict.fromkeys(preset.model for preset in _presets()) if models is None else models
+    # What is compiled for the first as well needs no name of its own.
+    of_model = {model: f", {_options_of(model)}" if n else "" for n, model in enumerate(models)}
     wanted: dict[wp.Module, tuple[str, wp.Kernel]] = {}
-    for contraction in _contractions():
+    for model, contraction in product(models, _contractions()):
         for kernel in rendering_kernels(model, contraction, workers.device):
-            wanted.setdefault(kernel.module, (_words(kernel, contraction), kernel))
+            words = _words(kernel, contraction) + of_model[model]
+            wanted.setdefault(kernel.module, (words, kernel))
         for jacobian, losses in dict.fromkeys((p.jacobian, p.loss) for p in _presets()):
             for scaling in get_args(Scaling):
                 for kernel in training_kernels(
                     model, contraction, scaling, jacobian, workers.device, losses
                 ):
-                    words = _words(kernel, contraction, scaling, losses)
+                    words = _words(kernel, contraction, scaling, losses) + of_model[model]
                     wanted.setdefault(kernel.module, (words, kernel))
     done = []
     for name, kernel in wanted.values():
@@ -125,6 +129,16 @@ def _contractions() -> list[Contraction]:
         chosen = preset.grid.contraction
         found |= dict.fromkeys(("none", "linf", "ndc") if chosen == "auto" else (chosen,))
     return list(found)
+
+
+def _options_of(model: Model) -> str:
+    """A model's name, and what of it is not as by default."""
+    chosen = [
+        f"{field.name}={value}"
+        for field in fields(model)  # type: ignore[arg-type]
+        if (value := getattr(model, field.name)) != field.default
+    ]
+    return " ".join([model.name, *chosen])
 
 
 def _words(
