@@ -6,8 +6,9 @@
 A candidate is a preset, and fields of its TrainConfig that are something else, by their path and as
 JSON. Scenes are as for training.py. Trainings of a scene and a seed take turns of a fraction of a
 second, each for as long on a clock of its own; so a machine that is slow for a while is slow for
-all. Prints PSNR and SSIM on the test views, and of a sample of training views PSNR, the mean and
-half of the range over the seeds; writes benchmarks/results/presets_<device>.json.
+all. Where the extent is looked for first, that is off the clock. Prints PSNR and SSIM on the test
+views, and of a sample of training views PSNR, the mean and half of the range over the seeds; writes
+benchmarks/results/presets_<device>.json.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from warpnerf.model.models import model_of
 from warpnerf.presets import EVERYDAY, PRESETS
 from warpnerf.runtime.parallel import Workers
 from warpnerf.training import coarse
+from warpnerf.training.trainer import Trainer
 
 TRAINING_VIEWS = 4
 """That are looked at: how far test views lie below them tells fitting from generalising."""
@@ -61,10 +63,10 @@ def main() -> None:
         scene = replace(scene, splits={**scene.splits, **looked_at})
         for seed in args.seeds:
             for candidate, found in race(scene, candidates, seed).items():
-                rows.append({"scene": name, "seed": seed, "candidate": candidate, **found})
+                rows.append({"scene": scene.name, "seed": seed, "candidate": candidate, **found})
         print(f"\n{name}\n  PSNR           SSIM    training  steps    samples  candidate")
         for candidate in candidates:
-            of_seeds = [r for r in rows if (r["scene"], r["candidate"]) == (name, candidate)]
+            of_seeds = [r for r in rows if (r["scene"], r["candidate"]) == (scene.name, candidate)]
             psnr = [row["psnr"] for row in of_seeds]
             mean = {key: float(np.mean([r[key] for r in of_seeds])) for key in FIGURES}
             print(
@@ -101,9 +103,12 @@ def race(scene: wn.Scene, candidates: dict[str, TrainConfig], seed: int) -> dict
     Returns:
         Of each candidate: FIGURES.
     """
-    trainers = {
-        text: coarse.begin(scene, replace(config, seed=seed)) for text, config in candidates.items()
-    }
+    trainers = {}
+    for text, config in candidates.items():
+        config, sight = replace(config, seed=seed), None
+        if coarse.is_needed(scene, config):
+            sight, _ = coarse.find_sight(scene, config)
+        trainers[text] = Trainer(scene, config, sight=sight)
     seconds = take_turns(trainers, lambda _, __: None)
     found = {}
     for text in candidates:

@@ -1,5 +1,7 @@
 """Photographs of the built-in room as people take them.
 
+    python benchmarks/room_scan.py path/to/new/folder --size 320 240
+
 Who takes them turns around in its middle, walks around its table, or does both. A COLMAP text model
 beside them holds points of the room's surfaces with the photographs that show them, as structure
 from motion would find them: with noise, and with a share of outliers far behind the walls and close
@@ -8,6 +10,7 @@ before the cameras.
 
 from __future__ import annotations
 
+import argparse
 import itertools
 from collections.abc import Callable
 from pathlib import Path
@@ -171,3 +174,18 @@ def _sees(cameras: list[Camera], point: np.ndarray) -> np.ndarray:
     candidates = np.flatnonzero(inside)
     hits = first_hit(origins[candidates], directions[candidates])
     return candidates[hits >= 0.999 * away[candidates]]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("folder", type=Path, help="new, receives images/ and sparse/0/")
+    parser.add_argument("--scan", choices=list(SCANS), default="room-scan")
+    parser.add_argument("--views", type=int, default=125)
+    parser.add_argument("--size", type=int, nargs=2, default=(160, 120), help="width, height")
+    parser.add_argument("--points", type=int, default=4000, help="of the model; 0: none")
+    args = parser.parse_args()
+    write_scan(args.folder, args.views, args.points, tuple(args.size), args.scan)
+
+
+if __name__ == "__main__":
+    main()

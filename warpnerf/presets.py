@@ -8,11 +8,17 @@ Source of these: Sun et al. 2022 (CVPR), Sun et al. 2022 (arXiv 2206.05085), and
 in their repository: default.py, nerf_unbounded_default.py, llff_default.py. Different here:
 
 - Gradients are scaled by distance; ``scaling="none"`` leaves that out.
-- Their coarse stage gives box and free space. Here the grid's own first steps do. Their box is
-  5 % larger on each axis.
+- The near plane is 0; theirs is 2 in Blender's scenes.
+- In dvgo a coarse stage gives box and free space, the box 5 % larger on each axis than what it finds;
+  here the grid's own first steps do.
+- In dvgo-unbounded their box is a cube that holds all cameras' rays at the near clip; here it is
+  0.75 content distances to each side.
 - Outside the box their samples are thinned to 0.95 of a step in folded space; here steps grow.
+- Their free space only ever grows; here it is looked for anew.
 - Rays that meet free space only are left out; there they are replaced by others.
 - The opacity below which space is free rises there in the first 5500 steps of dvgo-unbounded.
+- Total variation reaches the nodes that rays have touched; theirs reaches all of them, in
+  dvgo-unbounded always and in dvgo-llff in the first 10 000 steps.
 - Their planes are 128 from the start; here coarser grids have fewer.
 - Their squared error is the mean over red, green and blue, here it is the sum: weights of other
   losses are three times theirs.
