@@ -9,8 +9,8 @@ in their repository: default.py, nerf_unbounded_default.py, llff_default.py. Dif
 
 - Gradients are scaled by distance; ``scaling="none"`` leaves that out.
 - The near plane is 0; theirs is 2 in Blender's scenes.
-- In dvgo a coarse stage gives box and free space, the box 5 % larger on each axis than what it finds;
-  here the grid's own first steps do.
+- In dvgo a coarse stage gives free space and a box 5 % larger on each axis than what it finds; here
+  the grid's own first steps do.
 - In dvgo-unbounded their box is a cube that holds all cameras' rays at the near clip; here it is
   0.75 content distances to each side.
 - Outside the box their samples are thinned to 0.95 of a step in folded space; here steps grow.
