@@ -9,6 +9,7 @@ import json
 import math
 import os
 import platform
+import shlex
 import sys
 import time
 from collections.abc import Callable, Iterable
@@ -101,13 +102,18 @@ def machine(device: str, threads: int) -> dict[str, Any]:
         **{package: _version(package) for package in ("torch", "numba", "taichi", "drjit")},
         "system": platform.platform(),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "command": " ".join(["python", *sys.argv]),
+        "command": shlex.join(["python", *map(_without_folders, sys.argv)]),
     }
 
 
 def default_threads() -> list[int]:
     """One, and two where there are two cores."""
     return sorted({1, min(2, usable_cores())})
+
+
+def _without_folders(word: str) -> str:
+    """A word of the command; of a path from the root its last part, which is no other machine's."""
+    return Path(word).name if Path(word).is_absolute() else word
 
 
 def _version(package: str) -> str | None:

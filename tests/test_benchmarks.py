@@ -9,8 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
-from tiny_scenes import picture, ring, write_blender
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "benchmarks"))
@@ -338,23 +336,6 @@ def test_distances(tmp_path):
     assert 2.0 < row["true"] < 3.5 and not row["box_found"]
     assert row["cameras"] < 0.8 * row["true"] and 0.5 < row["found"] / row["true"] < 2.0
     assert f"{row['found']:.3g}" in printed and f"{row['true']:.3g}" in printed
-
-
-@pytest.mark.slow
-def test_tightening(tmp_path):
-    scene = tmp_path / "scene"
-    scene.mkdir()
-    for split in ("train", "test"):
-        write_blender(scene, split, ring(4))
-        for i in range(4):  # large enough for SSIM
-            pixels = picture(i, width=16, height=12, channels=4)
-            Image.fromarray(pixels).save(scene / split / f"r_{i}.png")
-    options = (str(scene), "--time-limit", "1.5", "--voxels", "8000", "--threads", "1")
-    record, printed = run("tightening.py", tmp_path / "record.json", *options)
-    assert [row["box"] for row in record["rows"]] == ["at growth", "own grid", "early"]
-    for row in record["rows"]:
-        assert row["steps"] > 2 and 5 < row["psnr"] < 50 and row["longest_edge"] > 0
-        assert f"{row['psnr']:.2f}" in printed
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from tiny_fields import assert_same_state, tiny_state
 from tiny_scenes import camera_at, ring
 
 from warpnerf.checks import InputError
-from warpnerf.config import MarchConfig, TrainConfig
+from warpnerf.config import GridConfig, MarchConfig, TrainConfig
 from warpnerf.model.models import Rgb
 from warpnerf.training.checkpoint import load_checkpoint, load_field
 from warpnerf.training.tensor_file import DamagedFileError
@@ -116,8 +116,12 @@ def write_old(path: Path, header: dict[str, Any], **tensors: np.ndarray) -> None
 
 def test_files_of_the_version_before_hold_the_model_rgb(tmp_path: Path) -> None:
     """Values and moments, bit for bit, and a configuration to go on with."""
-    # All rays were drawn then, and steps outside the box were shorter.
-    then = {"skip_empty_rays": False, "march": MarchConfig(growth=0.02)}
+    # All rays were drawn then, steps outside the box were shorter, and all grids grew late.
+    then = {
+        "skip_empty_rays": False,
+        "march": MarchConfig(growth=0.02),
+        "grid": GridConfig(grow_at=(0.3, 0.4, 0.5, 0.6)),
+    }
     expected = tiny_state(5, TrainConfig(threads=1, model="rgb", **then))
     grid, free = expected.field.grid, expected.field.free
     values = grid.values.numpy().reshape(5, 6, 7, 4)

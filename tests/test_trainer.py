@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from tiny_fields import assert_same_state
 from tiny_trainings import (
-    FIRST_LOOK,
     GROWING,
     STEPS,
     ball,
@@ -51,12 +50,11 @@ def test_resumed_after_any_step_it_ends_the_same(
     scene = replace(ball(), unbounded=unbounded)
     config = tiny_config(threads=threads, model=model)
     whole = stopped_at(STEPS, tmp_path / "whole", config, scene)
-    resizing = GROWING if unbounded else (FIRST_LOOK, *GROWING)
-    assert whole.grown == len(resizing) and 0.02 < whole.progress.occupied < 0.98
+    assert whole.grown == len(GROWING) and 0.02 < whole.progress.occupied < 0.98
     assert unbounded or (whole.field.grid.box_min > scene.box_min).any()
     for step in range(1, STEPS):
         begun = stopped_at(step, tmp_path / "begun", config, scene)
-        assert begun.grown == sum(step > at for at in resizing)
+        assert begun.grown == sum(step > at for at in GROWING)
         resumed = stopped_at(STEPS, tmp_path / "resumed", begun.config, scene, begun)
         assert_same_state(without_seconds(resumed), without_seconds(whole))
 
@@ -86,20 +84,23 @@ def resized_at(config: TrainConfig, scene: Scene) -> list[tuple[int, float, floa
     return found
 
 
-def test_the_box_of_an_object_is_tightened_before_the_grid_grows(on_cpu: None) -> None:
+def test_the_grid_of_an_object_grows_earlier_into_a_tighter_box(on_cpu: None) -> None:
     config = tiny_config(steps=100)  # in which 10 suffice for a ball to show
-    config = replace(config, grid=replace(config.grid, alpha_init=0.05))
+    grid = replace(config.grid, voxels=24_000, grow_at="auto", alpha_init=0.05)
+    config = replace(config, grid=grid)
     found = resized_at(config, ball())
-    assert [step for step, _, _ in found] == [10, 31, 61]
+    assert [step for step, _, _ in found] == [10, 20, 30, 40]
     nodes, box = np.array(found)[:, 1:].T
-    assert box[0] < 0.9 and nodes == pytest.approx([1.0, 2.0, 2.0], rel=0.2)
+    assert box.prod() < 0.9 and nodes == pytest.approx([2.0] * 4, rel=0.2)
     opaque = [replace(view, image=view.image[..., :3].copy()) for view in ball().views]
     filled = resized_at(config, replace(ball(), views=opaque))
-    assert [step for step, _, _ in filled] == [31, 61]
-    early = replace(config, grid=replace(config.grid, grow_at=(0.05, 0.601)))
-    assert [step for step, _, _ in resized_at(early, ball())] == [5, 61]
+    assert [step for step, _, _ in filled] == [30, 40, 50, 60]
+    told = replace(config, grid=replace(config.grid, grow_at=(0.05, 0.601)))
+    assert [step for step, _, _ in resized_at(told, ball())] == [5, 61]
     never = replace(config, grid=replace(config.grid, grow_at=()))
     assert resized_at(never, ball()) == []
+    with pytest.raises(InputError, match=r"^grid\.grow_at must be auto or shares .*'never'"):
+        GridConfig(grow_at="never")  # type: ignore[arg-type]
 
 
 # Rates at which most of the empty space is found within a few steps.

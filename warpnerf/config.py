@@ -32,6 +32,14 @@ ACCUMULATE_AT: dict[SceneKind, tuple[float, ...]] = {
 """What ``OptimConfig.accumulate_at`` is by default. Where rays meet fewer samples, as they should
 where photographs have alpha, updates take more steps, and earlier."""
 
+GROW_AT: dict[SceneKind, tuple[float, ...]] = {
+    "object": (0.1, 0.2, 0.3, 0.4),
+    "bounded": (0.3, 0.4, 0.5, 0.6),
+    "unbounded": (0.3, 0.4, 0.5, 0.6),
+}
+"""What ``GridConfig.grow_at`` is by default. Around an object most of the first box is empty, and a
+growth leaves that out; elsewhere coarse grids do more in the same time."""
+
 MAX_VOXELS = 2**31
 """Nodes are counted in 32 bits."""
 
@@ -49,8 +57,8 @@ class GridConfig:
 
     voxels: int = 160**3
     """Nodes of the final grid, in all."""
-    grow_at: tuple[float, ...] = (0.3, 0.4, 0.5, 0.6)
-    """Shares of the training at which the number of nodes doubles."""
+    grow_at: Literal["auto"] | tuple[float, ...] = "auto"
+    """Shares of the training at which the number of nodes doubles. auto: those of ``GROW_AT``."""
     shift_at_growth: float = 0.0
     """Taken from all raw densities at each growth, before their activation; DVGO takes 1."""
     alpha_init: float = 1e-3
@@ -78,8 +86,24 @@ class GridConfig:
             raise InputError(f"grid.alpha_init must lie between 0 and 1, not {self.alpha_init}.")
         if not 0 < self.border <= 1:
             raise InputError(f"grid.border must be above 0 and at most 1, not {self.border}.")
-        require_shares("grid.grow_at", self.grow_at)
+        if not isinstance(self.grow_at, str):
+            require_shares("grid.grow_at", self.grow_at)
+        elif self.grow_at != "auto":
+            raise InputError(
+                f"grid.grow_at must be auto or shares between 0 and 1, not {self.grow_at!r}."
+            )
         require_at_least("grid.shift_at_growth", self.shift_at_growth, 0.0)
+
+    def growth(self, kind: SceneKind) -> tuple[float, ...]:
+        """``grow_at``, decided for a kind of scene.
+
+        Args:
+            kind: object, bounded or unbounded.
+
+        Returns:
+            Shares of the training.
+        """
+        return GROW_AT[kind] if isinstance(self.grow_at, str) else self.grow_at
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -358,7 +358,7 @@ def _cost(scene: Scene, config: TrainConfig, threads: int) -> Cost:
     samples, occupied = SAMPLES_IN_NDC if in_ndc else SAMPLES_AND_OCCUPIED[scene.kind]
     finer = (voxels / PRESETS["fast"].grid.voxels) ** (1.0 / 3.0) / config.march.step_voxels
     share = (np.arange(1000) + 0.5)[:, None] / 1000  # of the training, evenly
-    nodes = voxels * 0.5 ** (share < config.grid.grow_at).sum(axis=1)
+    nodes = voxels * 0.5 ** (share < config.grid.growth(scene.kind)).sum(axis=1)
     steps_an_update = 2.0 ** (share >= config.optim.accumulation(scene.kind)).sum(axis=1)
     step = config.rays_per_step * (SECONDS_PER_RAY + finer * samples * SECONDS_PER_SAMPLE)
     step += float((nodes / steps_an_update).mean()) * occupied * SECONDS_PER_NODE

@@ -17,7 +17,7 @@ import warp as wp
 from warpnerf_kernels.base.types import vector
 
 from warpnerf.checks import InputError
-from warpnerf.config import Contraction, TrainConfig, config_from_json, config_to_json
+from warpnerf.config import GROW_AT, Contraction, TrainConfig, config_from_json, config_to_json
 from warpnerf.model.grid import FreeCells, VoxelGrid
 from warpnerf.model.interface import Model, n_weights
 from warpnerf.model.models import MODELS, Rgb, decode, to_json
@@ -113,7 +113,8 @@ def load_checkpoint(path: str | Path) -> TrainingState:
         raise InputError(
             f"{path} holds a field but no training to go on with; name a checkpoint, or train anew."
         )
-    if not 0 <= training.grown <= 1 + len(training.config.grid.grow_at):
+    growths = max(len(training.config.grid.growth(kind)) for kind in GROW_AT)
+    if not 0 <= training.grown <= growths:
         refuse(path, f"a grid cannot have been resized {training.grown} times")
     if not 0 <= training.updates <= training.progress.step:
         refuse(path, f"{training.updates} updates do not fit {training.progress.step} steps")

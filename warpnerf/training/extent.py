@@ -15,9 +15,6 @@ from warpnerf.model.interface import Model
 from warpnerf.scenes.frustum import FARTHEST, contraction_of, fit_frustum
 from warpnerf.scenes.scene import Scene
 
-TIGHTEN_AT = 0.1
-"""Share of the training at which the box of an object is tightened, before the grid first grows."""
-
 
 def require_grid(scene: Scene, config: TrainConfig, device: wp.Device) -> None:
     """Raise InputError where the final grid has no place in memory, or the scene no frustum."""
@@ -64,18 +61,6 @@ def first_grid(
         density_scale=1.0 / voxel,
         frustum=frustum,
     )
-
-
-def resize_at(scene: Scene, config: TrainConfig) -> tuple[float, ...]:
-    """Shares of the training at which the grid gets another box or more nodes.
-
-    Around an object much of the first box is empty. What the first steps show of that suffices to
-    spend its nodes elsewhere; they need no training, and no grid, of their own.
-    """
-    grow_at = config.grid.grow_at
-    if scene.kind == "object" and grow_at and grow_at[0] > TIGHTEN_AT:
-        return (TIGHTEN_AT, *grow_at)
-    return grow_at
 
 
 def content_distances(scene: Scene, config: TrainConfig) -> tuple[float, list[float]]:

@@ -61,7 +61,7 @@ class TrainingState:
     reach: float
     """From the outermost camera to the farthest corner of the first box, scene units."""
     grown: int
-    """How often the grid has been resized: its box tightened, or its nodes doubled."""
+    """How often the grid has grown."""
     updates: int
     """How often the optimiser has updated the grid."""
     restarted: int = 0

@@ -107,7 +107,7 @@ class Trainer:
             self.workers,
         )
         self._accumulation = config.optim.accumulation(scene.kind)
-        self._resize_at = extent.resize_at(scene, config)
+        self._grow_at = config.grid.growth(scene.kind)
         self._grown = 0
         self._updates = 0
         self._restarted = 0
@@ -341,13 +341,8 @@ class Trainer:
         )
 
     def _voxels(self, grown: int) -> int:
-        """Nodes after the grid was resized so often."""
-        left = len(self.config.grid.grow_at) - self._growths(grown)
-        return max(8, self.config.grid.voxels >> left)
-
-    def _growths(self, grown: int) -> int:
-        """In how many of so many resizings nodes doubled; the others, which come first, tighten."""
-        return max(0, grown - len(self._resize_at) + len(self.config.grid.grow_at))
+        """Nodes after the grid has grown so often."""
+        return max(8, self.config.grid.voxels >> len(self._grow_at) - grown)
 
     def parameters(self) -> tuple[Parameter, ...]:
         """What is trained."""
@@ -359,10 +354,9 @@ class Trainer:
 
     def _decay_from(self) -> float:
         """The share of the training at which learning rates were those of the start."""
-        growths = self._growths(self._grown)
-        if growths == 0 or not self.config.optim.restart_at_growth:
+        if self._grown == 0 or not self.config.optim.restart_at_growth:
             return 0.0
-        return self.config.grid.grow_at[growths - 1]
+        return self._grow_at[self._grown - 1]
 
     def _training_pass(self) -> TrainingPass:
         return TrainingPass(
@@ -388,8 +382,8 @@ class Trainer:
         )
 
     def _grow(self, fraction: float) -> None:
-        """Carry grid and optimiser over to more or smaller voxels, once the schedule says so."""
-        grown = sum(fraction >= at for at in self._resize_at)
+        """Carry grid and optimiser over to more voxels, once the schedule says so."""
+        grown = sum(fraction >= at for at in self._grow_at)
         if grown == self._grown or self.steps_done < FIRST_LOOK:
             return
         box = self._tight_box()
@@ -400,11 +394,10 @@ class Trainer:
             state = self.optimiser[parameter.name]
             resized = RULES[parameter.kind].resized(state, self.grid, grid, self.workers)
             self.optimiser[parameter.name] = resized
-        growths = self._growths(grown) - self._growths(self._grown)
-        shift = growths * self.config.grid.shift_at_growth
+        shift = (grown - self._grown) * self.config.grid.shift_at_growth
         self.grid = replace(grid, density_shift=grid.density_shift - shift)
         self._grown = grown
-        if growths and self.config.optim.restart_at_growth:
+        if self.config.optim.restart_at_growth:
             self.optimiser = first_states(self.parameters(), self.workers)
             self._restarted = self._updates
         give_back()
