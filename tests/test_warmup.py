@@ -8,7 +8,7 @@ import pytest
 from test_determinism import small_scene
 from test_frustum import facing
 
-from warpnerf.config import GridConfig, LossConfig, OptimConfig, TrainConfig
+from warpnerf.config import GridConfig, OptimConfig, TrainConfig
 from warpnerf.model.interface import Model
 from warpnerf.model.models import Deferred, Features, Rgb
 from warpnerf.presets import EVERYDAY, PRESETS
@@ -63,8 +63,8 @@ def test_a_training_loads_no_other_kernels(
 )
 def test_warm_up_covers_the_presets_and_is_done_once(presets: tuple[str, ...], device: str) -> None:
     shown: list[Any] = []
-    models = [PRESETS[name].model for name in presets]
-    first = warm_up(device, shown.append, models)
+    configs = [PRESETS[name] for name in presets]
+    first = warm_up(device, shown.append, configs)
     assert first == shown
     names = [kernel.name for kernel in first]
     assert len(set(names)) == len(names)
@@ -73,17 +73,17 @@ def test_warm_up_covers_the_presets_and_is_done_once(presets: tuple[str, ...], d
         assert f"render train, space folded in, scaling {scaling}" in names
         assert f"render train, in NDC, scaling {scaling}" in names
     assert {"render forward", "render forward, space folded in", "adam step"} < set(names)
-    again = warm_up(device, models=models)
+    again = warm_up(device, configs=configs)
     assert [kernel.name for kernel in again] == names
     assert not any(kernel.compiled for kernel in again)
 
 
-def test_without_models_those_of_the_presets_are_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unless_told_the_presets_are_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
     loaded: list[Any] = []
     monkeypatch.setattr(Workers, "load", lambda workers, kernel: loaded.append(kernel.module))
     names = [kernel.name for kernel in warm_up("cpu")]
     assert "render forward, deferred width=64 specular=12" in names
-    for model in (PRESETS[name].model for name in EVERYDAY):
-        where = Workers("cpu", 1).device
-        for kernel in training_kernels(model, "ndc", "clamped", "none", where, LossConfig()):
+    where = Workers("cpu", 1).device
+    for config in (PRESETS[name] for name in EVERYDAY):
+        for kernel in training_kernels(config.model, "ndc", "clamped", "none", where, config.loss):
             assert kernel.module in loaded

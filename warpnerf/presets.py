@@ -63,13 +63,14 @@ _DVGO = TrainConfig(
 )
 
 PRESETS: dict[str, TrainConfig] = {
-    "fast": TrainConfig(),
+    "fast": TrainConfig(loss=LossConfig(distortion=0.01)),
     "quality": TrainConfig(
         steps=200_000,
         time_limit=900.0,
         model=Deferred(specular=12, width=64),
         grid=GridConfig(voxels=224**3),
         optim=OptimConfig(decay=0.03),
+        loss=LossConfig(distortion=0.01),
     ),
     "dvgo": _DVGO,
     "dvgo-unbounded": replace(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -74,8 +75,8 @@ def warmup_command(
 
     start = time.perf_counter()
     presets = [PRESETS[name] for name in EVERYDAY]
-    chosen = dict.fromkeys(chosen_model(p.model, model, model_options) for p in presets)
-    kernels = warm_up(device, shown, chosen)
+    configs = [replace(p, model=chosen_model(p.model, model, model_options)) for p in presets]
+    kernels = warm_up(device, shown, configs)
     compiled = sum(kernel.compiled for kernel in kernels)
     seconds = time.perf_counter() - start
     print(

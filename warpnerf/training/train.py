@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from warpnerf.config import TrainConfig
+from warpnerf.presets import PRESETS
 from warpnerf.rendering.field import Field
 from warpnerf.scenes.scene import Scene
 from warpnerf.training.coarse import begin
@@ -42,8 +43,7 @@ def train(
 
     Args:
         scene: From ``load_scene``.
-        config: How to train; None: as the training to be resumed, or else the defaults, which are
-            the preset "fast".
+        config: How to train; None: as the training to be resumed, or else the preset "fast".
         on_progress: Called every ``trainer.REPORT_EVERY`` steps and at the end.
         on_checkpoint: Called every ``config.checkpoint_every`` seconds and at the end with what
             ``save_checkpoint`` takes, whose arrays the next update changes.
@@ -59,7 +59,7 @@ def train(
         FloatingPointError: The loss, or a value in the grid, is no longer a finite number.
     """
     if config is None:
-        config = TrainConfig() if resume is None else resume.config
+        config = PRESETS["fast"] if resume is None else resume.config
     trainer = begin(scene, config, resume)
     progress = trainer.run(on_progress, on_checkpoint)
     return TrainResult(

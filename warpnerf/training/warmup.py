@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, fields
-from itertools import product
 from typing import get_args
 
 import warp as wp
@@ -76,14 +75,14 @@ def rendering_kernels(model: Model, contraction: Contraction, device: wp.Device)
 def warm_up(
     device: str = "cpu",
     on_kernel: Callable[[Warmed], None] = lambda kernel: None,
-    models: Collection[Model] | None = None,
+    configs: Collection[TrainConfig] | None = None,
 ) -> list[Warmed]:
-    """Compile whatever training and rendering with the everyday presets need, in every scaling.
+    """Compile whatever trainings and rendering need, in every scaling.
 
     Args:
         device: Where they are to run: cpu, cuda, cuda:1, ...
         on_kernel: Called with each kernel that is ready.
-        models: For which; None: those of the presets.
+        configs: For which; None: the presets fast and quality.
 
     Returns:
         All of them.
@@ -92,20 +91,22 @@ def warm_up(
         InputError: The device does not exist, or kernels can be kept nowhere.
     """
     workers = Workers(device, 1)
-    models = dict.fromkeys(preset.model for preset in _presets()) if models is None else models
-    # What is compiled for the first as well needs no name of its own.
-    of_model = {model: f", {_options_of(model)}" if n else "" for n, model in enumerate(models)}
+    configs = [PRESETS[name] for name in EVERYDAY] if configs is None else configs
+    first = next(iter(configs), None)
     wanted: dict[wp.Module, tuple[str, wp.Kernel]] = {}
-    for model, contraction in product(models, _contractions()):
-        for kernel in rendering_kernels(model, contraction, workers.device):
-            words = _words(kernel, contraction) + of_model[model]
-            wanted.setdefault(kernel.module, (words, kernel))
-        for jacobian, losses in dict.fromkeys((p.jacobian, p.loss) for p in _presets()):
+    for config in configs:
+        model, losses = config.model, config.loss
+        # What is compiled for the first model as well needs no name of its own.
+        of_model = "" if first is None or model == first.model else f", {_options_of(model)}"
+        for contraction in _contractions(config):
+            for kernel in rendering_kernels(model, contraction, workers.device):
+                words = _words(kernel, contraction) + of_model
+                wanted.setdefault(kernel.module, (words, kernel))
             for scaling in get_args(Scaling):
                 for kernel in training_kernels(
-                    model, contraction, scaling, jacobian, workers.device, losses
+                    model, contraction, scaling, config.jacobian, workers.device, losses
                 ):
-                    words = _words(kernel, contraction, scaling, losses) + of_model[model]
+                    words = _words(kernel, contraction, scaling, losses) + of_model
                     wanted.setdefault(kernel.module, (words, kernel))
     done = []
     for name, kernel in wanted.values():
@@ -118,17 +119,10 @@ def warm_up(
     return done
 
 
-def _presets() -> list[TrainConfig]:
-    return [PRESETS[name] for name in EVERYDAY]
-
-
-def _contractions() -> list[Contraction]:
-    """Those of the presets; "auto" is none for bounded scenes, and linf or ndc for others."""
-    found: dict[Contraction, None] = {}
-    for preset in _presets():
-        chosen = preset.grid.contraction
-        found |= dict.fromkeys(("none", "linf", "ndc") if chosen == "auto" else (chosen,))
-    return list(found)
+def _contractions(config: TrainConfig) -> tuple[Contraction, ...]:
+    """Those of a configuration; "auto" is none for bounded scenes, and linf or ndc for others."""
+    chosen = config.grid.contraction
+    return ("none", "linf", "ndc") if chosen == "auto" else (chosen,)
 
 
 def _options_of(model: Model) -> str:
