@@ -10,7 +10,6 @@ from tiny_scenes import ring, tiny_scene
 
 from warpnerf.evaluation.inspection import Inspection
 from warpnerf.media.scene_plan import _BOX, _SIGHT_END, _TEST, _TRAIN, plan_picture
-from warpnerf.model.models import Rgb
 
 HEADER = 92
 
@@ -24,7 +23,6 @@ def inspection(poses: list[np.ndarray], up: tuple[float, float, float]) -> Inspe
         focus=None,
         oddities=(),
         costs={},
-        model=Rgb(),
     )
 
 

@@ -152,7 +152,7 @@ def train_command(
         config = dataclasses.replace(config, steps=STEPS_OF_TIMED)
     if steps is not None and time_limit is None:
         config = dataclasses.replace(config, time_limit=None)
-    if config.loss.kinds:  # before photographs are posed or read; loads Warp
+    if config.loss.sample_colour > 0.0:  # before photographs are posed or read; loads Warp
         from warpnerf.rendering.losses import parts_with
 
         parts_with(config.model, "float32", config.loss)
