@@ -33,6 +33,17 @@ def smaller(name: str, **changes: Any) -> wn.TrainConfig:
     return replace(preset, **(values | changes))
 
 
+def squared_error(field: wn.Field, scene: Scene) -> float:
+    """Mean over the training views, of photographs before the field's background."""
+    errors = []
+    for view in (scene.views[index] for index in scene.splits["train"]):
+        image = view.image / 255.0
+        alpha = image[..., 3:] if image.shape[2] == 4 else 1.0
+        target = image[..., :3] * alpha + np.array(field.background) * (1.0 - alpha)
+        errors.append(np.square(field.render(view.camera).rgb - target).mean())
+    return float(np.mean(errors))
+
+
 @pytest.mark.slow  # compiles networks as wide as DVGO's
 @pytest.mark.parametrize(
     ("name", "scene"),
@@ -46,10 +57,10 @@ def smaller(name: str, **changes: Any) -> wn.TrainConfig:
 )
 def test_presets_train(name: str, scene: Scene) -> None:
     trainer = Trainer(scene, smaller(name))
-    before = wn.evaluate(trainer.field(), scene, split="training").mean["psnr"]
+    before = squared_error(trainer.field(), scene)
     trainer.run()
     assert trainer.steps_done == STEPS
-    assert wn.evaluate(trainer.field(), scene, split="training").mean["psnr"] > before + 1.0
+    assert squared_error(trainer.field(), scene) < 0.8 * before
     for parameter in trainer.parameters():
         values = parameter.values.numpy()
         assert values.any() and np.isfinite(values).all()
