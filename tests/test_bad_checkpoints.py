@@ -77,10 +77,10 @@ def test_65_a_flipped_bit_in_a_checkpoint(checkpoint: Path, command: str) -> Non
 def test_66_a_checkpoint_of_another_version(checkpoint: Path, command: str) -> None:
     with safe_open(checkpoint, framework="numpy") as file:
         metadata = file.metadata()
-    metadata["header"] = metadata["header"].replace("warpnerf-training-6", "warpnerf-training-7")
+    metadata["header"] = metadata["header"].replace("warpnerf-training-7", "warpnerf-training-8")
     save_file(load_file(checkpoint), checkpoint, metadata)
     said = refused(command, checkpoint)
-    assert f"{checkpoint} has format 'warpnerf-training-7'" in said
+    assert f"{checkpoint} has format 'warpnerf-training-8'" in said
     assert "use the version of warpnerf that wrote it" in said
 
 

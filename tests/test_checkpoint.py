@@ -183,7 +183,7 @@ def test_metadata_tell_what_a_file_is(tmp_path: Path) -> None:
     with safe_open(tmp_path / "training", framework="numpy") as file:
         metadata = file.metadata()
     header = json.loads(metadata["header"])
-    assert header["format"] == "warpnerf-training-6"
+    assert header["format"] == "warpnerf-training-7"
     assert header["model"]["name"] == header["training"]["config"]["model"]["name"] == "deferred"
     assert header["training"]["progress"]["step"] == 3
     assert header["training"]["config"]["grid"]["voxels"] == TrainConfig().grid.voxels
@@ -237,7 +237,7 @@ def in_config(old: str, new: str) -> Callable[[str], str]:
 @pytest.mark.parametrize(
     ("header", "tensors", "says"),
     [
-        (lambda text: text.replace("training-6", "training-7"), {}, "training-7"),
+        (lambda text: text.replace("training-7", "training-8"), {}, "training-8"),
         (lambda text: text[:-1], {}, "header"),
         (lambda text: "[" * 100_000, {}, "header"),
         (lambda text: "[]", {}, "header"),

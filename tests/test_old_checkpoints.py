@@ -53,7 +53,7 @@ OLD_TRAINING = OLD_FIELD | {
                 "border": 0.2,
                 "contraction": "auto",
                 "grow_at": [0.3, 0.4, 0.5, 0.6],
-                "voxels": 4096000,
+                "voxels": 840,  # 5 x 6 x 7, doubled twice
             },
             "jacobian": "none",
             "march": {
@@ -85,7 +85,7 @@ OLD_TRAINING = OLD_FIELD | {
             "time_limit": None,
         },
         "content_distance": 0.6666666666666666,
-        "grown": 2,
+        "grown": 3,  # twice, after its box was made tighter
         "progress": {
             "fraction": 0.25,
             "loss": 0.1,
@@ -120,7 +120,7 @@ def test_files_of_the_version_before_hold_the_model_rgb(tmp_path: Path) -> None:
     then = {
         "skip_empty_rays": False,
         "march": MarchConfig(growth=0.02),
-        "grid": GridConfig(grow_at=(0.3, 0.4, 0.5, 0.6)),
+        "grid": GridConfig(grow_at=(0.3, 0.4, 0.5, 0.6), voxels=840),
     }
     expected = tiny_state(5, TrainConfig(threads=1, model="rgb", **then))
     grid, free = expected.field.grid, expected.field.free

@@ -31,10 +31,15 @@ from warpnerf.training.state import Progress, TrainingState
 from warpnerf.training.tensor_file import read_tensors, refuse, write_tensors
 
 FIELD = "warpnerf-field-2"
-TRAINING = "warpnerf-training-6"
+TRAINING = "warpnerf-training-7"
 """What a file holds, and the version of its format."""
-OLDER = {"warpnerf-field-1": FIELD, "warpnerf-training-5": TRAINING}
-"""Formats of the version before, which had one model, rgb; they are read."""
+OLDER = {
+    "warpnerf-field-1": FIELD,
+    "warpnerf-training-5": TRAINING,
+    "warpnerf-training-6": TRAINING,
+}
+"""Formats of versions before, which are read. field-1 and training-5 had one model, rgb; up to
+training-6 the resizings of a grid that did not grow were counted as growths."""
 
 
 def save_field(path: str | Path, field: Field) -> None:
@@ -114,8 +119,8 @@ def load_checkpoint(path: str | Path) -> TrainingState:
             f"{path} holds a field but no training to go on with; name a checkpoint, or train anew."
         )
     growths = max(len(training.config.grid.growth(kind)) for kind in GROW_AT)
-    if not 0 <= training.grown <= growths:
-        refuse(path, f"a grid cannot have been resized {training.grown} times")
+    if header.format == TRAINING and not 0 <= training.grown <= growths:
+        refuse(path, f"a grid cannot have grown {training.grown} times")
     if not 0 <= training.updates <= training.progress.step:
         refuse(path, f"{training.updates} updates do not fit {training.progress.step} steps")
     if not 0 <= training.restarted <= training.updates:
@@ -130,13 +135,17 @@ def load_checkpoint(path: str | Path) -> TrainingState:
     field = _field(header, tensors, path, workers)
     if training.config.model != field.model:
         refuse(path, "its configuration names another model than its field")
+    grown = training.grown
+    if header.format != TRAINING:
+        to_come = math.log2(training.config.grid.voxels / math.prod(field.grid.size))
+        grown = min(max(0, growths - round(to_come)), growths)
     return TrainingState(
         config=training.config,
         scene_digest=training.scene_digest,
         content_distance=training.content_distance,
         content_distances=training.content_distances,
         reach=training.reach,
-        grown=training.grown,
+        grown=grown,
         updates=training.updates,
         restarted=training.restarted,
         progress=training.progress,
