@@ -175,12 +175,28 @@ def test_the_box_around_a_common_focus_stays(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_where_nothing_opaque_grows_the_guess_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = guessed_scene()
-    monkeypatch.setattr(coarse, "sight_of", lambda *_: None)
+    monkeypatch.setattr(coarse, "seen_extent", lambda *_: None)
     trainer = begin(scene, SHORT)
     assert trainer.content_distance == scene.content_distance and trainer.scene.guessed
     assert trainer.scene.notes[-1] == coarse.NOTHING_SEEN and trainer.sight is None
     with pytest.raises(wn.InputError, match="something opaque"):
         begin(scene, replace(SHORT, content_distance="per-camera"))
+
+
+@pytest.mark.parametrize("some", [True, False])
+def test_only_photographs_in_which_no_ray_meets_anything_are_refused(
+    some: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where a third of the cameras see enough, training goes on with the guess."""
+    scene = guessed_scene()
+    config = replace(SHORT, steps=10 * SHORT.coarse_steps)
+    points = [np.ones((200 if some and n < 2 else 0, 3)) for n in range(len(scene.views))]
+    monkeypatch.setattr(coarse, "seen_points", lambda *_: points)
+    if some:
+        assert find_sight(scene, config)[0] is None
+        return
+    with pytest.raises(wn.InputError, match="met nothing opaque"):
+        find_sight(scene, config)
 
 
 def test_too_little_time_finds_nothing() -> None:

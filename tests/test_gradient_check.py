@@ -7,16 +7,16 @@ import pytest
 from drive import Kernels, Problem, assert_close
 
 from warpnerf.evaluation.gradient_check import (
-    BOX_MAX,
-    BOX_MIN,
     DENSITY_SHIFT,
     ProblemKernels,
     RayProblem,
     folded,
+    in_frustum,
     make_problem,
     of_model,
     partly_free,
     stopping_early,
+    with_losses,
 )
 from warpnerf.model.models import Deferred, Features
 from warpnerf.runtime.parallel import Workers
@@ -26,6 +26,8 @@ PATHS = {
     "stopping early": stopping_early,
     "partly free": partly_free,
     "folded": folded,
+    "frustum": in_frustum,
+    "losses": lambda problem: with_losses(problem, sample_colour=0.4),
     "deferred": lambda problem: of_model(problem, Deferred()),
     "features": lambda problem: of_model(problem, Features(width=16, hidden_layers=1)),
 }
@@ -34,8 +36,8 @@ PATHS = {
 def for_driver(problem: RayProblem) -> Problem:
     return Problem(
         raw=problem.raw,
-        box_min=BOX_MIN,
-        box_max=BOX_MAX,
+        box_min=problem.box_min,
+        box_max=problem.box_max,
         origins=problem.origins,
         directions=problem.directions,
         background=problem.background,
@@ -48,6 +50,8 @@ def for_driver(problem: RayProblem) -> Problem:
         content_distance=problem.content_distance,
         contraction=problem.contraction,
         border=problem.border,
+        frustum=problem.frustum,
+        minimised=problem.minimised,
         density_shift=DENSITY_SHIFT,
         density_scale=problem.density_scale,
         free=problem.free,
@@ -100,3 +104,10 @@ def test_rounded_numbers_are_those_of_float32() -> None:
     assert problem.raw.dtype == np.float64
     assert np.array_equal(problem.raw.astype(np.float32), problem.raw)
     assert np.abs(problem.raw - make_problem(0).raw).max() > 0.0
+    frustum, before = in_frustum(make_problem(0)).rounded().frustum, in_frustum(make_problem(0))
+    assert frustum is not None and before.frustum is not None
+    for ours, exact in (
+        (frustum.axes, before.frustum.axes),
+        (frustum.origin, before.frustum.origin),
+    ):
+        assert np.array_equal(ours.astype(np.float32), ours) and np.abs(ours - exact).max() > 0.0

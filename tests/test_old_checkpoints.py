@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import hashlib
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from safetensors.numpy import save_file
+from test_checkpoint import rewrite
 from tiny_fields import assert_same_state, tiny_state
 from tiny_scenes import camera_at, ring
+from tiny_trainings import GROWING, STEPS, ball, stopped_at, tiny_config, without_seconds
+from tiny_trainings import early_growth as early_growth
 
 from warpnerf.checks import InputError
 from warpnerf.config import GridConfig, MarchConfig, TrainConfig
 from warpnerf.model.models import Rgb
-from warpnerf.training.checkpoint import load_checkpoint, load_field
+from warpnerf.training.checkpoint import load_checkpoint, load_field, save_checkpoint
 from warpnerf.training.tensor_file import DamagedFileError
 
 OLD_FIELD = {
@@ -53,7 +57,7 @@ OLD_TRAINING = OLD_FIELD | {
                 "border": 0.2,
                 "contraction": "auto",
                 "grow_at": [0.3, 0.4, 0.5, 0.6],
-                "voxels": 840,  # 5 x 6 x 7, doubled twice
+                "voxels": 4096000,
             },
             "jacobian": "none",
             "march": {
@@ -85,7 +89,7 @@ OLD_TRAINING = OLD_FIELD | {
             "time_limit": None,
         },
         "content_distance": 0.6666666666666666,
-        "grown": 3,  # twice, after its box was made tighter
+        "grown": 2,
         "progress": {
             "fraction": 0.25,
             "loss": 0.1,
@@ -120,7 +124,7 @@ def test_files_of_the_version_before_hold_the_model_rgb(tmp_path: Path) -> None:
     then = {
         "skip_empty_rays": False,
         "march": MarchConfig(growth=0.02),
-        "grid": GridConfig(grow_at=(0.3, 0.4, 0.5, 0.6), voxels=840),
+        "grid": GridConfig(grow_at=(0.3, 0.4, 0.5, 0.6)),
     }
     expected = tiny_state(5, TrainConfig(threads=1, model="rgb", **then))
     grid, free = expected.field.grid, expected.field.free
@@ -177,3 +181,24 @@ def test_formats_before_that_are_refused_in_one_sentence(kind: str, tmp_path: Pa
         assert said.startswith(f"{path} has format {kind!r}, but this version reads ")
         assert said.endswith("or train again.") and "\n" not in said
         assert not isinstance(caught.value, DamagedFileError)
+
+
+@pytest.mark.parametrize("step", [GROWING[0], GROWING[0] + 1, GROWING[1] + 1])
+def test_growths_that_were_counted_with_a_tighter_box(
+    step: int, tmp_path: Path, on_cpu: None
+) -> None:
+    """As format 6 counted them for objects; they go on as if they had been counted as now."""
+    path, scene, config = tmp_path / "begun", ball(), tiny_config()
+    state = stopped_at(step, path, config, scene)
+    for counted in (state.grown + 1, state.grown):
+        save_checkpoint(path, replace(state, grown=counted))
+        rewrite(path, lambda text: text.replace("training-7", "training-6"))
+        begun = load_checkpoint(path)
+        assert begun.grown == state.grown
+    whole = stopped_at(STEPS, tmp_path / "whole", config, scene)
+    resumed = stopped_at(STEPS, tmp_path / "resumed", begun.config, scene, begun)
+    assert_same_state(without_seconds(resumed), without_seconds(whole))
+    save_checkpoint(path, replace(state, grown=4))
+    rewrite(path, lambda text: text.replace("training-7", "training-6"))
+    with pytest.raises(DamagedFileError, match="cannot have grown 4 times"):
+        load_checkpoint(path)

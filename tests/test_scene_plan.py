@@ -16,6 +16,7 @@ HEADER = 92
 
 def inspection(poses: list[np.ndarray], up: tuple[float, float, float]) -> Inspection:
     return Inspection(
+        contraction="none",
         scene=tiny_scene(poses),
         format="by hand",
         content_distance=1.0,

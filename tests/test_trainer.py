@@ -59,6 +59,20 @@ def test_resumed_after_any_step_it_ends_the_same(
         assert_same_state(without_seconds(resumed), without_seconds(whole))
 
 
+@pytest.mark.parametrize("grow_at", ["auto", ()])
+def test_resumed_it_grows_as_its_kind_of_scene_does(
+    grow_at: Any, tmp_path: Path, on_cpu: None
+) -> None:
+    config = tiny_config(grid=GridConfig(voxels=6000, grow_at=grow_at, alpha_init=0.1))
+    whole = stopped_at(STEPS, tmp_path / "whole", config, ball())
+    for step in (3, 7, 12):
+        begun = stopped_at(step, tmp_path / "begun", config, ball())
+        assert begun.config.grid.grow_at == grow_at
+        resumed = stopped_at(STEPS, tmp_path / "resumed", begun.config, ball(), begun)
+        assert_same_state(without_seconds(resumed), without_seconds(whole))
+    assert whole.grown == (4 if grow_at else 0)
+
+
 def test_interrupted_after_every_step_it_ends_the_same(tmp_path: Path, on_cpu: None) -> None:
     whole = stopped_at(STEPS, tmp_path / "whole", tiny_config(), ball())
     state = None

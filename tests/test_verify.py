@@ -65,6 +65,17 @@ def times(factor: float) -> Spoil:
     return lambda method: lambda *given, **named: multiplied(method(*given, **named), factor)
 
 
+def trained_times(factor: float) -> Spoil:
+    def spoil(method: Callable[..., Any]) -> Callable[..., Any]:
+        def train(*given: Any, **named: Any) -> Any:
+            error, gradient = method(*given, **named)
+            return error, multiplied(gradient, factor)
+
+        return train
+
+    return spoil
+
+
 def weights_times(factor: float) -> Spoil:
     def spoil(method: Callable[..., Any]) -> Callable[..., Any]:
         def gradient(*given: Any, **named: Any) -> Found:
@@ -119,6 +130,8 @@ def coarse_when_packed(method: Callable[..., Any]) -> Callable[..., Any]:
             *("gradient", weights_times(1.0 + 1e-5), ["differences, features"]),
             marks=pytest.mark.slow,
         ),
+        ("gradient", times(1.0 + 1e-6), ["differences, frustum"]),
+        ("train", trained_times(1.0 + 1e-6), ["differences, losses"]),
         ("scatter", times(1.0 + 1e-5), ["gather"]),
         ("gradient", without_scaling, ["s(t)", "t = 0"]),
         ("gradient", never_above_one, ["beyond", "its own s(t)"]),

@@ -94,7 +94,7 @@ class GridConfig:
             )
         require_at_least("grid.shift_at_growth", self.shift_at_growth, 0.0)
 
-    def growth(self, kind: SceneKind) -> tuple[float, ...]:
+    def grows_at(self, kind: SceneKind) -> tuple[float, ...]:
         """``grow_at``, decided for a kind of scene.
 
         Args:
@@ -104,6 +104,18 @@ class GridConfig:
             Shares of the training.
         """
         return GROW_AT[kind] if isinstance(self.grow_at, str) else self.grow_at
+
+    def nodes_after(self, grown: int, kind: SceneKind) -> int:
+        """How many nodes a grid has, about, that has grown so often.
+
+        Args:
+            grown: At most as often as ``grows_at`` has shares.
+            kind: object, bounded or unbounded.
+
+        Returns:
+            Nodes in all; 8 at least.
+        """
+        return max(8, self.voxels >> len(self.grows_at(kind)) - grown)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -208,7 +220,7 @@ class OptimConfig:
             if not 0 <= getattr(self, name) < 1:
                 raise InputError(f"optim.{name} must lie in [0, 1), not {getattr(self, name)}.")
 
-    def accumulation(self, kind: SceneKind) -> tuple[float, ...]:
+    def accumulates_at(self, kind: SceneKind) -> tuple[float, ...]:
         """``accumulate_at``, decided for a kind of scene.
 
         Args:
@@ -217,9 +229,7 @@ class OptimConfig:
         Returns:
             Shares of the training.
         """
-        if not isinstance(self.accumulate_at, str):
-            return self.accumulate_at
-        return ACCUMULATE_AT[kind]
+        return ACCUMULATE_AT[kind] if isinstance(self.accumulate_at, str) else self.accumulate_at
 
 
 HUBER_DELTA = 0.1

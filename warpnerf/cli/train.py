@@ -211,7 +211,8 @@ def _begin_alone(
     from warpnerf.training.coarse import begin, is_needed
     from warpnerf.training.run import Run
 
-    if is_needed(scene, config):
+    looks = is_needed(scene, config)
+    if looks:
         print("looking for how far the cameras see", flush=True)
         with ProgressBar("first step") as bar:
             trainer = begin(
@@ -222,7 +223,7 @@ def _begin_alone(
     trained = trainer.scene  # in which box and distance may be other ones
     _describe(trained, trainer.content_distance, config)
     distance, near = trainer.content_distance, config.march.near
-    for oddity in oddities(trained, survey(source), distance, near, looked=True):
+    for oddity in oddities(trained, survey(source), distance, near, looked=looks):
         print(f"  odd: {oddity}", flush=True)
     run = Run(output)
     with training_page(page, trained, trainer) as session:

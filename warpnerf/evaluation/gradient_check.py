@@ -70,13 +70,13 @@ class RayProblem:
     box_min: np.ndarray = field(default_factory=lambda: BOX_MIN)
     """[3] scene units, or coordinates in the frustum."""
     box_max: np.ndarray = field(default_factory=lambda: BOX_MAX)
-    """[3]"""
+    """[3] likewise."""
     contraction: Contraction = "none"
     """How space outside the box is folded in, or ndc."""
+    border: float = 0.0
+    """Width of the shell that holds what is folded in, in half edges of the box."""
     frustum: Frustum | None = None
     """Of normalised device coordinates."""
-    border: float = 0.0
-    """Width of the shell that holds it, in half edges of the box."""
     density_scale: float = 1.0
     """1 / scene unit."""
     model: Model = field(default_factory=Rgb)
@@ -99,6 +99,14 @@ class RayProblem:
             for name, value in exact.items()
             if isinstance(value, np.ndarray) and value.dtype == np.float64
         }
+        if self.frustum is not None:
+            exact["frustum"] = replace(
+                self.frustum,
+                origin=self.frustum.origin.astype(np.float32).astype(np.float64),
+                axes=self.frustum.axes.astype(np.float32).astype(np.float64),
+                near=float(np.float32(self.frustum.near)),
+                depth=float(np.float32(self.frustum.depth)),
+            )
         return RayProblem(**exact)
 
 
@@ -161,7 +169,14 @@ def in_frustum(problem: RayProblem) -> RayProblem:
 
 def with_losses(problem: RayProblem, sample_colour: float = 0.0) -> RayProblem:
     """The same with losses besides the squared error, in a launch that trains."""
-    losses = LossConfig(distortion=0.3, entropy=0.2, sample_colour=sample_colour)
+    losses = LossConfig(
+        photometric="huber",
+        distortion=0.3,
+        entropy=0.2,
+        sample_colour=sample_colour,
+        near_clip=0.1,
+        near_clip_distance=0.6,
+    )
     return replace(problem, minimised=Minimised(config=losses, content_distance=1.3))
 
 

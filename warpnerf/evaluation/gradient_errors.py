@@ -1,7 +1,7 @@
 """How far gradients, and what is seen, are off: by launches of a problem that ought to agree.
 
-Each function gives the largest difference over the largest of what is expected; NaN where the two
-say nothing, so that no check passes for want of anything to compare.
+Each function gives the largest difference over the largest of what is expected, unless it says
+otherwise; NaN where the two say nothing, so that no check passes for want of anything to compare.
 """
 
 from __future__ import annotations

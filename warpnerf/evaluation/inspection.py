@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from warpnerf.checks import InputError, require_at_least, require_positive
-from warpnerf.config import TRAINING_BYTES, SceneKind, TrainConfig
+from warpnerf.config import TRAINING_BYTES, Contraction, SceneKind, TrainConfig
 from warpnerf.model.interface import Model
 from warpnerf.model.models import to_json
 from warpnerf.presets import EVERYDAY, PRESETS
@@ -79,6 +79,8 @@ class Inspection:
     """[3] unit vector, estimated from the cameras."""
     focus: np.ndarray | None
     """[3] the point that the training cameras look at, scene units; None where there is none."""
+    contraction: Contraction
+    """How the first of the trainings that were asked about treats space outside the box, or ndc."""
     oddities: tuple[str, ...]
     """What may be a mistake, a sentence each."""
     costs: dict[str, Cost]
@@ -158,7 +160,7 @@ class Inspection:
             ("up", "  ".join(f"{value:.3g}" for value in facts["up"])),
             (
                 "box",
-                f"{box} scene units, {HELD[contraction_of(scene, PRESETS['fast'])]}",
+                f"{box} scene units, {HELD[self.contraction]}",
             ),
             ("content distance", f"{self.content_distance:.4g} scene units"),
         ]
@@ -201,7 +203,7 @@ def inspect(
         masks: As for ``load_scene``.
         content_distance: The one that training will be given, scene units; None: the estimate.
         near: The near plane that training will be given, scene units.
-        configs: Trainings whose costs to estimate, by name; None: the presets fast and quality.
+        configs: Trainings whose costs to estimate, by name; by default fast and quality.
         threads: CPU threads that training would have.
 
     Returns:
@@ -213,7 +215,7 @@ def inspect(
     require_at_least("near", near, 0.0)
     if content_distance is not None:
         require_positive("content_distance", content_distance)
-    if configs is None:
+    if not configs:
         configs = {name: PRESETS[name] for name in EVERYDAY}
     found = survey(path)
     try:
@@ -232,6 +234,7 @@ def inspect(
         content_distance=distance,
         up=up_direction(scene.training_cameras),
         focus=_focus(scene.training_cameras),
+        contraction=contraction_of(scene, next(iter(configs.values()))),
         oddities=(*scene.warnings, *oddities(scene, found, distance, near, looked=False)),
         costs={name: _cost(scene, config, threads) for name, config in configs.items()},
     )
@@ -244,11 +247,8 @@ def _read_once(scene: Scene) -> None:
             pass
 
 
-GUESSED = {
-    False: "; training looks for better ones first, if it has time",
-    True: ": give a distance, or poses with points, as COLMAP writes them",
-}
-"""What may become of guesses, before training and where it has looked in vain."""
+LOOKS_FIRST = "training of 500 steps or more looks for better ones first, but with DVGO's presets"
+"""What may become of guesses where it has not."""
 
 
 def oddities(
@@ -261,7 +261,8 @@ def oddities(
         found: In its files.
         content_distance: That training will use, scene units.
         near: The near plane that training will use, scene units.
-        looked: Whether training has begun: what it has not found by now it will not find.
+        looked: Whether training has looked for content distance and box: what it has not found
+            it will not find.
 
     Returns:
         A sentence each.
@@ -276,7 +277,7 @@ def oddities(
         )
     cameras = scene.training_cameras
     if not found.built_in:  # they look everywhere, and know their true distances
-        odd += _odd_directions(cameras, scene.content_distances is not None, looked)
+        odd += _odd_directions(cameras, scene, content_distance, looked)
     odd += _odd_places(scene)
     nearest = max(near, _distance_to_box(scene))
     if nearest >= content_distance:
@@ -295,9 +296,15 @@ def _focus(cameras: Sequence[Camera]) -> np.ndarray | None:
     return None if focus.guessed else focus.point
 
 
-def _odd_directions(cameras: Sequence[Camera], known: bool, looked: bool) -> list[str]:
+def _odd_directions(
+    cameras: Sequence[Camera], scene: Scene, content_distance: float, looked: bool
+) -> list[str]:
     """Cameras that have nothing in common to look at, unless points tell what they see."""
     odd = []
+    given = content_distance != scene.content_distance
+    guesses = "the box is a guess" if given else "content distance and box are guesses"
+    way_out = "poses with points, as COLMAP writes them"
+    way_out = f"give {way_out}" if given else f"give a distance, or {way_out}"
     aimed = share_aimed_at(cameras, find_focus(cameras).point)
     turned = [_turned(camera) for camera in cameras]
     if _focus(cameras) is None and _focus(turned) is not None:
@@ -305,10 +312,10 @@ def _odd_directions(cameras: Sequence[Camera], known: bool, looked: bool) -> lis
             "all cameras look away from the point that they surround: if they should look at it, "
             "the poses are in OpenCV axes (looking along +z); negate their y and z columns"
         )
-    elif _focus(cameras) is None and not known:
+    elif _focus(cameras) is None and scene.content_distances is None:
         odd.append(
             f"no common focus: {aimed:.0%} of the training cameras have one point in the middle of "
-            f"their image, so content distance and box are guesses{GUESSED[looked]}"
+            f"their image, so {guesses}: {way_out if looked else LOOKS_FIRST}"
         )
     return odd
 
@@ -358,8 +365,8 @@ def _cost(scene: Scene, config: TrainConfig, threads: int) -> Cost:
     samples, occupied = SAMPLES_IN_NDC if in_ndc else SAMPLES_AND_OCCUPIED[scene.kind]
     finer = (voxels / PRESETS["fast"].grid.voxels) ** (1.0 / 3.0) / config.march.step_voxels
     share = (np.arange(1000) + 0.5)[:, None] / 1000  # of the training, evenly
-    nodes = voxels * 0.5 ** (share < config.grid.growth(scene.kind)).sum(axis=1)
-    steps_an_update = 2.0 ** (share >= config.optim.accumulation(scene.kind)).sum(axis=1)
+    nodes = voxels * 0.5 ** (share < config.grid.grows_at(scene.kind)).sum(axis=1)
+    steps_an_update = 2.0 ** (share >= config.optim.accumulates_at(scene.kind)).sum(axis=1)
     step = config.rays_per_step * (SECONDS_PER_RAY + finer * samples * SECONDS_PER_SAMPLE)
     step += float((nodes / steps_an_update).mean()) * occupied * SECONDS_PER_NODE
     step *= config.model.relative_time

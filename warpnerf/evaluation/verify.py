@@ -37,13 +37,15 @@ from warpnerf.training.train import train
 
 SEEDS = range(3)
 
+BESIDES = "all but the frustum"
+
 PATHS: dict[str, Callable[[RayProblem], RayProblem]] = {
     "plain": lambda problem: problem,
     "early stop": stopping_early,
     "free space": partly_free,
     "folded space": folded,
     "frustum": in_frustum,
-    "all but the frustum": lambda problem: stopping_early(partly_free(folded(problem))),
+    BESIDES: lambda problem: stopping_early(partly_free(folded(problem))),
 }
 
 VIEW_DEPENDENT: tuple[Model, ...] = (
@@ -151,7 +153,7 @@ def _checks(workers: Workers) -> Iterator[tuple[str, float, Measure]]:
         measure = partial(_worst, gradient_errors.against_differences, path, exact)
         yield f"float64 adjoint = central differences, {_words(model)}", 1e-7, measure
     measure = partial(_worst, gradient_errors.trained_against_differences, with_losses, exact)
-    yield "float64 adjoint = central differences, distortion and entropy", 1e-7, measure
+    yield "float64 adjoint = central differences, losses of rays", 1e-7, measure
     for name, kernels, tolerance in (("float64", exact, 1e-15), ("float32", plain, 1e-6)):
         measure = partial(gradient_errors.transposed, kernels)
         yield f"{name} <gather x, y> = <x, adjoint of gather y>", tolerance, measure
@@ -195,12 +197,12 @@ def _checks(workers: Workers) -> Iterator[tuple[str, float, Measure]]:
         for path_name, tolerance in (
             ("plain", 1e-5),
             ("frustum", 1e-5),
-            ("all but the frustum", 1e-4),
+            (BESIDES, 1e-4),
         ):
             measure = partial(_worst, gradient_errors.forms, PATHS[path_name], kernels, other)
             yield f"{name}, {path_name}", tolerance, measure
         measure = partial(_worst, gradient_errors.forms, _with_all_losses, kernels, other)
-        yield f"{name}, distortion, entropy and colours of samples", 1e-5, measure
+        yield f"{name}, losses", 1e-5, measure
         for model in VIEW_DEPENDENT:
             measure = partial(
                 _worst, gradient_errors.forms, partial(_with_model, model), kernels, other
@@ -231,11 +233,11 @@ def _with_all_losses(problem: RayProblem) -> RayProblem:
 
 def _words(model: Model) -> str:
     direct = isinstance(model, Features) and not model.residual
-    return f"{model.name}, {'direct' if direct else 'all of these'}"
+    return f"{model.name}, {'direct, ' if direct else ''}{BESIDES}"
 
 
 def _with_model(model: Model, problem: RayProblem) -> RayProblem:
-    return of_model(PATHS["all but the frustum"](problem), model)
+    return of_model(PATHS[BESIDES](problem), model)
 
 
 def _worst(

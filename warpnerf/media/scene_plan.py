@@ -10,9 +10,8 @@ from PIL import Image, ImageDraw
 
 from warpnerf.evaluation.inspection import Inspection
 from warpnerf.media.pictures import FAINT, INK, font
-from warpnerf.presets import PRESETS
 from warpnerf.scenes.camera import Camera
-from warpnerf.scenes.frustum import HELD, contraction_of
+from warpnerf.scenes.frustum import HELD
 from warpnerf.scenes.undistort import directions
 
 _FINE = 2  # pixels are drawn twice as large, then averaged
@@ -89,7 +88,7 @@ def _header(draw: ImageDraw.ImageDraw, inspection: Inspection) -> None:
         (f"{len(scene.splits['train'])} training cameras", _TRAIN),
         (f"{len(scene.splits['test'])} test cameras", _TEST),
         (f"content distance {inspection.content_distance:.4g} in sight", _SIGHT_END),
-        (f"box, {HELD[contraction_of(scene, PRESETS['fast'])]}", _BOX),
+        (f"box, {HELD[inspection.contraction]}", _BOX),
     ]
     if scene.points is not None:
         legend.append(("points", _POINT))

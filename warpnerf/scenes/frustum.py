@@ -118,8 +118,8 @@ def _require_bounds(scene: Scene) -> None:
         if not 0.0 < near < far < math.inf:
             raise InputError(
                 f"{scene.name}: the bounds of {scene.views[index].name} must be two depths above "
-                f"0, the nearer first, not {near:g} and {far:g}; correct them, or use "
-                "--contraction linf, which does not need them."
+                f"0, the nearer first, not {near:g} and {far:g}; correct them, or train "
+                "with --contraction linf, which does not need them."
             )
 
 

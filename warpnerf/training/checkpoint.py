@@ -18,7 +18,7 @@ from warpnerf_kernels.base.types import vector
 
 from warpnerf.checks import InputError
 from warpnerf.config import GROW_AT, Contraction, TrainConfig, config_from_json, config_to_json
-from warpnerf.model.grid import FreeCells, VoxelGrid
+from warpnerf.model.grid import FreeCells, VoxelGrid, grid_size
 from warpnerf.model.interface import Model, n_weights
 from warpnerf.model.models import MODELS, Rgb, decode, to_json
 from warpnerf.model.parameters import parameters_of
@@ -38,8 +38,8 @@ OLDER = {
     "warpnerf-training-5": TRAINING,
     "warpnerf-training-6": TRAINING,
 }
-"""Formats of versions before, which are read. field-1 and training-5 had one model, rgb; up to
-training-6 the resizings of a grid that did not grow were counted as growths."""
+"""Formats of versions before, which are read. field-1 and training-5 had one model, rgb;
+training-6 counted it among the growths that the box of an object had been made tighter."""
 
 
 def save_field(path: str | Path, field: Field) -> None:
@@ -118,9 +118,6 @@ def load_checkpoint(path: str | Path) -> TrainingState:
         raise InputError(
             f"{path} holds a field but no training to go on with; name a checkpoint, or train anew."
         )
-    growths = max(len(training.config.grid.growth(kind)) for kind in GROW_AT)
-    if header.format == TRAINING and not 0 <= training.grown <= growths:
-        refuse(path, f"a grid cannot have grown {training.grown} times")
     if not 0 <= training.updates <= training.progress.step:
         refuse(path, f"{training.updates} updates do not fit {training.progress.step} steps")
     if not 0 <= training.restarted <= training.updates:
@@ -135,10 +132,11 @@ def load_checkpoint(path: str | Path) -> TrainingState:
     field = _field(header, tensors, path, workers)
     if training.config.model != field.model:
         refuse(path, "its configuration names another model than its field")
-    grown = training.grown
-    if header.format != TRAINING:
-        to_come = math.log2(training.config.grid.voxels / math.prod(field.grid.size))
-        grown = min(max(0, growths - round(to_come)), growths)
+    grown, most = training.grown, max(len(training.config.grid.grows_at(kind)) for kind in GROW_AT)
+    if header.format == "warpnerf-training-6":
+        grown = _growths(grown, most, training.config, field.grid)
+    if not 0 <= grown <= most:
+        refuse(path, f"a grid cannot have grown {grown} times")
     return TrainingState(
         config=training.config,
         scene_digest=training.scene_digest,
@@ -152,6 +150,17 @@ def load_checkpoint(path: str | Path) -> TrainingState:
         field=field,
         optimiser=_optimiser(training.config, field, tensors, path, workers),
     )
+
+
+def _growths(counted: int, most: int, config: TrainConfig, grid: VoxelGrid) -> int:
+    """How often a grid has grown, where growths may have been counted with one that was none."""
+    extent = (grid.box_max - grid.box_min) * (1.0 + grid.border)
+    for grown in (counted, counted - 1):
+        if 0 <= grown <= most:
+            nodes = config.grid.nodes_after(grown, "object")
+            if grid_size(extent, nodes) == grid.size:
+                return grown
+    return counted
 
 
 class _Training(msgspec.Struct, frozen=True):

@@ -55,8 +55,8 @@ EMPTY = -200.0
 """Raw density so low that a few hundred updates do not raise it to anything visible."""
 
 NOTHING_SEEN = (
-    "a short training met nothing opaque, or had too little time: content distance and box stay "
-    "what the cameras suggest"
+    "a short training met too little that is opaque, or had too little time: content distance and "
+    "box stay what the cameras suggest"
 )
 
 
@@ -75,7 +75,7 @@ def begin(
         on_progress: Called while the extent is looked for, with the share of that.
 
     Raises:
-        InputError: As for ``Trainer``.
+        InputError: As for ``Trainer``, and for ``find_sight``.
     """
     sight, seconds = None, 0.0
     if resume is None and is_needed(scene, config):
@@ -114,11 +114,12 @@ def find_sight(
         on_progress: Called with each report of these, its fraction that of all of them.
 
     Returns:
-        What they see, None where nothing opaque has grown in fewer than all steps; seconds of
-        training, to which compiling and looking at depths do not count.
+        What they see, None where too few see anything opaque; seconds of training, to which
+        compiling and looking at depths do not count.
 
     Raises:
-        InputError: Nothing opaque has grown in all steps, and no content distance is given.
+        InputError: No ray has met anything opaque after all steps, and no content distance is
+            given.
     """
     limit, given = config.time_limit, config.content_distance
     rounds = ROUNDS if scene.guessed else 1
@@ -135,7 +136,7 @@ def find_sight(
             grow_at=(),
         ),
     )
-    sight, seconds, all_steps = None, 0.0, False
+    sight, seconds, blind = None, 0.0, False
     for done in range(rounds):
 
         def report(progress: Progress, done: int = done) -> None:
@@ -145,14 +146,17 @@ def find_sight(
         trainer = Trainer(scene, small, sight=sight)
         leave_out_near(trainer.grid, scene.training_cameras, config.march.near)
         seconds += trainer.run(report).seconds
-        done_enough = trainer.steps_done >= MIN_COARSE_STEPS
-        all_steps = trainer.steps_done == config.coarse_steps
-        found = sight_of(scene, trainer.field()) if done_enough else None
+        n_steps, field = trainer.steps_done, trainer.field()
         del trainer  # its copy of the photographs, before the next one makes its own
+        if n_steps < MIN_COARSE_STEPS:
+            break
+        points = seen_points(scene, field)
+        found = seen_extent(scene.cameras, points, scene.splits["train"], OUTSIDE)
         if found is None:
+            blind = n_steps == config.coarse_steps and not any(map(len, points))
             break
         sight = found
-    if sight is None and all_steps and isinstance(given, str):
+    if sight is None and blind and isinstance(given, str):
         raise InputError(
             f"{scene.name}: {config.coarse_steps} steps of a short training met nothing opaque, so "
             "photographs and poses show no common surface; look at them with `warpnerf inspect`, "
@@ -186,16 +190,15 @@ def _steps(config: TrainConfig) -> int:
     return min(config.coarse_steps, int(STEPS_SHARE * config.steps))
 
 
-def sight_of(scene: Scene, field: Field) -> SeenExtent | None:
-    """What the cameras of a scene see of a field of it; None where too few see anything."""
+def seen_points(scene: Scene, field: Field) -> list[np.ndarray]:
+    """Where rays of each camera of a scene meet something opaque: [n, 3] scene units each."""
     origins, directions, owner = _some_rays(scene.views, field)
     distance = median_distances(field, origins, directions)
     points = origins + distance[:, None] * directions
-    seen = [
+    return [
         points[(owner == index) & np.isfinite(distance)].astype(np.float64)
         for index in range(len(scene.views))
     ]
-    return seen_extent(scene.cameras, seen, scene.splits["train"], OUTSIDE)
 
 
 def median_distances(field: Field, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:

@@ -54,8 +54,9 @@ def train(
         The field, and how training ended.
 
     Raises:
-        InputError: The device is missing, the grid would not fit the memory, or scene or
-            configuration are not those of the training to be resumed.
+        InputError: The device is missing, the grid would not fit the memory, a short training for
+            the content distance met nothing opaque, or scene or configuration are not those of the
+            training to be resumed.
         FloatingPointError: The loss, or a value in the grid, is no longer a finite number.
     """
     if config is None:

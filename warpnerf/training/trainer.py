@@ -106,8 +106,8 @@ class Trainer:
             config.seed,
             self.workers,
         )
-        self._accumulation = config.optim.accumulation(scene.kind)
-        self._grow_at = config.grid.growth(scene.kind)
+        self._accumulation = config.optim.accumulates_at(scene.kind)
+        self._grow_at = config.grid.grows_at(scene.kind)
         self._grown = 0
         self._updates = 0
         self._restarted = 0
@@ -116,7 +116,7 @@ class Trainer:
         self.grid = extent.first_grid(
             scene,
             config,
-            self._voxels(0),
+            config.grid.nodes_after(0, scene.kind),
             self.workers.device,
             None if resume is None else resume.field.grid,
         )
@@ -340,10 +340,6 @@ class Trainer:
             in_ndc=self.grid.frustum is not None,
         )
 
-    def _voxels(self, grown: int) -> int:
-        """Nodes after the grid has grown so often."""
-        return max(8, self.config.grid.voxels >> len(self._grow_at) - grown)
-
     def parameters(self) -> tuple[Parameter, ...]:
         """What is trained."""
         return parameters_of(self.model, self.grid, self.weights, self.config.optim)
@@ -386,8 +382,8 @@ class Trainer:
         grown = sum(fraction >= at for at in self._grow_at)
         if grown == self._grown or self.steps_done < FIRST_LOOK:
             return
-        box = self._tight_box()
-        size = grid_size((box[1] - box[0]) * (1.0 + self.grid.border), self._voxels(grown))
+        box, nodes = self._tight_box(), self.config.grid.nodes_after(grown, self.scene.kind)
+        size = grid_size((box[1] - box[0]) * (1.0 + self.grid.border), nodes)
         del self._pass  # gives its memory back before more is asked for
         grid = self.grid.resized(self.workers, size, box)
         for parameter in self.parameters():
