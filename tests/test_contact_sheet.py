@@ -144,7 +144,7 @@ def shown_by_a_run(folder: Path, scene: Scene, split: str, monkeypatch: Any) -> 
         calls.append(arguments)
         return contact_sheet(*arguments)
 
-    monkeypatch.setattr("warpnerf.training.run.contact_sheet", noted)
+    monkeypatch.setattr("warpnerf.training.run_pictures.contact_sheet", noted)
     result = run.evaluate(tiny_field(), scene, split)
     ((rows, title, near, far),) = calls
     pixels = np.asarray(Image.open(folder / "test.png"))
