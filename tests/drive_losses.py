@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import reference
 import torch
-from drive import Float64, Problem, oracle
 from drive_models import head_of, problem_of
+from expected import oracle
+from problems import Float64, Problem
 from test_kernel_render import early, masked
 from torch import Tensor
 

@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 import reference
 import torch
-from drive import RGB, Float64, Kernels, Problem, in_float32, make_problem, oracle
+from drive import Kernels
+from expected import RGB, oracle
+from problems import Float64, Problem, in_float32, make_problem
 from torch import Tensor
 
 from warpnerf.model.interface import Model, n_weights

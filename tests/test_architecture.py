@@ -89,7 +89,8 @@ LPIPS = ROOT / "warpnerf" / "evaluation" / "lpips.py"
 
 @pytest.mark.parametrize("path", PACKAGE, ids=module_of)
 def test_the_package_knows_no_tests_and_torch_in_two_places_only(path: Path) -> None:
-    assert not roots(path) & {"tests", "benchmarks", "reference", "drive"}
+    of_tests = {"tests", "benchmarks", "reference", "drive", "problems", "expected"}
+    assert not roots(path) & of_tests
     assert "torch" not in roots(path) or TORCH in path.parents or path == LPIPS
     if TORCH not in path.parents:
         outside = set(imports(path, inside_functions=False))

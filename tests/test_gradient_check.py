@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from drive import Kernels, Problem, assert_close
+from drive import Kernels
+from expected import assert_close
+from problems import Problem
 
 from warpnerf.evaluation.gradient_check import (
     DENSITY_SHIFT,

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import reference
 import torch
-from drive import N_SEEDS, Kernels
+from drive import Kernels
+from problems import N_SEEDS
 
 from warpnerf.rendering.render import JACOBIANS, SCALINGS
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from drive import Kernels, Problem, assert_close, unbounded
+from drive import Kernels
 from drive_models import (
     DEFERRED,
     DEFERRED_LARGE,
@@ -21,6 +21,8 @@ from drive_models import (
     oracle_train_both,
     problem_of,
 )
+from expected import assert_close
+from problems import Problem, unbounded
 from test_kernel_render import early, masked
 
 from warpnerf.model.interface import Model

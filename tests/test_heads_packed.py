@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from drive import Problem, assert_close
 from drive_models import (
     DEFERRED,
     DEFERRED_LARGE,
@@ -22,6 +21,8 @@ from drive_models import (
     problem_of,
     smooth_problems,
 )
+from expected import assert_close
+from problems import Problem
 from test_kernel_render import early, masked
 
 from warpnerf.model.interface import Model

@@ -9,7 +9,8 @@ import pytest
 import reference
 import torch
 import warp as wp
-from drive import Kernels, unit
+from drive import Kernels
+from problems import unit
 from warpnerf_kernels.base import precision
 
 N_COEFFICIENTS = 48

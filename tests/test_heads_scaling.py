@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from drive import Float64, Kernels, Problem, assert_close
+from drive import Kernels
 from drive_models import (
     DEFERRED,
     FEATURES,
@@ -16,6 +16,8 @@ from drive_models import (
     oracle_train_both,
     problem_of,
 )
+from expected import assert_close
+from problems import Float64, Problem
 
 from warpnerf.model.interface import Model
 from warpnerf.rendering.render import Steps

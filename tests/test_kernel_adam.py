@@ -7,7 +7,8 @@ import pytest
 import reference
 import torch
 import warp as wp
-from drive import N_SEEDS, Kernels
+from drive import Kernels
+from problems import N_SEEDS
 from warpnerf_kernels.base.tiles import STRETCH, TILE
 
 RATES = np.array([0.2, 0.1, 0.05, 0.02, 0.3, 0.01, 0.15, 0.07])

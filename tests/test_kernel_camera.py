@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import reference
 import warp as wp
-from drive import Kernels, unit
+from drive import Kernels
+from problems import unit
 
 from warpnerf.runtime.parallel import NODES
 from warpnerf.scenes.fisheye import largest_angle

@@ -7,17 +7,9 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from drive import (
-    N_SEEDS,
-    Kernels,
-    Problem,
-    assert_close,
-    in_frustum,
-    make_problem,
-    oracle,
-    oracle_gradient,
-    unbounded,
-)
+from drive import Kernels
+from expected import assert_close, oracle, oracle_gradient
+from problems import N_SEEDS, Problem, in_frustum, make_problem, unbounded
 
 from warpnerf.model.grid import CONTRACTIONS
 from warpnerf.rendering.render import Steps

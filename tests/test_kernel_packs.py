@@ -4,17 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from drive import (
-    N_SEEDS,
-    Kernels,
-    Problem,
-    assert_close,
-    in_float32,
-    make_problem,
-    oracle_gradient,
-    oracle_train,
-    unbounded,
-)
+from drive import Kernels
+from expected import assert_close, oracle_gradient, oracle_train
+from problems import N_SEEDS, Problem, in_float32, make_problem, unbounded
 from test_kernel_render import VARIANTS, Path, each_path, early, jittered, masked, rng_of
 
 from warpnerf.rendering.render import Steps

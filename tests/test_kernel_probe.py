@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import reference
 import torch
-from drive import N_SEEDS, assert_close
+from expected import assert_close
+from problems import N_SEEDS
 
 from warpnerf.evaluation.gradient_check import ProblemKernels, make_problem, of_model
 from warpnerf.model.interface import Model

@@ -7,20 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from drive import (
-    N_SEEDS,
-    Kernels,
-    Problem,
-    assert_close,
-    directional_differences,
-    in_frustum,
-    make_problem,
-    oracle,
-    oracle_gradient,
-    oracle_train,
-    unbounded,
-    unit,
-)
+from drive import Kernels
+from expected import assert_close, directional_differences, oracle, oracle_gradient, oracle_train
+from problems import N_SEEDS, Problem, in_frustum, make_problem, unbounded, unit
 
 from warpnerf.rendering.render import Steps
 

@@ -7,7 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 import warp as wp
-from drive import Kernels, Problem, assert_close, make_problem, unbounded
+from drive import Kernels
+from expected import assert_close
+from problems import Problem, make_problem, unbounded
 from test_kernel_render import early, masked
 from warpnerf_kernels.base.simd import LANES
 from warpnerf_kernels.base.tiles import TILE

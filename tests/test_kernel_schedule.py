@@ -10,7 +10,9 @@ import pytest
 import reference
 import torch
 import warp as wp
-from drive import Kernels, Problem, assert_close, unbounded, unit
+from drive import Kernels
+from expected import assert_close
+from problems import Problem, unbounded, unit
 from test_kernel_scatter import leave_chunks_unwritten, most_steps, of, problem
 from warpnerf_kernels.base.types import vec3
 from warpnerf_kernels.cpu import schedule

@@ -7,7 +7,9 @@ import pytest
 import reference
 import torch
 import warp as wp
-from drive import N_SEEDS, Kernels, assert_close, directional_differences
+from drive import Kernels
+from expected import assert_close, directional_differences
+from problems import N_SEEDS
 from warpnerf_kernels.base.tiles import STRETCH, TILE
 
 each_n_floats = pytest.mark.parametrize("n_floats", [4, 16])

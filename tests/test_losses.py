@@ -5,9 +5,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from drive import N_SEEDS, Kernels, assert_close, in_float32
+from drive import Kernels
 from drive_losses import LOSSES, oracle_minimised, problem_with
 from drive_models import FEATURES, SH, Stale, name_of, problem_of
+from expected import assert_close
+from problems import N_SEEDS, in_float32
 from seams.ray_losses import WithLosses
 from test_heads_scaling import at_one_distance
 from tiny_scenes import ring, tiny_scene

@@ -8,7 +8,8 @@ import pytest
 import reference
 import torch
 import warp as wp
-from drive import Kernels, assert_close
+from drive import Kernels
+from expected import assert_close
 from warpnerf_kernels.base.tiles import STRETCH, TILE
 
 from warpnerf.model.grid import grid_struct

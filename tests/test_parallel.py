@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 import warp as wp
-from drive import Kernels, make_problem
+from drive import Kernels
+from problems import make_problem
 from warpnerf_kernels.cpu.barrier import wait_for_all
 
 from warpnerf.checks import InputError

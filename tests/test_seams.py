@@ -8,17 +8,9 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from drive import (
-    N_SEEDS,
-    Kernels,
-    Problem,
-    assert_close,
-    directional_differences,
-    in_float32,
-    in_frustum,
-    make_problem,
-    oracle,
-)
+from drive import Kernels
+from expected import assert_close, directional_differences, oracle
+from problems import N_SEEDS, Problem, in_float32, in_frustum, make_problem
 from seams.constant_features import OneColour
 from seams.given_distances import AtDistances
 from seams.grey import Grey

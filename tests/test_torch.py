@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import reference
 import torch
-from drive import N_SEEDS, Problem, assert_close, make_problem, oracle, oracle_gradient, unit
+from expected import assert_close, oracle, oracle_gradient
+from problems import N_SEEDS, Problem, make_problem, unit
 from torch import Tensor
 
 from warpnerf.checks import InputError

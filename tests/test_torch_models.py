@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from drive import Problem, assert_close, in_float32
 from drive_models import (
     DEFERRED,
     DEFERRED_SMALL,
@@ -21,6 +20,8 @@ from drive_models import (
     problem_of,
     smooth_problems,
 )
+from expected import assert_close
+from problems import Problem, in_float32
 from torch import Tensor
 
 from warpnerf.checks import InputError
