@@ -120,9 +120,11 @@ def write_old(path: Path, header: dict[str, Any], **tensors: np.ndarray) -> None
 
 def test_files_of_the_version_before_hold_the_model_rgb(tmp_path: Path) -> None:
     """Values and moments, bit for bit, and a configuration to go on with."""
-    # All rays were drawn then, steps outside the box were shorter, and all grids grew late.
+    # All rays were drawn then, thinner matter was not free space, steps outside the box were
+    # shorter, and all grids grew late.
     then = {
         "skip_empty_rays": False,
+        "alpha_min": 0.01,
         "march": MarchConfig(growth=0.02),
         "grid": GridConfig(grow_at=(0.3, 0.4, 0.5, 0.6)),
     }
