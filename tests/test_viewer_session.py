@@ -167,11 +167,37 @@ def test_one_stands_in_a_camera_without_seeing_it(field: Field) -> None:
         serving(field, scene=tiny_scene(poses)) as session,
         PageClient(session.server.get_port()) as page,
     ):
-        page.wait(lambda page: len(page.messages.get("CameraFrustumMessage", [])) == 4)
         page.look_from(opencv(poses[1]))
-        page.wait(lambda _: any(p._hidden.keys() == {"/cameras/0001"} for p in pages(session)))
+        page.wait(lambda page: page.pictures)
+        assert "CameraFrustumMessage" not in page.messages  # they come after a fine picture
+        page.wait(lambda page: len(page.messages.get("CameraFrustumMessage", [])) == 4)
+        page.wait(lambda page: visible(page) == {0, 2, 3})
         page.look_from(opencv(ring(5, radius=1.0)[2]))
-        page.wait(lambda page: page.messages.get("RemoveSceneNodeMessage"))
+        page.wait(lambda page: visible(page) == {0, 1, 2, 3})
+
+
+def test_each_page_gets_its_cameras_after_its_picture(field: Field) -> None:
+    """Whoever comes later, too, and with the photographs that have been made small before."""
+    poses = ring(5)
+    with serving(field, scene=tiny_scene(poses)) as session:
+        for _ in range(2):
+            with PageClient(session.server.get_port()) as page:
+                page.look_from(opencv(poses[1]))
+                page.wait(lambda page: page.pictures)
+                assert "CameraFrustumMessage" not in page.messages
+                page.wait(lambda page: visible(page) == {0, 2, 3})
+                session._stage.show_cameras(visible=False, scale=2.0)
+                page.wait(lambda page: visible(page) == set())
+                session._stage.show_cameras(visible=True, scale=1.0)
+        page.wait(lambda _: not session._stage._pages)
+    assert len(session._stage._photographs) == 4
+
+
+def visible(page: PageClient) -> set[int]:
+    """The cameras that a page shows, by what it was told last."""
+    told = page.messages.get("SetSceneNodeVisibilityMessage", [])
+    shown = {message["name"]: message["visible"] for message in told}
+    return {int(n.rpartition("/")[2]) for n, v in shown.items() if v and n.startswith("/cameras/")}
 
 
 def trained(config: TrainConfig, looking: bool) -> tuple[bytes, int]:

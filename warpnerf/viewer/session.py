@@ -25,7 +25,7 @@ from warpnerf.viewer.painter import Painter, Settings, Subject
 from warpnerf.viewer.panel import Panel
 from warpnerf.viewer.screen import Pace, Screen
 from warpnerf.viewer.server import address, close_server, open_server
-from warpnerf.viewer.stage import Stage
+from warpnerf.viewer.stage import Pyramids, Stage
 from warpnerf.viewer.viewpoint import FirstLook, Viewpoint, World, first_look
 
 WARM_UP_SIZE = (120, 90)
@@ -37,24 +37,16 @@ MAX_DEBT = 0.5
 class Page:
     """A client of the server, and what it sees."""
 
-    def __init__(self, client: Any, screen: Screen) -> None:
+    def __init__(self, client: Any, screen: Screen, pyramids: Pyramids) -> None:
         """Say in its panel what it is shown."""
         self.client = client
         self.screen = screen
+        self.pyramids = pyramids
         self.viewpoint: Viewpoint | None = None
         self.turn = 0  # when it was last drawn for, counted over all pages
-        self._hidden: dict[str, Any] = {}
         self._said = client.gui.add_markdown("", order=-1.0)
         self._pictures = 0
         self._since = monotonic()
-
-    def hide(self, names: Sequence[str]) -> None:
-        """Hide these things of the scene from this page, and no others."""
-        for name in self._hidden.keys() - set(names):
-            self._hidden.pop(name).remove()
-        for name in set(names) - self._hidden.keys():
-            # For this page, it takes the place of what the others see.
-            self._hidden[name] = self.client.scene.add_frame(name, show_axes=False, visible=False)
 
     def say(self) -> None:
         """Say how large the pictures are, and while the camera moves how many come in a second."""
@@ -234,11 +226,13 @@ class Session:
             client.scene.set_background_image(picture, format="jpeg", jpeg_quality=quality)
             page.say()
             client.flush()
+            if page.screen.fine:
+                page.pyramids.put_up()
 
-        page = Page(client, Screen(self._painter, show, self._coarse, self._fine))
+        screen = Screen(self._painter, show, self._coarse, self._fine)
+        page = Page(client, screen, self._stage.welcome(client))
         self._pages[client.client_id] = page
         self._look(page)
-        self._stage.show_photographs()
 
         # A coroutine, which the server's own thread runs: a pool of threads could mix up the order.
         @client.camera.on_update
@@ -253,11 +247,12 @@ class Session:
         if viewpoint is not None:
             page.viewpoint = viewpoint
             page.screen.look_from(viewpoint)
-            page.hide(self._stage.in_the_way(viewpoint.c2w[:, 3]))
+            page.pyramids.stand_at(viewpoint.c2w[:, 3])
             self._news.set()
 
     async def _forget(self, client: Any) -> None:
         self._pages.pop(client.client_id, None)
+        self._stage.forget(client.client_id)
 
 
 def _before(box: tuple[np.ndarray, np.ndarray]) -> FirstLook:

@@ -1,10 +1,13 @@
-"""What stands in the scene besides the field: training cameras, the crop box, the recorded path."""
+"""What stands in the scene besides the field: training cameras, the crop box, the recorded path.
+
+Box and path are the same for all pages. Cameras are put up for each page when it has its first fine
+picture: two hundred pyramids would keep a browser from that for a second.
+"""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,52 +37,69 @@ EDGES = [(a, b) for a in range(8) for b in range(a) if np.abs(CORNERS[a] - CORNE
 
 
 class Stage:
-    """Things in viser's scene, seen by all pages."""
+    """Things in viser's scene."""
 
     def __init__(self, server: viser.ViserServer, world: World, scene: Scene | None) -> None:
-        """Put the training cameras up."""
+        """Nothing is there yet."""
         self._server = server
         self._world = world
-        self._handles: list[Any] = []
-        self._views: list[View] = []  # whose photographs are not shown yet
-        self.length = 0.0
-        """Of a camera's pyramid, viser's units."""
-        self._scale = 1.0
+        self._pages: dict[int, Pyramids] = {}
         self.cameras: dict[str, Camera] = {}
         """Those that are shown, by the names of their photographs."""
+        self.pyramids: list[dict[str, Any]] = []
+        """How each is drawn: what viser is told of it."""
+        self._views: list[View] = []
+        self._photographs: dict[int, np.ndarray | None] = {}
+        self._places = np.empty((0, 3))
+        self.length = 0.0
+        """Of a pyramid, viser's units."""
+        self.visible = True
+        """Whether cameras are shown."""
+        self.scale = 1.0
+        """How many times as large as at first."""
         if scene is not None:
             views = [scene.views[index] for index in scene.splits["train"]]
             self._views = [views[index] for index in spread(len(views), MAX_CAMERAS)]
             self.cameras = {view.name: _straight(view.camera) for view in self._views}
-            self.length = _length(list(self.cameras.values()), world)
-            for camera in self.cameras.values():
-                self._add_camera(camera)
-        self._places = np.array([camera.position for camera in self.cameras.values()]).reshape(
-            -1, 3
-        )
+            cameras = list(self.cameras.values())
+            self._places = np.array([camera.position for camera in cameras])
+            self.length = _length(cameras, world)
+            self.pyramids = [_pyramid(camera, world, self.length) for camera in cameras]
 
-    def show_photographs(self) -> None:
-        """Begin to put the photographs on their cameras, in a thread of its own; once."""
-        views, self._views = self._views, []
-        if views:
-            threading.Thread(target=self._put_up, args=(views,), daemon=True).start()
+    def welcome(self, client: viser.ClientHandle) -> Pyramids:
+        """The cameras for a new page."""
+        self._pages[client.client_id] = pyramids = Pyramids(client, self)
+        return pyramids
 
-    def _put_up(self, views: Sequence[View]) -> None:
-        for handle, view in zip(self._handles, views, strict=True):
-            with suppress(InputError):  # its file is no longer what it was
-                handle.image = thumbnail(view.image)
+    def forget(self, client_id: int) -> None:
+        """A page has gone."""
+        pyramids = self._pages.pop(client_id, None)
+        if pyramids is not None:
+            pyramids.gone = True
 
     def show_cameras(self, visible: bool, scale: float) -> None:
         """Show or hide them, so many times as large as at first."""
-        self._scale = scale
-        for handle, camera in zip(self._handles, self.cameras.values(), strict=True):
-            handle.visible = visible
-            handle.scale = scale * _frustum_scale(camera, self.length)
+        self.visible, self.scale = visible, scale
+        for pyramids in list(self._pages.values()):
+            pyramids.refresh()
 
-    def in_the_way(self, position: np.ndarray) -> list[str]:
-        """Names of the cameras that one stands in at a position [3], scene units."""
+    def in_the_way(self, position: np.ndarray) -> frozenset[int]:
+        """The cameras that one stands in at a position [3], scene units."""
         apart = self._world.scale * np.linalg.norm(self._places - position, axis=1)
-        return [self._handles[i].name for i in np.flatnonzero(apart < self._scale * self.length)]
+        return frozenset(np.flatnonzero(apart < self.scale * self.length).tolist())
+
+    def photograph(self, index: int) -> np.ndarray | None:
+        """What a camera took, small; [h, w, 3] uint8, None: its file is not what it was."""
+        if index not in self._photographs:
+            try:
+                self._photographs[index] = thumbnail(self._views[index].image)
+            except InputError:
+                self._photographs[index] = None
+        return self._photographs[index]
+
+    def clicked(self, index: int, client: viser.ClientHandle) -> None:
+        """Have a page stand in a camera."""
+        stand_in(client, self.cameras[self._views[index].name], self._world)
 
     def show_box(self, crop: tuple[Sequence[float], Sequence[float]] | None) -> None:
         """Show a box by its corners, scene units; None: none."""
@@ -107,24 +127,56 @@ class Stage:
             thickness_units="screen",
         )
 
-    def _add_camera(self, camera: Camera) -> None:
-        wxyz, position = self._world.pose(camera.c2w)
-        handle = self._server.scene.add_camera_frustum(
-            f"/cameras/{len(self._handles):04}",
-            fov=2.0 * float(np.arctan(0.5 * camera.height / camera.fy)),
-            aspect=camera.width / camera.fx * camera.fy / camera.height,
-            scale=_frustum_scale(camera, self.length),
-            thickness=1.5,
-            thickness_units="screen",
-            color=CAMERA_COLOUR,
-            format="jpeg",
-            wxyz=wxyz,
-            position=position,
-            cast_shadow=False,
-            receive_shadow=False,
-        )
-        handle.on_click(_to_stand_in(camera, self._world))
-        self._handles.append(handle)
+
+class Pyramids:
+    """The training cameras of one page. Any thread may call."""
+
+    def __init__(self, client: viser.ClientHandle, stage: Stage) -> None:
+        """None is shown before ``put_up``."""
+        self._client = client
+        self._stage = stage
+        self._handles: list[Any] = []
+        self._inside: frozenset[int] = frozenset()
+        self._begun = False
+        self._lock = threading.Lock()
+        self.gone = False
+        """Whether the page has been closed."""
+
+    def put_up(self) -> None:
+        """Begin to put them up, then their photographs, in a thread; once."""
+        if self._stage.pyramids and not self._begun:
+            self._begun = True
+            threading.Thread(target=self._put_up, daemon=True).start()
+
+    def _put_up(self) -> None:
+        with self._lock, self._client.atomic():
+            for index, looks in enumerate(self._stage.pyramids):
+                handle = self._client.scene.add_camera_frustum(
+                    f"/cameras/{index:04}", **looks, visible=False
+                )
+                handle.on_click(lambda event, index=index: self._stage.clicked(index, event.client))
+                self._handles.append(handle)
+        self.refresh()
+        for index, handle in enumerate(self._handles):
+            photograph = self._stage.photograph(index)
+            if self.gone:
+                break
+            if photograph is not None:
+                handle.image = photograph
+
+    def stand_at(self, position: np.ndarray) -> None:
+        """Hide those that one stands in at a position [3], scene units, and no others."""
+        inside = self._stage.in_the_way(position)
+        if inside != self._inside:
+            self._inside = inside
+            self.refresh()
+
+    def refresh(self) -> None:
+        """Show what is to be shown, as large as it is to be."""
+        with self._lock:
+            for index, handle in enumerate(self._handles):
+                handle.visible = self._stage.visible and index not in self._inside
+                handle.scale = self._stage.scale * self._stage.pyramids[index]["scale"]
 
 
 def stand_in(client: viser.ClientHandle, camera: Camera, world: World) -> None:
@@ -153,11 +205,22 @@ def _straight(camera: Camera) -> Camera:
     return path_lens([camera], None) if camera.fisheye else camera
 
 
-def _to_stand_in(camera: Camera, world: World) -> Callable[[Any], None]:
-    def clicked(event: Any) -> None:
-        stand_in(event.client, camera, world)
-
-    return clicked
+def _pyramid(camera: Camera, world: World, length: float) -> dict[str, Any]:
+    """What viser is told of a camera's pyramid, of a length in its units."""
+    wxyz, position = world.pose(camera.c2w)
+    return {
+        "fov": 2.0 * float(np.arctan(0.5 * camera.height / camera.fy)),
+        "aspect": camera.width / camera.fx * camera.fy / camera.height,
+        "scale": _frustum_scale(camera, length),
+        "thickness": 1.5,
+        "thickness_units": "screen",
+        "color": CAMERA_COLOUR,
+        "format": "jpeg",
+        "wxyz": wxyz,
+        "position": position,
+        "cast_shadow": False,
+        "receive_shadow": False,
+    }
 
 
 def _frustum_scale(camera: Camera, length: float) -> float:
