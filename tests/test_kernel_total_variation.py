@@ -11,6 +11,7 @@ from drive import Kernels
 from expected import assert_close, directional_differences
 from problems import N_SEEDS
 from warpnerf_kernels.base.tiles import STRETCH, TILE
+from warpnerf_kernels.optim.total_variation import RUN
 
 each_n_floats = pytest.mark.parametrize("n_floats", [4, 16])
 
@@ -44,6 +45,7 @@ def adj_variation(
     already: Any,
     span: int = STRETCH,
     flags: Any = None,
+    strength: Any = None,
 ) -> Any:
     """A gradient [n_nodes, n_floats], with that of total variation added."""
     n, n_floats = values[..., 0].size, values.shape[3]
@@ -52,6 +54,8 @@ def adj_variation(
     gradient.values.assign(already)
     if flags is not None:
         gradient.touched.assign(np.asarray(flags, np.uint8))
+    if strength is None:
+        strength = np.ones(-(-n // RUN))
     kernels.workers.launch(
         kernels.module("optim.total_variation").total_variation_backward_kernel(n_floats),
         -(-n // span),
@@ -59,6 +63,7 @@ def adj_variation(
         kernels.array(values.reshape(n, n_floats), node),
         wp.vec3i(*values.shape[:3]),
         node(*weight),
+        kernels.array(strength),
         gradient,
     )
     return gradient.values.numpy()
@@ -109,6 +114,25 @@ def test_only_nodes_with_a_gradient_are_touched(n_floats: int, kernels64: Kernel
         after = adj_variation(kernels64, values, weight, already)
         assert not after[~touched].any()
         assert_close((after - already)[touched], full[touched], 1e-12)
+
+
+@each_n_floats
+def test_each_run_of_nodes_has_its_strength(
+    n_floats: int, kernels64: Kernels, kernels32: Kernels
+) -> None:
+    """In whole tiles and node by node; a pair across two runs pulls each node by its own."""
+    rng = np.random.default_rng(7)
+    values, weight = rng.normal(size=(5, 6, 21, n_floats)), rng.uniform(0.5, 2.0, size=n_floats)
+    n = values[..., 0].size
+    ones, strength = np.ones((n, n_floats)), rng.uniform(0.1, 1.0, size=-(-n // RUN))
+    raw = torch.tensor(values, requires_grad=True)
+    reference.total_variation(raw, torch.tensor(weight)).backward()
+    assert raw.grad is not None
+    expected = raw.grad.numpy().reshape(n, n_floats) * np.repeat(strength, RUN)[:n, None]
+    for kernels, tolerance in ((kernels64, 1e-12), (kernels32, 1e-6)):
+        for span in (1, TILE, STRETCH):
+            after = adj_variation(kernels, values, weight, ones, span, strength=strength)
+            assert_close(after - 1.0, expected, tolerance)
 
 
 def test_float32_against_float64(kernels64: Kernels, device: str) -> None:

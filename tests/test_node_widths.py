@@ -11,6 +11,7 @@ import warp as wp
 from drive import Kernels
 from expected import assert_close
 from warpnerf_kernels.base.tiles import STRETCH, TILE
+from warpnerf_kernels.optim.total_variation import RUN
 
 from warpnerf.model.grid import grid_struct
 from warpnerf.rendering.adjoint import gradient_struct, n_tiles
@@ -88,6 +89,7 @@ def test_total_variation(n_floats: int, kernels32: Kernels, kernels64: Kernels) 
                 kernels.array(values.reshape(-1, n_floats), node),
                 wp.vec3i(*SIZE),
                 node(*weight),
+                kernels.array(np.ones(-(-N_NODES // RUN))),
                 gradient,
             )
             after = gradient.values.numpy()

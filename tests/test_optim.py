@@ -8,6 +8,7 @@ import reference
 import torch
 import warp as wp
 from warpnerf_kernels.base.types import vector
+from warpnerf_kernels.optim.total_variation import RUN
 
 from warpnerf.config import OptimConfig
 from warpnerf.model.grid import VoxelGrid
@@ -19,6 +20,11 @@ from warpnerf.runtime.parallel import Workers
 from warpnerf.training.optim import adam_step, add_total_variation, first_states
 
 RGB, DEFERRED = Rgb(), Deferred(specular=2, width=16, hidden_layers=1)
+
+
+def ones(n_nodes: int) -> wp.array:
+    """Strengths of runs of nodes."""
+    return wp.full(-(-n_nodes // RUN), 1.0, dtype=wp.float32)
 
 
 def grid_of(values: Any, workers: Workers) -> VoxelGrid:
@@ -66,7 +72,9 @@ def test_total_variation_counts_the_face_between_two_nodes(
     gradients.touched.fill_(1)
     config = OptimConfig(tv_density=3e-2, tv_rgb=2e-3, tv_every=every)
     parameters = learned(model, grid, config, workers)
-    add_total_variation(parameters, grid, gradients, coarser * 60, n_steps, config, workers)
+    add_total_variation(
+        parameters, grid, gradients, coarser * 60, n_steps, ones(60), config, workers
+    )
     added = gradients.values.numpy().reshape(shape) - 1.0
     assert raw.grad is not None
     np.testing.assert_allclose(added, raw.grad.numpy(), atol=1e-6)
@@ -78,7 +86,7 @@ def test_updates_pack_their_launches_once(
     model: Model, monkeypatch: pytest.MonkeyPatch, on_cpu: None
 ) -> None:
     """And take what they are given: another grid, another rate."""
-    workers = Workers("cpu", 2)
+    workers, strength = Workers("cpu", 2), ones(1000)
     config = OptimConfig(tv_density=1e-2, tv_rgb=1e-3)
     rng = np.random.default_rng(0)
     raw = rng.normal(size=(2, 10, 10, 10, model.n_floats)).astype(np.float32)
@@ -95,7 +103,9 @@ def test_updates_pack_their_launches_once(
             gradients.values.fill_(1.0)
             gradients.weights.fill_(1.0)
             gradients.touched.fill_(1)
-            add_total_variation(parameters, grids[which], gradients, 1000, 1, config, workers)
+            add_total_variation(
+                parameters, grids[which], gradients, 1000, 1, strength, config, workers
+            )
             found.append(gradients.values.numpy().copy())
             adam_step(parameters, states[which], gradients, number, factor, config, workers)
             found.append(np.concatenate([p.values.numpy().ravel() for p in parameters]))

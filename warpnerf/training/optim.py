@@ -159,6 +159,7 @@ def add_total_variation(
     gradients: Gradients,
     n_asked: int,
     n_steps: int,
+    strength: wp.array,
     config: OptimConfig,
     workers: Workers,
 ) -> None:
@@ -173,6 +174,7 @@ def add_total_variation(
         gradients: Added to.
         n_asked: Nodes of the grid that the weights are meant for: the final one, or about so.
         n_steps: Training steps that the gradients are the sum of.
+        strength: Of nodes in a row, see ``warpnerf.training.smoothing``.
         config: How many updates this one gradient stands for.
         workers: Where to work.
     """
@@ -188,6 +190,7 @@ def add_total_variation(
             parameter.values,
             wp.vec3i(*grid.size),
             vector(n_floats)(*(factor * parameter.variation)),
+            strength,
             gradients.struct,
             chunk=NODES // tiles.STRETCH,
             cache=gradients.launches,

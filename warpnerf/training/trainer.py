@@ -25,6 +25,7 @@ from warpnerf.scenes.points import SeenExtent, seen_scene
 from warpnerf.scenes.scene import Scene
 from warpnerf.training import extent
 from warpnerf.training.optim import RULES, adam_step, add_total_variation, first_states
+from warpnerf.training.smoothing import strengths
 from warpnerf.training.state import Progress, TrainingState, scene_digest
 from warpnerf.training.warmup import training_kernels
 
@@ -133,7 +134,7 @@ class Trainer:
         self._seen = 1.0
         if resume is not None and self.free.size != (1, 1, 1):
             self._keep_to_what_is_seen()
-        self._pass = self._training_pass()
+        self._pass, self._strength = self._training_pass(), self._smoothing()
 
     def run(
         self,
@@ -205,6 +206,7 @@ class Trainer:
                 self._pass.gradients,
                 config.grid.voxels,
                 n_steps,
+                self._strength,
                 config.optim,
                 self.workers,
             )
@@ -397,8 +399,17 @@ class Trainer:
             self.optimiser = first_states(self.parameters(), self.workers)
             self._restarted = self._updates
         give_back()
-        self._pass = self._training_pass()
+        self._pass, self._strength = self._training_pass(), self._smoothing()
         self._look_for_free_space()
+
+    def _smoothing(self) -> wp.array:
+        return strengths(
+            self.grid,
+            self.scene.training_cameras,
+            self._content_distances,
+            self.config.scaling,
+            self.workers,
+        )
 
     def _tight_box(self) -> tuple[np.ndarray, np.ndarray]:
         """The box around what is occupied, where space is bounded; never larger than before."""

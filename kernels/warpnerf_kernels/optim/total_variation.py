@@ -28,6 +28,9 @@ from ..fields.interp import flat_index
 
 wp.set_module_options({"enable_backward": False})
 
+RUN = 16
+"""Nodes in a row that share a strength: a whole number of tiles."""
+
 
 @wp.func
 def huber(difference: real) -> real:
@@ -113,7 +116,7 @@ auto load = [&](const scalar* from) -> numbers {
 };
 const size_t stride_y = FLOATS * (size_t)size.c[2], stride_x = stride_y * size.c[1];
 numbers weights;
-for (int n = 0; n < AT_ONCE; ++n) weights[n] = weight.c[n % FLOATS];
+for (int n = 0; n < AT_ONCE; ++n) weights[n] = strength * weight.c[n % FLOATS];
 const numbers one = 1;
 for (int begin = 0; begin < FLOATS * TILE; begin += AT_ONCE) {
     const scalar* here = (const scalar*)(values.data + node) + begin;
@@ -148,7 +151,12 @@ def tile_variation(n_floats: int) -> wp.Function:
 
     @wp.func_native(TILE_VARIATION)
     def add_tile_variation(
-        values: wp.array(dtype=Node), size: wp.vec3i, weight: Node, node: int, gradient: Gradient
+        values: wp.array(dtype=Node),
+        size: wp.vec3i,
+        weight: Node,
+        strength: real,
+        node: int,
+        gradient: Gradient,
     ) -> bool:
         """Add to a tile, from its first node, where gradient is not 0.
 
@@ -194,6 +202,7 @@ def total_variation_backward_kernel(n_floats: int) -> wp.Kernel:
         values: wp.array(dtype=Node),  # [X * Y * Z]
         size: wp.vec3i,
         weight: Node,  # per channel
+        strength: wp.array(dtype=real),  # [ceil(X * Y * Z / RUN)] of nodes in a row, times weight
         gradient: Gradient,  # added to where not 0
     ):
         """d TV / d x at the nodes that already have a gradient; unseen ones stay as they are."""
@@ -225,12 +234,15 @@ def total_variation_backward_kernel(n_floats: int) -> wp.Kernel:
                 inside = inside and node >= stride_x and node < n_nodes - stride_x
                 inside = inside and j > 0 and j + 1 < size[1]
                 inside = inside and k > 0 and k + wp.static(TILE) < size[2]
-                if inside and add_tile_variation(values, size, weight, node, gradient):
+                here = strength[node // wp.static(RUN)]
+                if inside and add_tile_variation(values, size, weight, here, node, gradient):
                     end_node = first_node
+                weights = here * weight
                 for n in range(first_node, end_node):
                     adj = gradient.values[n]
                     if not (adj == Node()):
-                        gradient.values[n] = adj + adj_node_variation(values, size, weight, n, j, k)
+                        more = adj_node_variation(values, size, weights, n, j, k)
+                        gradient.values[n] = adj + more
                     k += 1  # on to the next node, without dividing for each
                     if k == size[2]:
                         k = 0

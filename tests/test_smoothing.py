@@ -1,0 +1,86 @@
+"""Total variation is as strong as the gradients are that it is held against."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from tiny_scenes import ring, tiny_scene
+from warpnerf_kernels.optim.total_variation import RUN
+
+from warpnerf.config import Scaling, TrainConfig
+from warpnerf.model.nodes import points_of
+from warpnerf.scenes.camera import Camera
+from warpnerf.training.smoothing import root_mean_square_scale
+from warpnerf.training.trainer import Trainer
+
+CONFIG = TrainConfig(steps=10, rays_per_step=64, threads=1, model="rgb")
+
+
+def one_by_one(
+    point: Any, cameras: list[Camera], distances: list[float], scaling: Scaling
+) -> float:
+    """By the definition: rays go with 1 / distance^2, and each has its scale."""
+    rays, squares = [], []
+    for camera, distance in zip(cameras, distances, strict=True):
+        away = point - camera.position
+        t = math.sqrt(float(away @ away))
+        corner = math.hypot(
+            max(camera.cx, camera.width - camera.cx) / camera.fx,
+            max(camera.cy, camera.height - camera.cy) / camera.fy,
+        )
+        if not camera.fisheye and math.acos(away @ camera.forward / t) >= math.atan(corner):
+            continue
+        scale = (t / distance) ** 2
+        rays.append(1.0 / t**2)
+        squares.append(rays[-1] * (min(1.0, scale) if scaling == "clamped" else scale) ** 2)
+    return math.sqrt(sum(squares) / sum(rays)) if rays else 1.0
+
+
+@pytest.mark.parametrize("scaling", ["clamped", "quadratic"])
+@pytest.mark.parametrize("lens", ["straight", "fisheye"])
+def test_the_scales_of_the_rays_at_points(scaling: Scaling, lens: str) -> None:
+    cameras = list(tiny_scene(ring(5), fisheye=lens == "fisheye").cameras)
+    distances = [1.0, 2.0, 3.0, 4.0, 5.0]
+    points = np.random.default_rng(0).uniform(-6.0, 6.0, size=(200, 3))
+    found = root_mean_square_scale(points, cameras, distances, scaling)
+    expected = [one_by_one(point, cameras, distances, scaling) for point in points]
+    np.testing.assert_allclose(found, expected, rtol=1e-4)
+    assert found.max() > 2.0 if scaling == "quadratic" else found.min() < 0.95
+    unseen = sum(value == 1.0 for value in expected)
+    assert lens == "fisheye" or unseen > 10
+
+
+def test_places_at_infinity_and_nowhere_are_far() -> None:
+    cameras = list(tiny_scene(ring(5)).cameras)
+    points = np.array([[np.inf, 0, 0], [0, -np.inf, 0], [np.nan, np.nan, np.nan]])
+    assert np.isfinite(root_mean_square_scale(points, cameras, [1.0] * 5, "quadratic")).all()
+    np.testing.assert_allclose(root_mean_square_scale(points, cameras, [1.0] * 5, "clamped"), 1.0)
+
+
+def test_a_training_smooths_less_what_is_near() -> None:
+    scene = tiny_scene(ring(5))
+    without = Trainer(scene, replace(CONFIG, scaling="none"))._strength.numpy()
+    assert (without == 1.0).all()
+    trainer = Trainer(scene, replace(CONFIG, content_distance=20.0))
+    strength, grid = trainer._strength.numpy(), trainer.grid
+    n_nodes = math.prod(grid.size)
+    assert len(strength) == len(without) == -(-n_nodes // RUN)
+    middles = np.minimum(np.arange(len(strength)) * RUN + RUN // 2, n_nodes - 1)
+    places = points_of(grid, np.stack(np.unravel_index(middles, grid.size), axis=1))
+    cameras = list(scene.training_cameras)
+    for run in (0, 7, len(strength) // 2, len(strength) - 1):
+        expected = one_by_one(places[run], cameras, [20.0] * len(cameras), "clamped")
+        assert strength[run] == pytest.approx(expected, rel=1e-4)
+    assert strength.min() < 0.1
+
+
+def test_a_grown_grid_gets_strengths_of_its_own() -> None:
+    config = replace(CONFIG, steps=600, grid=replace(CONFIG.grid, voxels=4096, grow_at=(0.6,)))
+    trainer = Trainer(tiny_scene(ring(5)), config)
+    before = len(trainer._strength)
+    trainer.run()
+    assert len(trainer._strength) == -(-math.prod(trainer.grid.size) // RUN) > before

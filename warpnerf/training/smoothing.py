@@ -1,0 +1,92 @@
+"""How strong total variation is at each place: it must not win where gradients are scaled down.
+
+The distance scaling makes the photometric gradient of what is near to cameras smaller, and with it
+the root of the second moment, by which Adam divides. Total variation of one weight for all nodes
+would so smooth the more, the nearer a node lies. It is multiplied by what that root is: the root of
+the mean square of the scales of a node's rays, of which each camera sends 1 / distance^2.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+from warpnerf_kernels.optim.total_variation import RUN
+
+from warpnerf.config import Scaling
+from warpnerf.model.grid import VoxelGrid
+from warpnerf.model.nodes import points_of
+from warpnerf.runtime.parallel import Workers
+from warpnerf.scenes.camera import Camera
+
+AT_ONCE = 1 << 10
+"""Runs of nodes that are looked at together."""
+CLOSEST, FARTHEST = 1e-3, 1e3
+"""Content distances: places nearer or farther than these count as being there."""
+
+
+def strengths(
+    grid: VoxelGrid,
+    cameras: Sequence[Camera],
+    distances: Sequence[float],
+    scaling: Scaling,
+    workers: Workers,
+) -> wp.array:
+    """Of each run of nodes, by the place of its middle one.
+
+    Args:
+        grid: Whose nodes.
+        cameras: The training cameras.
+        distances: Content distance of each, scene units.
+        scaling: Of gradients.
+        workers: Where the result shall live.
+
+    Returns:
+        [ceil(n_nodes / RUN)] root of the mean square of the scales of the rays that a run gets;
+        1 where no camera looks.
+    """
+    n_nodes = math.prod(grid.size)
+    strength = np.ones(-(-n_nodes // RUN), np.float32)
+    if scaling != "none":
+        middles = np.minimum(np.arange(len(strength)) * RUN + RUN // 2, n_nodes - 1)
+        for begin in range(0, len(middles), AT_ONCE):
+            nodes = np.stack(np.unravel_index(middles[begin : begin + AT_ONCE], grid.size), axis=1)
+            strength[begin : begin + AT_ONCE] = root_mean_square_scale(
+                points_of(grid, nodes), cameras, distances, scaling
+            )
+    return wp.array(strength, dtype=wp.float32, device=workers.device)
+
+
+def root_mean_square_scale(
+    points: np.ndarray, cameras: Sequence[Camera], distances: Sequence[float], scaling: Scaling
+) -> np.ndarray:
+    """The root of the mean square of the scales of rays at points [n, 3], scene units; [n]."""
+    positions = np.array([camera.position for camera in cameras])
+    forward = np.array([camera.forward for camera in cameras])
+    edge = np.array([_cosine(camera) for camera in cameras], np.float32)
+    unit = np.asarray(distances, np.float64)
+    # Squared distances and depths by products of matrices.
+    far = FARTHEST * unit.max()
+    points = np.clip(np.nan_to_num(points, nan=far), -far, far)
+    middle = positions.mean(axis=0)
+    p, c = points - middle, positions - middle
+    square = np.sum(p * p, axis=1)[:, None] + np.sum(c * c, axis=1) - 2.0 * (p @ c.T)
+    square = (square / np.square(unit)).astype(np.float32)
+    depth = ((p @ forward.T - np.sum(c * forward, axis=1)) / unit).astype(np.float32)
+    square = np.clip(square, CLOSEST**2, FARTHEST**2)
+    rays = (depth > edge * np.sqrt(square)) / (square * np.square(unit).astype(np.float32))
+    scale = np.minimum(square, 1.0) if scaling == "clamped" else square
+    total = rays.sum(axis=1)
+    mean = (rays * scale * scale).sum(axis=1) / np.maximum(total, 1e-30)
+    return np.where(total > 0.0, np.sqrt(mean), 1.0)
+
+
+def _cosine(camera: Camera) -> float:
+    """Of the angle from a camera's axis to the corners of its picture; -1: it sees all around."""
+    if camera.fisheye:
+        return -1.0
+    x = max(camera.cx, camera.width - camera.cx) / camera.fx
+    y = max(camera.cy, camera.height - camera.cy) / camera.fy
+    return 1.0 / math.sqrt(1.0 + x * x + y * y)
