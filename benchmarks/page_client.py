@@ -99,5 +99,6 @@ class PageClient:
                     self.pictures.append(np.asarray(picture))
                     self.times.append(time.monotonic())
                 else:
+                    message["n_pictures"] = len(self.pictures)  # that came before
                     self.messages.setdefault(message["type"], []).append(message)
             self._news.notify_all()

@@ -11,7 +11,7 @@ import pytest
 from tiny_scenes import ring, tiny_scene
 from warpnerf_kernels.optim.total_variation import RUN
 
-from warpnerf.config import Scaling, TrainConfig
+from warpnerf.config import TrainConfig
 from warpnerf.model.nodes import points_of
 from warpnerf.scenes.camera import Camera
 from warpnerf.training.smoothing import root_mean_square_scale
@@ -21,7 +21,7 @@ CONFIG = TrainConfig(steps=10, rays_per_step=64, threads=1, model="rgb")
 
 
 def one_by_one(
-    point: Any, cameras: list[Camera], distances: list[float], scaling: Scaling
+    point: Any, cameras: list[Camera], distances: list[float], near: float = 0.0
 ) -> float:
     """By the definition: rays go with 1 / distance^2, and each has its scale."""
     rays, squares = [], []
@@ -32,24 +32,29 @@ def one_by_one(
             max(camera.cx, camera.width - camera.cx) / camera.fx,
             max(camera.cy, camera.height - camera.cy) / camera.fy,
         )
+        if t < near:
+            continue
         if not camera.fisheye and math.acos(away @ camera.forward / t) >= math.atan(corner):
             continue
-        scale = (t / distance) ** 2
+        scale = min(1.0, (t / distance) ** 2)
         rays.append(1.0 / t**2)
-        squares.append(rays[-1] * (min(1.0, scale) if scaling == "clamped" else scale) ** 2)
+        squares.append(rays[-1] * scale**2)
     return math.sqrt(sum(squares) / sum(rays)) if rays else 1.0
 
 
-@pytest.mark.parametrize("scaling", ["clamped", "quadratic"])
+@pytest.mark.parametrize("near", [0.0, 3.0])
+@pytest.mark.parametrize("away", [0.0, 1e6])
 @pytest.mark.parametrize("lens", ["straight", "fisheye"])
-def test_the_scales_of_the_rays_at_points(scaling: Scaling, lens: str) -> None:
+def test_the_scales_of_the_rays_at_points(lens: str, away: float, near: float) -> None:
+    """Also of a scene in the coordinates of a country."""
     cameras = list(tiny_scene(ring(5), fisheye=lens == "fisheye").cameras)
     distances = [1.0, 2.0, 3.0, 4.0, 5.0]
     points = np.random.default_rng(0).uniform(-6.0, 6.0, size=(200, 3))
-    found = root_mean_square_scale(points, cameras, distances, scaling)
-    expected = [one_by_one(point, cameras, distances, scaling) for point in points]
+    expected = [one_by_one(point, cameras, distances, near) for point in points]
+    moved = [replace(camera, c2w=camera.c2w + [[0, 0, 0, away]] * 3) for camera in cameras]
+    found = root_mean_square_scale(points + away, moved, distances, near)
     np.testing.assert_allclose(found, expected, rtol=1e-4)
-    assert found.max() > 2.0 if scaling == "quadratic" else found.min() < 0.95
+    assert found.min() < 0.95 and found.max() == 1.0
     unseen = sum(value == 1.0 for value in expected)
     assert lens == "fisheye" or unseen > 10
 
@@ -57,14 +62,15 @@ def test_the_scales_of_the_rays_at_points(scaling: Scaling, lens: str) -> None:
 def test_places_at_infinity_and_nowhere_are_far() -> None:
     cameras = list(tiny_scene(ring(5)).cameras)
     points = np.array([[np.inf, 0, 0], [0, -np.inf, 0], [np.nan, np.nan, np.nan]])
-    assert np.isfinite(root_mean_square_scale(points, cameras, [1.0] * 5, "quadratic")).all()
-    np.testing.assert_allclose(root_mean_square_scale(points, cameras, [1.0] * 5, "clamped"), 1.0)
+    np.testing.assert_allclose(root_mean_square_scale(points, cameras, [1.0] * 5), 1.0)
 
 
 def test_a_training_smooths_less_what_is_near() -> None:
     scene = tiny_scene(ring(5))
     without = Trainer(scene, replace(CONFIG, scaling="none"))._strength.numpy()
     assert (without == 1.0).all()
+    none = replace(CONFIG.optim, tv_density=0.0, tv_rgb=0.0)  # then it would be for nothing
+    assert (Trainer(scene, replace(CONFIG, optim=none))._strength.numpy() == 1.0).all()
     trainer = Trainer(scene, replace(CONFIG, content_distance=20.0))
     strength, grid = trainer._strength.numpy(), trainer.grid
     n_nodes = math.prod(grid.size)
@@ -73,7 +79,7 @@ def test_a_training_smooths_less_what_is_near() -> None:
     places = points_of(grid, np.stack(np.unravel_index(middles, grid.size), axis=1))
     cameras = list(scene.training_cameras)
     for run in (0, 7, len(strength) // 2, len(strength) - 1):
-        expected = one_by_one(places[run], cameras, [20.0] * len(cameras), "clamped")
+        expected = one_by_one(places[run], cameras, [20.0] * len(cameras))
         assert strength[run] == pytest.approx(expected, rel=1e-4)
     assert strength.min() < 0.1
 

@@ -168,8 +168,6 @@ def test_one_stands_in_a_camera_without_seeing_it(field: Field) -> None:
         PageClient(session.server.get_port()) as page,
     ):
         page.look_from(opencv(poses[1]))
-        page.wait(lambda page: page.pictures)
-        assert "CameraFrustumMessage" not in page.messages  # they come after a fine picture
         page.wait(lambda page: len(page.messages.get("CameraFrustumMessage", [])) == 4)
         page.wait(lambda page: visible(page) == {0, 2, 3})
         page.look_from(opencv(ring(5, radius=1.0)[2]))
@@ -183,9 +181,9 @@ def test_each_page_gets_its_cameras_after_its_picture(field: Field) -> None:
         for _ in range(2):
             with PageClient(session.server.get_port()) as page:
                 page.look_from(opencv(poses[1]))
-                page.wait(lambda page: page.pictures)
-                assert "CameraFrustumMessage" not in page.messages
                 page.wait(lambda page: visible(page) == {0, 2, 3})
+                first = page.messages["CameraFrustumMessage"][0]
+                assert first["n_pictures"] >= 2  # a coarse one and a fine one
                 session._stage.show_cameras(visible=False, scale=2.0)
                 page.wait(lambda page: visible(page) == set())
                 session._stage.show_cameras(visible=True, scale=1.0)

@@ -23,6 +23,8 @@ from warpnerf.scenes.camera import Camera
 
 AT_ONCE = 1 << 10
 """Runs of nodes that are looked at together."""
+MAX_CAMERAS = 200
+"""That are looked at; of more, so many evenly spread ones."""
 CLOSEST, FARTHEST = 1e-3, 1e3
 """Content distances: places nearer or farther than these count as being there."""
 
@@ -31,6 +33,7 @@ def strengths(
     grid: VoxelGrid,
     cameras: Sequence[Camera],
     distances: Sequence[float],
+    near: float,
     scaling: Scaling,
     workers: Workers,
 ) -> wp.array:
@@ -40,46 +43,49 @@ def strengths(
         grid: Whose nodes.
         cameras: The training cameras.
         distances: Content distance of each, scene units.
-        scaling: Of gradients.
+        near: Distance before which rays have no samples, scene units.
+        scaling: Of gradients. A Jacobian that it takes into account is left out here.
         workers: Where the result shall live.
 
     Returns:
-        [ceil(n_nodes / RUN)] root of the mean square of the scales of the rays that a run gets;
-        1 where no camera looks.
+        [ceil(n_nodes / RUN)] root of the mean square of the scales of the rays that a run gets, of
+        which those above 1 count as 1; 1 where no camera looks.
     """
     n_nodes = math.prod(grid.size)
     strength = np.ones(-(-n_nodes // RUN), np.float32)
     if scaling != "none":
+        some = np.unique(np.linspace(0, len(cameras) - 1, MAX_CAMERAS).astype(int))
+        cameras, distances = [cameras[i] for i in some], [distances[i] for i in some]
         middles = np.minimum(np.arange(len(strength)) * RUN + RUN // 2, n_nodes - 1)
         for begin in range(0, len(middles), AT_ONCE):
             nodes = np.stack(np.unravel_index(middles[begin : begin + AT_ONCE], grid.size), axis=1)
             strength[begin : begin + AT_ONCE] = root_mean_square_scale(
-                points_of(grid, nodes), cameras, distances, scaling
+                points_of(grid, nodes), cameras, distances, near
             )
     return wp.array(strength, dtype=wp.float32, device=workers.device)
 
 
 def root_mean_square_scale(
-    points: np.ndarray, cameras: Sequence[Camera], distances: Sequence[float], scaling: Scaling
+    points: np.ndarray, cameras: Sequence[Camera], distances: Sequence[float], near: float = 0.0
 ) -> np.ndarray:
     """The root of the mean square of the scales of rays at points [n, 3], scene units; [n]."""
     positions = np.array([camera.position for camera in cameras])
     forward = np.array([camera.forward for camera in cameras])
     edge = np.array([_cosine(camera) for camera in cameras], np.float32)
     unit = np.asarray(distances, np.float64)
-    # Squared distances and depths by products of matrices.
     far = FARTHEST * unit.max()
-    points = np.clip(np.nan_to_num(points, nan=far), -far, far)
     middle = positions.mean(axis=0)
-    p, c = points - middle, positions - middle
+    p = np.clip(np.nan_to_num(points - middle, nan=far), -far, far)
+    c = positions - middle
+    # Squared distances and depths by products of matrices.
     square = np.sum(p * p, axis=1)[:, None] + np.sum(c * c, axis=1) - 2.0 * (p @ c.T)
-    square = (square / np.square(unit)).astype(np.float32)
+    sampled = square >= near * near
+    square = np.clip((square / np.square(unit)).astype(np.float32), CLOSEST**2, FARTHEST**2)
     depth = ((p @ forward.T - np.sum(c * forward, axis=1)) / unit).astype(np.float32)
-    square = np.clip(square, CLOSEST**2, FARTHEST**2)
-    rays = (depth > edge * np.sqrt(square)) / (square * np.square(unit).astype(np.float32))
-    scale = np.minimum(square, 1.0) if scaling == "clamped" else square
+    seen = sampled & (depth > edge * np.sqrt(square))
+    rays = seen / (square * np.square(unit).astype(np.float32))
     total = rays.sum(axis=1)
-    mean = (rays * scale * scale).sum(axis=1) / np.maximum(total, 1e-30)
+    mean = (rays * np.square(np.minimum(square, 1.0))).sum(axis=1) / np.maximum(total, 1e-30)
     return np.where(total > 0.0, np.sqrt(mean), 1.0)
 
 

@@ -407,7 +407,8 @@ class Trainer:
             self.grid,
             self.scene.training_cameras,
             self._content_distances,
-            self.config.scaling,
+            self.config.march.near,
+            self.config.scaling if any(np.any(p.variation) for p in self.parameters()) else "none",
             self.workers,
         )
 

@@ -136,7 +136,7 @@ class Pyramids:
         self._client = client
         self._stage = stage
         self._handles: list[Any] = []
-        self._inside: frozenset[int] = frozenset()
+        self._position = np.full(3, np.inf)
         self._begun = False
         self._lock = threading.Lock()
         self.gone = False
@@ -150,6 +150,8 @@ class Pyramids:
 
     def _put_up(self) -> None:
         with self._lock, self._client.atomic():
+            if self.gone:
+                return
             for index, looks in enumerate(self._stage.pyramids):
                 handle = self._client.scene.add_camera_frustum(
                     f"/cameras/{index:04}", **looks, visible=False
@@ -158,24 +160,23 @@ class Pyramids:
                 self._handles.append(handle)
         self.refresh()
         for index, handle in enumerate(self._handles):
-            photograph = self._stage.photograph(index)
             if self.gone:
                 break
+            photograph = self._stage.photograph(index)
             if photograph is not None:
                 handle.image = photograph
 
     def stand_at(self, position: np.ndarray) -> None:
         """Hide those that one stands in at a position [3], scene units, and no others."""
-        inside = self._stage.in_the_way(position)
-        if inside != self._inside:
-            self._inside = inside
-            self.refresh()
+        self._position = position
+        self.refresh()
 
     def refresh(self) -> None:
         """Show what is to be shown, as large as it is to be."""
+        inside = self._stage.in_the_way(self._position)
         with self._lock:
             for index, handle in enumerate(self._handles):
-                handle.visible = self._stage.visible and index not in self._inside
+                handle.visible = self._stage.visible and index not in inside
                 handle.scale = self._stage.scale * self._stage.pyramids[index]["scale"]
 
 
