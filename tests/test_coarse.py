@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import signal
 import subprocess
 import sys
@@ -117,7 +118,11 @@ def test_it_is_for_scenes_without_points() -> None:
     known = replace(scene, content_distances=np.ones(6))
     assert is_needed(scene, SHORT) and is_needed(replace(scene, guessed=False), SHORT)
     assert not is_needed(known, SHORT)
-    assert not is_needed(replace(scene, unbounded=False), SHORT)
+    bounded = replace(scene, unbounded=False)
+    assert not bounded.has_alpha and is_needed(bounded, SHORT)
+    rgba = np.full((*bounded.views[0].image.shape[:2], 4), 255, np.uint8)
+    object_views = [replace(view, image=rgba) for view in bounded.views]
+    assert not is_needed(replace(bounded, views=object_views), SHORT)
     assert not is_needed(scene, replace(SHORT, grid=replace(SHORT.grid, contraction="none")))
     assert not is_needed(scene, replace(SHORT, coarse_steps=0))
     assert not is_needed(scene, replace(SHORT, steps=400))  # too short to see anything first
@@ -161,6 +166,8 @@ def test_training_takes_what_was_found(monkeypatch: pytest.MonkeyPatch) -> None:
     assert given.content_distance == 7.0 and given.grid.box_max.tolist() == [4.0, 4.0, 4.0]
     own = begin(scene, replace(SHORT, content_distance="per-camera"))
     assert own.state().content_distances == [1.0, 2.0, 3.0, 4.0, 5.0]  # the sixth is for testing
+    auto = trainer.state().content_distances
+    assert auto == pytest.approx([math.sqrt(2.5 * own) for own in range(1, 6)], rel=1e-12)
 
 
 def test_the_box_around_a_common_focus_stays(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -279,7 +280,40 @@ def test_training_takes_each_camera_s_distance() -> None:
         assert not np.array_equal(values[0], other)
     alike = replace(scene, content_distances=np.full(6, scene.content_distance))
     one = train(alike, PER_CAMERA).field.grid.values.numpy()
-    np.testing.assert_array_equal(one, values[1])
+    as_number = replace(PER_CAMERA, content_distance=scene.content_distance)
+    np.testing.assert_array_equal(one, train(alike, as_number).field.grid.values.numpy())
+
+
+def test_by_default_they_lie_between_each_camera_s_and_the_scene_s() -> None:
+    scene = replace(scene_of_two_distances(), content_distance=3.0)
+    auto = replace(PER_CAMERA, content_distance="auto")
+    trainer = Trainer(scene, auto)
+    assert trainer.content_distance == 3.0
+    expected = [math.sqrt(6.0)] * 3 + [math.sqrt(18.0)] * 2  # the sixth is for testing
+    assert trainer.content_distances == pytest.approx(expected, rel=1e-12)
+    trainer.run()
+    between = replace(scene, content_distances=np.sqrt(3.0 * scene.content_distances))
+    own = train(between, PER_CAMERA).field.grid.values.numpy()
+    np.testing.assert_array_equal(trainer.grid.values.numpy(), own)
+    unknown = Trainer(replace(scene, content_distances=None), auto)
+    assert unknown.content_distances == [3.0] * 5
+
+
+def test_a_checkpoint_of_one_distance_for_all_goes_on_so(tmp_path: Path) -> None:
+    """As they were written when auto was the scene's for each camera."""
+    scene = scene_of_two_distances()
+    auto = replace(PER_CAMERA, content_distance="auto")
+    half = Trainer(scene, replace(PER_CAMERA, content_distance=scene.content_distance))
+    half.run(stop=lambda: half.steps_done >= 10)
+    state = half.state()
+    assert state.content_distances is None
+    file = tmp_path / "state.safetensors"
+    save_checkpoint(file, replace(state, config=replace(state.config, content_distance="auto")))
+    resumed = Trainer(scene, auto, load_checkpoint(file))
+    assert resumed.content_distances == [scene.content_distance] * 5
+    save_checkpoint(file, replace(state, content_distances=[1.0] * 5))
+    with pytest.raises(InputError, match="content distances of cameras are not as its config"):
+        load_checkpoint(file)
 
 
 def test_a_resumed_training_keeps_them(tmp_path: Path) -> None:

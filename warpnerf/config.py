@@ -307,8 +307,9 @@ class TrainConfig:
     """How a sample's gradient depends on its distance t from the camera: none, quadratic
     (t / D)^2, or clamped min(1, (t / D)^2), the method of "Floaters No More"."""
     content_distance: float | Literal["auto", "per-camera"] = "auto"
-    """D: where gradients reach full strength, scene units; auto: the scene's estimate; per-camera:
-    of each camera's rays the distance of what it sees, as points or short trainings tell."""
+    """D: where gradients reach full strength, scene units; per-camera: for each camera's rays the
+    distance of what it sees, as points or short trainings tell; auto: where that is known, the
+    geometric mean of it and of the scene's estimate, else that."""
     coarse_steps: int = 200
     """Steps, at most, of a short training on a small grid that finds the content distance of
     photographs without points; two of them find the box as well where cameras look at no common

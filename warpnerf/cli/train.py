@@ -86,7 +86,8 @@ def train_command(
         time_limit: Seconds of training; the schedule is fitted to them.
         scaling: How a sample's gradient depends on its distance from the camera.
         content_distance: Where gradients reach full strength, in the scene's units; per-camera: of
-            each camera what it sees, as points or a short training tell.
+            each camera what it sees, as points or a short training tell; by default between that
+            and the scene's.
         voxels: Nodes of the final grid, in all; memory goes with their number.
         contraction: How space outside the box is held: none, folded in (linf, l2), or ndc, for
             cameras that look the same way; by default ndc for LLFF's captures that do, else folded
@@ -221,7 +222,7 @@ def _begin_alone(
     else:
         trainer = begin(scene, config)
     trained = trainer.scene  # in which box and distance may be other ones
-    _describe(trained, trainer.content_distance, config)
+    _describe(trained, trainer)
     distance, near = trainer.content_distance, config.march.near
     for oddity in oddities(trained, survey(source), distance, near, looked=looks):
         print(f"  odd: {oddity}", flush=True)
@@ -266,7 +267,7 @@ def _go_on(
     scene = _read(moved or begun.scene, begun.downscale, masks or begun.masks, images, run.folder)
     trainer = Trainer(scene, config, state)
     scene = begun.as_trained(scene)
-    _describe(scene, trainer.content_distance, config)
+    _describe(scene, trainer)
     for note in notes:
         print(f"  note: {note}")
     for name in ("device", "threads"):
@@ -342,7 +343,7 @@ def _train(run: Run, scene: Scene, trainer: Trainer, session: Session | None) ->
     return 0
 
 
-def _describe(scene: Scene, content_distance: float, config: TrainConfig) -> None:
+def _describe(scene: Scene, trainer: Trainer) -> None:
     """What was understood of a scene."""
     from warpnerf.scenes.frustum import HELD, contraction_of
 
@@ -350,14 +351,18 @@ def _describe(scene: Scene, content_distance: float, config: TrainConfig) -> Non
     sizes = sorted({(c.width, c.height) for c in scene.cameras})
     shown = ", ".join(f"{w} x {h}" for w, h in sizes[:3]) + (", ..." if len(sizes) > 3 else "")
     extent = scene.box_max - scene.box_min
-    outside = HELD[contraction_of(scene, config)]
+    outside = HELD[contraction_of(scene, trainer.config)]
     print(f"{scene.name}: {train} training and {test} test views, {shown} pixels")
     for warning in scene.warnings:
         print(f"  warning: {warning}")
     for note in scene.notes:
         print(f"  note: {note}")
-    each = ", of each camera its own" if config.content_distance == "per-camera" else ""
-    print(f"  content distance {content_distance:.4g} scene units{each}, scaling {config.scaling}")
+    least, most = min(trainer.content_distances), max(trainer.content_distances)
+    by_camera = f" ({least:.3g} to {most:.3g} by camera)" if least < most else ""
+    print(
+        f"  content distance {trainer.content_distance:.4g} scene units{by_camera}, "
+        f"scaling {trainer.config.scaling}"
+    )
     print(
         f"  box {extent[0]:.4g} x {extent[1]:.4g} x {extent[2]:.4g} scene units, {outside}",
         flush=True,

@@ -126,7 +126,8 @@ def load_checkpoint(path: str | Path) -> TrainingState:
             f"an optimiser of {training.updates} updates cannot begin anew after "
             f"{training.restarted}",
         )
-    if (training.config.content_distance == "per-camera") != bool(training.content_distances):
+    chosen, each = training.config.content_distance, bool(training.content_distances)
+    if each != (chosen == "per-camera") and not (each and chosen == "auto"):
         refuse(path, "content distances of cameras are not as its configuration says")
     workers = Workers("cpu")
     field = _field(header, tensors, path, workers)

@@ -90,14 +90,16 @@ def is_needed(scene: Scene, config: TrainConfig) -> bool:
     """Whether a better extent than the scene's is of use, and training long enough to look for it.
 
     Args:
-        scene: Where it brings points, these tell.
+        scene: Where it brings points, these tell; cameras of an object with alpha stand around it.
         config: Where it says a content distance, only a box that is a guess is looked for.
     """
     if scene.content_distances is not None or _steps(config) < MIN_COARSE_STEPS:
         return False
     if config.content_distance == "per-camera":
         return True
-    folded = scene.unbounded and config.grid.contraction != "none"
+    if not scene.unbounded:
+        return config.content_distance == "auto" and not scene.has_alpha
+    folded = config.grid.contraction != "none"
     return folded and (scene.guessed or config.content_distance == "auto")
 
 
@@ -156,6 +158,9 @@ def find_sight(
             blind = n_steps == config.coarse_steps and not any(map(len, points))
             break
         sight = found
+        if isinstance(given, str):
+            # cameras' own distances are too rough yet for the next round to follow
+            small = replace(small, content_distance=found.content_distance)
     if sight is None and blind and isinstance(given, str):
         raise InputError(
             f"{scene.name}: {config.coarse_steps} steps of a short training met nothing opaque, so "

@@ -64,7 +64,15 @@ def first_grid(
 
 
 def content_distances(scene: Scene, config: TrainConfig) -> tuple[float, list[float]]:
-    """The content distance of the scene, and those of its training views."""
+    """The content distance of the scene, and those of its training views.
+
+    With auto, a camera's is the geometric mean of the scene's and of its own where that is known: a
+    camera close to a wall shall draw the wall, but in a scene of few photographs a camera's own is
+    the distance of its floaters as often as not.
+
+    Raises:
+        InputError: It is per-camera, and the scene has none.
+    """
     chosen, train = config.content_distance, scene.splits["train"]
     if chosen == "per-camera":
         if scene.content_distances is None and not config.coarse_steps:
@@ -80,6 +88,9 @@ def content_distances(scene: Scene, config: TrainConfig) -> tuple[float, list[fl
                 "them, and photographs that show something opaque; use auto, or a number."
             )
         return scene.content_distance, [float(scene.content_distances[i]) for i in train]
+    if chosen == "auto" and scene.content_distances is not None:
+        one, each = scene.content_distance, scene.content_distances[list(train)]
+        return one, [math.sqrt(one * float(own)) for own in each]
     one = scene.content_distance if chosen == "auto" else float(chosen)
     return one, [one] * len(train)
 

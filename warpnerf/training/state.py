@@ -57,7 +57,7 @@ class TrainingState:
     content_distance: float
     """The one in use, scene units."""
     content_distances: list[float] | None = None
-    """Those of the training views where each has its own, scene units; else None."""
+    """Those of the training views, scene units; None: they are all that one."""
     reach: float
     """From the outermost camera to the farthest corner of the first box, scene units."""
     grown: int

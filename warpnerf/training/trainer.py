@@ -92,7 +92,8 @@ class Trainer:
                     f"the training to be resumed has {len(distances)} content distances, but "
                     f"{scene.name} {n_views} training views; train anew."
                 )
-        self._content_distances = distances
+        self.content_distances = distances
+        """Of the training views, scene units."""
         views = [scene.views[i] for i in scene.splits["train"]]
         behind = config.background
         if behind == "auto":
@@ -271,7 +272,7 @@ class Trainer:
             scene_digest=self._scene_digest,
             content_distance=self.content_distance,
             content_distances=(
-                self._content_distances if self.config.content_distance == "per-camera" else None
+                self.content_distances if isinstance(self.config.content_distance, str) else None
             ),
             reach=self._reach,
             grown=self._grown,
@@ -406,7 +407,7 @@ class Trainer:
         return strengths(
             self.grid,
             self.scene.training_cameras,
-            self._content_distances,
+            self.content_distances,
             self.config.march.near,
             self.config.scaling if any(np.any(p.variation) for p in self.parameters()) else "none",
             self.workers,
