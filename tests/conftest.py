@@ -1,6 +1,7 @@
-"""Where the kernels under test run, and where their compiled code is kept."""
+"""Where the kernels under test run, where compiled code is kept, and that Ctrl-C is heard."""
 
 import os
+import signal
 
 import pytest
 import warp as wp
@@ -9,6 +10,10 @@ from watched_command import assert_trained, make_scene, train
 
 if "WARP_CACHE_PATH" in os.environ:
     wp.config.kernel_cache_dir = os.environ["WARP_CACHE_PATH"]
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    # As shells have it for what runs in the background; commands under test would inherit it.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

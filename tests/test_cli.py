@@ -383,7 +383,8 @@ sys.exit(main.main(sys.argv[2:]))
 @pytest.mark.parametrize(("bad_step", "kept"), [(1, "Nothing was saved"), (4, "Step 3 is saved")])
 def test_what_is_not_finite_ends_the_run(tmp_path: Path, bad_step: int, kept: str) -> None:
     folder = tmp_path / "run"
-    arguments = ("train", *TINY, "--output", str(folder), "--checkpoint-every", "1e-9")
+    only = ("--content-distance", "2")  # no short training before it
+    arguments = ("train", *TINY, *only, "--output", str(folder), "--checkpoint-every", "1e-9")
     process = subprocess.run(
         [sys.executable, "-c", SPOIL, str(bad_step), *arguments],
         capture_output=True,
