@@ -120,6 +120,15 @@ def long(model: Model, seed: int) -> Problem:
     return masked(p, seed)
 
 
+def test_long_rays_against_float64() -> None:
+    """More samples at a time than an MLP takes through a layer together."""
+    p = long(replace(FEATURES, threshold=0.0), 0)
+    assert oracle_seen(p).n_samples.max() > 100
+    expected = oracle_train_both(p, "clamped")
+    for ours, theirs in zip(of(1).both_train(p, "clamped"), expected, strict=True):
+        assert_close(ours, theirs, 1e-5)
+
+
 @one_of_each
 def test_capacity_changes_nothing(model: Model) -> None:
     """Packs of a batch in one slot, in some, and in more than they need.

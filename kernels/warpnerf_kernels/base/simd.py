@@ -92,6 +92,18 @@ auto bits = [&](ivec x) -> unsigned {  // bit n: lane n is not 0
 auto each = [&](unsigned lanes, auto visit) {  // the lanes whose bits are set
     for (; lanes; lanes &= lanes - 1) visit(__builtin_ctz(lanes));
 };
+// Writes first + lane for each of them, one after the other, where there is room for sixteen; how
+// many they are.
+auto list_lanes = [&](unsigned lanes, int first, int* out) -> int {
+#ifdef __AVX512F__
+    const ivec numbers = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
+    *(ivec_at*)out = __builtin_ia32_compresssi512_mask(first + numbers, ivec(0), lanes);
+#else
+    int n = 0;
+    each(lanes, [&](int lane) { out[n++] = first + lane; });
+#endif
+    return __builtin_popcount(lanes);
+};
 auto count = [&](ivec x) -> int { return -__builtin_reduce_add(x); };
 // In lane i the sum, or product, of lanes 0 to i.
 auto running_sum = [&](vec x) -> vec {

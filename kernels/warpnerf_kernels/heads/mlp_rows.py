@@ -34,10 +34,17 @@ struct Few { enum { value = 4 }; };
 struct Many { enum { value = MOST_ROWS }; };
 struct Several { enum { value = WIDTH % (MOST_VECS * LANES) ? 1 : MOST_VECS }; };  // of a layer
 struct Inputs { enum { value = PADDED % (MOST_VECS * LANES) ? 1 : MOST_VECS }; };
-auto by_rows = [&](int n, auto visit) {
-    for (int begin = 0; begin < n;) {
-        if (n - begin > Few::value) visit(Many(), begin), begin += Many::value;
-        else visit(Few(), begin), begin += Few::value;
+// Rows that go through a layer before any goes through the next: a vector's column of weights stays
+// in the innermost cache as long. Arrays have as many entries, of which blocks may reach beyond the
+// rows that there are.
+constexpr int GROUP = 32, MOST_BLOCKS = GROUP / Few::value;
+auto by_groups = [&](int n, auto visit) {
+    for (int begin = 0; begin < n; begin += GROUP) visit(begin, least(GROUP, n - begin));
+};
+auto by_blocks = [&](int n, auto visit) {
+    for (int begin = 0, block = 0; begin < n; ++block) {
+        if (n - begin > Few::value) visit(Many(), begin, block), begin += Many::value;
+        else visit(Few(), begin, block), begin += Few::value;
     }
 };
 auto at = [&](const float* x) -> vec { return *(const vec_at*)x; };
@@ -50,6 +57,25 @@ auto units_four_times = [&](const float* h) -> vec {
 };
 auto outputs_four_times = [&](quad q) -> vec {
     return __builtin_shufflevector(q, q, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3);
+};
+// What of a block's inputs is looked at: all, or the units that are not 0 in every one of its rows.
+// Neighbouring samples share them, so ReLU saves a third to two thirds of the work.
+struct Every { int n; int operator[](int k) const { return k; } };
+struct Lit { int n; int units[WIDTH + LANES]; int operator[](int k) const { return units[k]; } };
+const Every every_input = {INPUTS};
+auto all_inputs = [&](int) -> const Every& { return every_input; };
+auto find_lit = [&](int n, const float* const* h, Lit* lit) {
+    by_blocks(n, [&](auto rows, int begin, int block) {
+        Lit& found = lit[block];
+        int n_found = 0;
+        for (int u = 0; u < WIDTH; u += LANES) {
+            ivec any = ivec(0);
+            #pragma clang loop unroll(full)
+            for (int b = 0; b < decltype(rows)::value; ++b) any |= at(h[begin + b] + u) != 0.0f;
+            n_found += list_lanes(bits(any), u, found.units + n_found);
+        }
+        found.n = n_found;
+    });
 };
 
 // The weights with rows and columns exchanged, for the way back.
@@ -67,164 +93,198 @@ auto transpose = [&](const float* w, float* t) {
         for (int i = 0; i < WIDTH; ++i) *t++ = w[AT_OUTPUT + OUTPUTS * i + o];
     }
 };
-// out[b][:] = act(first[b][:] + sum_i x[b][i] w[i][:]) for some rows, `units` numbers each.
-auto multiply = [&](auto rows, const float* w, int n_inputs, int units, auto step,
-                    const float* const* x, const float* const* first, float* const* out, auto act) {
-    constexpr int N = decltype(rows)::value, AT_ONCE = decltype(step)::value;
+// out[b][:] = act(first_of(b)[:] + sum_i x[b][i] w[i][:]) for n rows, `units` numbers each;
+// inputs_of(block): over which i.
+auto multiply = [&](int n, const float* w, auto inputs_of, int units, auto step,
+                    const float* const* x, auto first_of, float* const* out, auto act) {
+    constexpr int AT_ONCE = decltype(step)::value;
     for (int u = 0; u < units; u += AT_ONCE * LANES) {
-        vec sum[N][AT_ONCE];
-        #pragma clang loop unroll(full)
-        for (int b = 0; b < N; ++b) {
+        by_blocks(n, [&](auto rows, int begin, int block) {
+            constexpr int N = decltype(rows)::value;
+            const float* from[N];
+            vec sum[N][AT_ONCE];
             #pragma clang loop unroll(full)
-            for (int v = 0; v < AT_ONCE; ++v) {
-                sum[b][v] = first ? at(first[b] + u + v * LANES) : all(0.0f);
+            for (int b = 0; b < N; ++b) {
+                from[b] = x[begin + b];
+                #pragma clang loop unroll(full)
+                for (int v = 0; v < AT_ONCE; ++v) sum[b][v] = first_of(begin + b, u + v * LANES);
             }
-        }
-        for (int i = 0; i < n_inputs; ++i) {
-            vec row[AT_ONCE];
-            #pragma clang loop unroll(full)
-            for (int v = 0; v < AT_ONCE; ++v) row[v] = at(w + i * units + u + v * LANES);
+            const auto& inputs = inputs_of(block);
+            const int n_inputs = inputs.n;
+            for (int k = 0; k < n_inputs; ++k) {
+                const int i = inputs[k];
+                vec row[AT_ONCE];
+                #pragma clang loop unroll(full)
+                for (int v = 0; v < AT_ONCE; ++v) row[v] = at(w + i * units + u + v * LANES);
+                #pragma clang loop unroll(full)
+                for (int b = 0; b < N; ++b) {
+                    #pragma clang loop unroll(full)
+                    for (int v = 0; v < AT_ONCE; ++v) {
+                        sum[b][v] = fma(all(from[b][i]), row[v], sum[b][v]);
+                    }
+                }
+            }
             #pragma clang loop unroll(full)
             for (int b = 0; b < N; ++b) {
                 #pragma clang loop unroll(full)
                 for (int v = 0; v < AT_ONCE; ++v) {
-                    sum[b][v] = fma(all(x[b][i]), row[v], sum[b][v]);
+                    put(out[begin + b] + u + v * LANES, act(sum[b][v], begin + b, u + v * LANES));
                 }
             }
-        }
-        #pragma clang loop unroll(full)
-        for (int b = 0; b < N; ++b) {
-            #pragma clang loop unroll(full)
-            for (int v = 0; v < AT_ONCE; ++v) {
-                put(out[b] + u + v * LANES, act(sum[b][v], b, u + v * LANES));
-            }
-        }
+        });
     }
 };
 // w[i][:] += sum_b x[b][i] adj[b][:], and biases[:] += sum_b adj[b][:].
-auto add_outer = [&](auto rows, float* w, float* biases, int n_inputs, const float* const* x,
+auto add_outer = [&](int n, float* w, float* biases, auto inputs_of, const float* const* x,
                      const float* const* adj) {
-    constexpr int N = decltype(rows)::value, AT_ONCE = Several::value;
+    constexpr int AT_ONCE = Several::value;
     for (int u = 0; u < WIDTH; u += AT_ONCE * LANES) {
-        vec a[N][AT_ONCE];
-        #pragma clang loop unroll(full)
-        for (int v = 0; v < AT_ONCE; ++v) {
-            vec sum = at(biases + u + v * LANES);
+        by_blocks(n, [&](auto rows, int begin, int block) {
+            constexpr int N = decltype(rows)::value;
+            const float* from[N];
+            vec a[N][AT_ONCE];
             #pragma clang loop unroll(full)
-            for (int b = 0; b < N; ++b) sum += a[b][v] = at(adj[b] + u + v * LANES);
-            put(biases + u + v * LANES, sum);
-        }
-        for (int i = 0; i < n_inputs; ++i) {
-            float* to = w + i * WIDTH + u;
-            vec sum[AT_ONCE];
+            for (int b = 0; b < N; ++b) from[b] = x[begin + b];
             #pragma clang loop unroll(full)
-            for (int v = 0; v < AT_ONCE; ++v) sum[v] = at(to + v * LANES);
-            #pragma clang loop unroll(full)
-            for (int b = 0; b < N; ++b) {
+            for (int v = 0; v < AT_ONCE; ++v) {
+                vec sum = at(biases + u + v * LANES);
                 #pragma clang loop unroll(full)
-                for (int v = 0; v < AT_ONCE; ++v) sum[v] = fma(all(x[b][i]), a[b][v], sum[v]);
+                for (int b = 0; b < N; ++b) sum += a[b][v] = at(adj[begin + b] + u + v * LANES);
+                put(biases + u + v * LANES, sum);
             }
-            #pragma clang loop unroll(full)
-            for (int v = 0; v < AT_ONCE; ++v) put(to + v * LANES, sum[v]);
-        }
+            const auto& inputs = inputs_of(block);
+            const int n_inputs = inputs.n;
+            for (int k = 0; k < n_inputs; ++k) {
+                const int i = inputs[k];
+                float* to = w + i * WIDTH + u;
+                vec sum[AT_ONCE];
+                #pragma clang loop unroll(full)
+                for (int v = 0; v < AT_ONCE; ++v) sum[v] = at(to + v * LANES);
+                #pragma clang loop unroll(full)
+                for (int b = 0; b < N; ++b) {
+                    #pragma clang loop unroll(full)
+                    for (int v = 0; v < AT_ONCE; ++v) {
+                        sum[v] = fma(all(from[b][i]), a[b][v], sum[v]);
+                    }
+                }
+                #pragma clang loop unroll(full)
+                for (int v = 0; v < AT_ONCE; ++v) put(to + v * LANES, sum[v]);
+            }
+        });
     }
 };
+auto zero = [&](int, int) -> vec { return all(0.0f); };
 auto as_is = [&](vec x, int, int) -> vec { return x; };
 auto relu = [&](vec x, int, int) -> vec { return x < 0.0f ? all(0.0f) : x; };  // keeps a NaN
 // Rows 0 to n - 1: x_of(r) their inputs, first_of(r) what the first layer begins with, h_of(r) room
 // for all hidden units, y_of(r) room for four outputs.
 auto forward = [&](int n, const float* w, auto x_of, auto first_of, auto h_of, auto y_of) {
-    by_rows(n, [&](auto rows, int begin) {
-        constexpr int N = decltype(rows)::value;
-        const float *x[N], *first[N];
-        float* h[N];
+    by_groups(n, [&](int group, int some) {
+        const float *x[GROUP], *first[GROUP];
+        float* h[GROUP];
         float unused[HIDDEN * WIDTH];
-        for (int b = 0; b < N; ++b) {
-            const int r = least(begin + b, n - 1);
+        for (int b = 0; b < GROUP; ++b) {
+            const int r = group + least(b, some - 1);
             x[b] = x_of(r), first[b] = first_of(r);
-            h[b] = begin + b < n ? h_of(r) : unused;
+            h[b] = b < some ? h_of(r) : unused;
         }
-        multiply(rows, w, INPUTS, WIDTH, Several(), x, first, h, relu);
+        const auto given = [&](int b, int u) -> vec { return at(first[b] + u); };
+        multiply(some, w, all_inputs, WIDTH, Several(), x, given, h, relu);
         for (int layer = 1; layer < HIDDEN; ++layer) {
             const float* from = w + AT_HIDDEN + (layer - 1) * LAYER;
-            const float *below[N], *biases[N];
-            for (int b = 0; b < N; ++b) {
-                below[b] = h[b], biases[b] = from + WIDTH * WIDTH, h[b] += WIDTH;
-            }
-            multiply(rows, from, WIDTH, WIDTH, Several(), below, biases, h, relu);
+            const float* below[GROUP];
+            for (int b = 0; b < GROUP; ++b) below[b] = h[b], h[b] += WIDTH;
+            Lit lit[MOST_BLOCKS];
+            find_lit(some, below, lit);
+            const auto lit_of = [&](int block) -> const Lit& { return lit[block]; };
+            const auto biases = [&](int, int u) -> vec { return at(from + WIDTH * WIDTH + u); };
+            multiply(some, from, lit_of, WIDTH, Several(), below, biases, h, relu);
         }
-        vec sums[N];
         const float* last = w + AT_OUTPUT;
-        for (int b = 0; b < N; ++b) sums[b] = all(0.0f);
-        for (int i = 0; i < WIDTH; i += 4) {
-            const vec four = at(last + OUTPUTS * i);
-            #pragma clang loop unroll(full)
-            for (int b = 0; b < N; ++b) {
-                sums[b] = fma(units_four_times(h[b] + i), four, sums[b]);
-            }
-        }
         const quad biases = *(const quad_at*)(last + OUTPUTS * WIDTH);
-        for (int b = 0; b < N && begin + b < n; ++b) {
-            const octet two = sums[b].lo + sums[b].hi;
-            *(quad_at*)y_of(begin + b) = biases + (two.lo + two.hi);
-        }
+        by_blocks(some, [&](auto rows, int begin, int) {
+            constexpr int N = decltype(rows)::value;
+            vec sums[N];
+            for (int b = 0; b < N; ++b) sums[b] = all(0.0f);
+            for (int i = 0; i < WIDTH; i += 4) {
+                const vec four = at(last + OUTPUTS * i);
+                #pragma clang loop unroll(full)
+                for (int b = 0; b < N; ++b) {
+                    sums[b] = fma(units_four_times(h[begin + b] + i), four, sums[b]);
+                }
+            }
+            for (int b = 0; b < N && begin + b < some; ++b) {
+                const octet two = sums[b].lo + sums[b].hi;
+                *(quad_at*)y_of(group + begin + b) = biases + (two.lo + two.hi);
+            }
+        });
     });
 };
 // The way back: adj_y_of(r) four numbers, the last one 0; adj_x_of(r) room for PADDED inputs;
 // adj_first [WIDTH] the sum over rows, added to. Gradients of weights are added to g.
 auto backward = [&](int n, const float* transposed, float* g, auto x_of, auto h_of, auto adj_y_of,
                     auto adj_x_of, float* adj_first) {
-    by_rows(n, [&](auto rows, int begin) {
-        constexpr int N = decltype(rows)::value;
-        const float *x[N], *h[N];
-        float adj_room[N][WIDTH], below_room[N][WIDTH], input_room[N][PADDED];
-        float *adj[N], *below[N], *adj_x[N];
-        quad adj_y[N];
-        for (int b = 0; b < N; ++b) {
-            const int r = least(begin + b, n - 1);
+    by_groups(n, [&](int group, int some) {
+        const float *x[GROUP], *h[GROUP];
+        float adj_room[GROUP][WIDTH], below_room[GROUP][WIDTH], unused[PADDED];
+        float *adj[GROUP], *below[GROUP], *adj_x[GROUP];
+        quad adj_y[GROUP];
+        for (int b = 0; b < GROUP; ++b) {
+            const int r = group + least(b, some - 1);
             x[b] = x_of(r), h[b] = h_of(r) + (HIDDEN - 1) * WIDTH;
             adj[b] = adj_room[b], below[b] = below_room[b];
-            adj_x[b] = begin + b < n ? adj_x_of(r) : input_room[b];
-            adj_y[b] = begin + b < n ? quad(*(const quad_at*)adj_y_of(r)) : quad(0.0f);
+            adj_x[b] = b < some ? adj_x_of(r) : unused;
+            adj_y[b] = b < some ? quad(*(const quad_at*)adj_y_of(r)) : quad(0.0f);
         }
+        const auto behind_relu = [&](vec adj_h, int b, int u) -> vec {
+            return at(h[b] + u) > 0.0f ? adj_h : all(0.0f);
+        };
         // The output.
         float* g_last = g + AT_OUTPUT;
         const float* t = transposed + PADDED * WIDTH + (HIDDEN - 1) * WIDTH * WIDTH;
-        for (int b = 0; b < N; ++b) *(quad_at*)(g_last + OUTPUTS * WIDTH) += adj_y[b];
-        for (int i = 0; i < WIDTH; i += 4) {
-            vec sum = at(g_last + OUTPUTS * i);
-            #pragma clang loop unroll(full)
-            for (int b = 0; b < N; ++b) {
-                sum = fma(units_four_times(h[b] + i), outputs_four_times(adj_y[b]), sum);
+        by_blocks(some, [&](auto rows, int begin, int) {
+            constexpr int N = decltype(rows)::value;
+            for (int b = begin; b < begin + N; ++b) {
+                *(quad_at*)(g_last + OUTPUTS * WIDTH) += adj_y[b];
             }
-            put(g_last + OUTPUTS * i, sum);
-        }
-        auto behind_relu = [&](vec adj_h, int b, int u) -> vec {
-            return at(h[b] + u) > 0.0f ? adj_h : all(0.0f);
-        };
-        for (int u = 0; u < WIDTH; u += LANES) {
-            #pragma clang loop unroll(full)
-            for (int b = 0; b < N; ++b) {
-                vec sum = adj_y[b][0] * at(t + u);
-                sum = fma(all(adj_y[b][1]), at(t + WIDTH + u), sum);
-                sum = fma(all(adj_y[b][2]), at(t + 2 * WIDTH + u), sum);
-                put(adj[b] + u, behind_relu(sum, b, u));
+            for (int i = 0; i < WIDTH; i += 4) {
+                vec sum = at(g_last + OUTPUTS * i);
+                #pragma clang loop unroll(full)
+                for (int b = begin; b < begin + N; ++b) {
+                    sum = fma(units_four_times(h[b] + i), outputs_four_times(adj_y[b]), sum);
+                }
+                put(g_last + OUTPUTS * i, sum);
             }
-        }
-        // Hidden layers, the last one first.
+            for (int u = 0; u < WIDTH; u += LANES) {
+                #pragma clang loop unroll(full)
+                for (int b = begin; b < begin + N; ++b) {
+                    vec sum = adj_y[b][0] * at(t + u);
+                    sum = fma(all(adj_y[b][1]), at(t + WIDTH + u), sum);
+                    sum = fma(all(adj_y[b][2]), at(t + 2 * WIDTH + u), sum);
+                    put(adj[b] + u, behind_relu(sum, b, u));
+                }
+            }
+        });
+        // Hidden layers, the last one first. Nothing flows back through units that are 0.
+        Lit lit[HIDDEN][MOST_BLOCKS];
+        find_lit(some, h, lit[HIDDEN - 1]);
         for (int layer = HIDDEN - 1; layer > 0; --layer) {
             float* to = g + AT_HIDDEN + (layer - 1) * LAYER;
             t -= WIDTH * WIDTH;
-            for (int b = 0; b < N; ++b) h[b] -= WIDTH;
-            add_outer(rows, to, to + WIDTH * WIDTH, WIDTH, h, adj);
-            multiply(rows, t, WIDTH, WIDTH, Several(), adj, nullptr, below, behind_relu);
-            for (int b = 0; b < N; ++b) {
+            for (int b = 0; b < GROUP; ++b) h[b] -= WIDTH;
+            find_lit(some, h, lit[layer - 1]);
+            const auto lit_of = [&](int block) -> const Lit& { return lit[layer][block]; };
+            const auto lit_below = [&](int block) -> const Lit& { return lit[layer - 1][block]; };
+            add_outer(some, to, to + WIDTH * WIDTH, lit_below, h, adj);
+            multiply(some, t, lit_of, WIDTH, Several(), adj, zero, below, behind_relu);
+            for (int b = 0; b < GROUP; ++b) {
                 float* kept = adj[b];
                 adj[b] = below[b], below[b] = kept;
             }
         }
-        add_outer(rows, g, adj_first, INPUTS, x, adj);
-        multiply(rows, transposed, WIDTH, PADDED, Inputs(), adj, nullptr, adj_x, as_is);
+        const auto lit_of = [&](int block) -> const Lit& { return lit[0][block]; };
+        add_outer(some, g, adj_first, all_inputs, x, adj);
+        multiply(some, transposed, lit_of, PADDED, Inputs(), adj, zero, adj_x, as_is);
     });
 };
 """
