@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import mmap
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from warpnerf.runtime import memory
@@ -111,3 +113,29 @@ def test_what_the_process_has_is_not_free() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert int(done.stdout) == pytest.approx(2**28, rel=0.05)
+
+
+@pytest.mark.skipif(
+    not Path("/sys/kernel/mm/transparent_hugepage").exists(), reason="the system has no such pages"
+)
+def test_large_pages_are_asked_for() -> None:
+    room = mmap.mmap(-1, 8 << 20)
+    address = np.frombuffer(room, np.uint8).ctypes.data
+    assert "hg" not in flags_of(address)
+    memory.prefer_large_pages(address, 0)
+    assert "hg" not in flags_of(address)
+    memory.prefer_large_pages(address + 64, (8 << 20) - 64)
+    assert "hg" in flags_of(address + 4096)
+
+
+def flags_of(address: int) -> list[str]:
+    """What Linux says of the memory that holds an address."""
+    inside = False
+    for line in Path("/proc/self/smaps").read_text().splitlines():
+        words = line.split()
+        if not words[0].endswith(":"):
+            begin, end = (int(word, 16) for word in words[0].split("-"))
+            inside = begin <= address < end
+        elif inside and words[0] == "VmFlags:":
+            return words[1:]
+    raise AssertionError("no memory there")

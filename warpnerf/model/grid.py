@@ -20,7 +20,7 @@ from warpnerf_kernels.space import contraction
 
 from warpnerf.checks import InputError
 from warpnerf.config import MAX_VOXELS, TRAINING_BYTES, Contraction
-from warpnerf.runtime.memory import usable_memory
+from warpnerf.runtime.memory import prefer_large_pages, usable_memory
 from warpnerf.runtime.parallel import NODES, Workers
 from warpnerf.scenes.frustum import Frustum
 
@@ -136,7 +136,7 @@ class VoxelGrid:
             box: Corners of the new grid, within this one's; None: the same. Not with contraction.
         """
         box_min, box_max = box or (self.box_min, self.box_max)
-        values = wp.empty(math.prod(size), dtype=self.values.dtype, device=workers.device)
+        values = room_for_nodes(math.prod(size), self.values.dtype, workers.device)
         grid = replace(self, values=values, size=size, box_min=box_min, box_max=box_max)
         self.resample(dense.resample_kernel(self.n_floats), self.values, grid, values, workers)
         return grid
@@ -162,6 +162,20 @@ class VoxelGrid:
             *(source, wp.vec3i(*self.size), scale, offset),
             *(wp.vec3i(*other.size), out),
         )
+
+
+def room_for_nodes(n_nodes: int, dtype: Any, device: wp.Device) -> wp.array:
+    """Values of nodes, not yet written: [n_nodes], on the CPU on large pages where there are any.
+
+    Args:
+        n_nodes: How many.
+        dtype: What a node holds.
+        device: Where it lies.
+    """
+    values = wp.empty(n_nodes, dtype=dtype, device=device)
+    if device.is_cpu:
+        prefer_large_pages(values.ptr, values.capacity)
+    return values
 
 
 def grid_struct(

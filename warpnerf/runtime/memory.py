@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import mmap
 import os
 from pathlib import Path
 
@@ -128,6 +129,24 @@ def _share(files: tuple[Path, ...]) -> int | None:
     except (OSError, ValueError):  # not there, or "max"
         return None
     return None if quota < 0 else quota // period
+
+
+def prefer_large_pages(address: int, n_bytes: int) -> None:
+    """Ask the system for pages of 2 MB, where it has such (Linux), for memory not yet written to.
+
+    Reading what is scattered over many pages takes less time where they are large: there are fewer
+    of them to look up.
+
+    Args:
+        address: Where the memory begins.
+        n_bytes: Its length.
+    """
+    advice, page = getattr(mmap, "MADV_HUGEPAGE", None), mmap.PAGESIZE
+    begin, end = address // page * page, (address + n_bytes) // page * page
+    if advice is None or end <= begin:
+        return
+    with contextlib.suppress(OSError, AttributeError, TypeError):
+        ctypes.CDLL(None).madvise(ctypes.c_void_p(begin), ctypes.c_size_t(end - begin), advice)
 
 
 def give_back() -> None:

@@ -10,7 +10,7 @@ from warpnerf_kernels.base.types import vector
 
 from warpnerf.checks import InputError
 from warpnerf.config import TrainConfig
-from warpnerf.model.grid import VoxelGrid, grid_size, require_memory
+from warpnerf.model.grid import VoxelGrid, grid_size, require_memory, room_for_nodes
 from warpnerf.model.interface import Model
 from warpnerf.scenes.frustum import FARTHEST, contraction_of, fit_frustum
 from warpnerf.scenes.scene import Scene
@@ -49,8 +49,10 @@ def first_grid(
     require_memory(final, n_floats, device)
     size = grid_size(extent, n_voxels)
     voxel = float((extent / (np.array(final) - 1)).min())
+    values = room_for_nodes(math.prod(size), vector(n_floats), device)
+    values.zero_()
     return VoxelGrid(
-        values=wp.zeros(math.prod(size), dtype=vector(n_floats), device=device),
+        values=values,
         size=size,
         box_min=box[0],
         box_max=box[1],
