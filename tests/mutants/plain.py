@@ -206,7 +206,8 @@ MUTANTS = [
     Mutant("leap a sample too far", "sampling/steps.py",
            "- ray.offset - real(1.0e-3))", "- ray.offset + real(2.0))", OCCUPANCY),
     # gradscale.py
-    Mutant("not squared", "volume/gradscale.py", "scale = ratio * ratio", "scale = ratio", GRADSCALE),
+    Mutant("not squared", "volume/gradscale.py", "scale = ratio * ratio", "scale = ratio",
+           GRADSCALE, 1, 2),
     Mutant("clamp from below", "volume/gradscale.py",
            "wp.min(real(1.0), scale)", "wp.max(real(1.0), scale)", GRADSCALE),
     Mutant("Jacobian inverted", "volume/gradscale.py",

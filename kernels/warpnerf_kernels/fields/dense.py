@@ -133,7 +133,8 @@ uz += ahead * (ray.q_direction.c[2] * grid.to_nodes.c[2]);
 i = clamp(truncate(ux), grid.size.c[0] - 1);
 j = clamp(truncate(uy), grid.size.c[1] - 1);
 l = clamp(truncate(uz), grid.size.c[2] - 1);
-const ivec node_ahead = index(i, j, l);
+int node_ahead[LANES];  // in memory, as lanes are needed one by one
+*(ivec_at*)node_ahead = index(i, j, l);
 // Wide nodes are many cache lines, so only where the next pack begins right behind this one.
 if (FLOATS == 4 || bits(visited) >> (LANES - 1)) {
     for (int n = 0; n < LANES; ++n) fetch(grid.values.data + node_ahead[n], grid.size);

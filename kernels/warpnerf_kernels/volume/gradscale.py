@@ -12,8 +12,11 @@ Contraction changes volume as well. JACOBIAN_DENSITY multiplies (t / content_dis
 divides by it, as printed in the paper (eq. 8); JACOBIAN_NONE leaves it out, as in its experiments.
 """
 
+from typing import Any
+
 import warp as wp
 
+from ..base.simd import VECTORS
 from ..base.types import real
 
 NONE = 0
@@ -45,3 +48,30 @@ def distance_scale(
     if scaling == CLAMPED:
         scale = wp.min(real(1.0), scale)
     return scale
+
+
+@wp.func_native(
+    VECTORS
+    + f"""
+constexpr int NONE = {NONE}, CLAMPED = {CLAMPED};
+constexpr int DENSITY = {JACOBIAN_DENSITY}, PAPER = {JACOBIAN_PAPER};
+"""
+    + r"""
+auto& pack = packs.data[slot];
+const vec ratio = load(pack.t) / content_distance;
+vec scale = ratio * ratio;
+if (jacobian == DENSITY) scale *= load(pack.det_jacobian);
+if (jacobian == PAPER) scale /= load(pack.det_jacobian);
+if (scaling == CLAMPED) scale = scale > 1.0f ? all(1.0f) : scale;
+store(pack.scale, scaling == NONE ? all(1.0f) : scale);
+"""
+)
+def scale_pack(
+    content_distance: wp.float32,
+    scaling: int,
+    jacobian: int,
+    packs: wp.array(dtype=Any),  # their scale written
+    slot: int,
+):
+    """distance_scale of a pack's samples."""
+    ...

@@ -15,7 +15,7 @@ from ..base.simd import LANES, lanes
 from ..base.types import Ray
 from ..cpu.scatter import sink_type
 from ..sampling.traversal import distance_of, locate_pack, measure_pack, traversal
-from .gradscale import distance_scale
+from .gradscale import scale_pack
 from .pack import compositing, pack_type, row_type, weigh
 from .ray_loss import NONE, vector_form
 from .sample_loss import ColourSums
@@ -213,14 +213,7 @@ def walk_packs(sampler: Sampler, encoding: Encoding, head: Head, losses: Losses)
                     dense = packs[slot].visited[LANES - 1] != 0
                     transmittance = packs[slot].passed
                 n_samples += packs[slot].n_samples
-                t = packs[slot].t
-                det_jacobian = packs[slot].det_jacobian
-                scale = lanes()
-                for lane in range(LANES):
-                    scale[lane] = distance_scale(
-                        t[lane], content_distance, det_jacobian[lane], scaling, jacobian
-                    )
-                packs[slot].scale = scale
+                scale_pack(content_distance, scaling, jacobian, packs, slot)
                 if short and n + slot - first < wp.static(max(n_packs, 2)):
                     fetch_pack(scene.field, packs, slot, worker, sink)
                 if wp.static(has_loss):
