@@ -1,17 +1,26 @@
-"""A whole step of DVGO's model: warpnerf against the best eager torch that does the same.
+"""A whole training step of each model: warpnerf against the best eager torch that does the same.
 
-    python benchmarks/dvgo_step.py
+    python benchmarks/against_torch.py lego_200
+    python benchmarks/against_torch.py dense sphere --models dvgo
 
-A density and 12 features in each node of a 160^3 grid, and for each sample of a weight above 1e-4
-an MLP of two hidden layers of 128 units that sees the features and the encoded direction. A step is
-8192 rays in steps of half a voxel: march, composite, squared error, adjoint scaled by distance,
-gradients of nodes and network, and Adam over both, which leaves nodes alone that no ray has
-touched. Cases are those of throughput.py: dense, random values everywhere, and sphere, a solid one
-in empty space.
+A step marches, composites, takes the squared error, goes back through all of it with gradients
+scaled by distance, and updates nodes and network by Adam, which leaves nodes alone that no ray has
+touched. Beside it the pass alone, without Adam. What is marched through:
 
-Gradients are compared first; then the two take turns. Each counts with its better number of
-threads. Ratios are formed round by round; figures are medians with 95 % intervals. Prints a table
-and writes benchmarks/results/dvgo_step_cpu.json.
+    a capture    as for training.py, of a bounded scene: each model is trained on it by warpnerf up
+                 to nine tenths of its schedule; from there come grid, network, free space, and a
+                 batch of the rays that training draws, which end where they end in training
+    dense        the cases of throughput.py: random values everywhere,
+    sphere       and a solid one in empty space
+
+Models are as they are by default, and `dvgo`: a density and 12 features in each node and for each
+sample of a weight above 1e-4 an MLP of two hidden layers of 128 units that sees the features and
+the encoded direction; trained by its preset, in steps of half a voxel.
+
+Colours and gradients are compared first; where rays end early, a sample more or less at their ends
+may show in colours by the light that is left there. Then the two take turns. Each counts with its
+better number of threads. Ratios are formed round by round; figures are medians with 95 % intervals.
+Prints a table and writes benchmarks/results/against_torch_cpu.json.
 """
 
 from __future__ import annotations
@@ -19,6 +28,7 @@ from __future__ import annotations
 import gc
 import itertools
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -35,17 +45,26 @@ from measuring import (
     show,
     write_record,
 )
-from throughput import AT_KINKS, check, race
-from workload import CAMERA_DISTANCE, Scene, Workload, make_workload
+from models import train_until_late
+from throughput import AT_KINKS, TOLERANCE, check, race
+from training import path_of
+from workload import CAMERA_DISTANCE, MODELS, ModelName, Workload, make_workload, split_network
 
+import warpnerf as wn
 from warpnerf.config import OptimConfig
 from warpnerf.model.parameters import parameters_of
 from warpnerf.rendering.render import TrainingPass
 from warpnerf.runtime.parallel import Workers
 from warpnerf.training.optim import adam_step, first_states
+from warpnerf.training.trainer import Trainer
 
 RATE = 0.1
 """Of the grid."""
+AT_ENDS = 1e-4
+"""The share of the gradient's values that may differ by more where rays end early: which sample is
+the last may hang on rounding."""
+MADE = ("dense", "sphere")
+"""Scenes of throughput.py."""
 
 
 class WarpStep:
@@ -87,13 +106,22 @@ class TorchStep:
         """Load a workload."""
         self._pass = TorchModels(work, Choices(threads=threads))
         self._grid = MaskedAdam(self._pass.tables(), RATE)
-        self._network = torch.optim.Adam(self._pass.network, lr=1e-3, betas=(0.9, 0.99))
+        network = self._pass.network
+        self._network = torch.optim.Adam(network, lr=1e-3, betas=(0.9, 0.99)) if network else None
+
+    def gradient(self) -> None:
+        """The pass."""
+        self._pass.step()
 
     def step(self) -> None:
         """A whole one."""
         self._pass.step()
-        self._grid.step()
-        self._network.step()
+        self._update()
+
+    def _update(self) -> None:
+        self._grid.step(self._pass.touched)
+        if self._network is not None:
+            self._network.step()
 
     def choose(self, rounds: int) -> str:
         """Take what is fastest here; says what."""
@@ -101,90 +129,171 @@ class TorchStep:
         scatterings: tuple[Scattering, ...] = ("rows", "pairs")
         ways: tuple[Way, ...] = ("all", "rows")
         threads = self._pass.choices.threads
-        best: dict[tuple[int, Scattering], float] = {}
-        for choice in list(itertools.product((4, 16, 64), scatterings)) * rounds:
-            self._pass.choices = Choices(parts=choice[0], scattering=choice[1], threads=threads)
-            spent = seconds(self._pass.step)
-            best[choice] = min(best.get(choice, np.inf), spent)
-        parts, scattering = min(best, key=lambda choice: best[choice])
-        self._pass.choices = Choices(parts=parts, scattering=scattering, threads=threads)
-        updates: dict[Way, float] = {}
-        for way in ways * rounds:
-            self._grid.way = way
-            updates[way] = min(updates.get(way, np.inf), seconds(self._grid.step))
-        self._grid.way = min(updates, key=lambda way: updates[way])
-        return f"{parts} parts, gradients by {scattering}, Adam over {self._grid.way}"
+
+        def fastest(candidates: list[tuple[Choices, Way]]) -> tuple[Choices, Way]:
+            spent = dict.fromkeys(candidates, math.inf)
+            for candidate in candidates * rounds:
+                self._pass.choices, self._grid.way = candidate
+                self._pass.step()  # leaves what the next one zeroes
+                spent[candidate] = min(spent[candidate], seconds(self.step))
+            return min(spent, key=lambda candidate: spent[candidate])
+
+        choices, _ = fastest(
+            [
+                (Choices(parts=parts, scattering=scattering, threads=threads), "all")
+                for parts, scattering in itertools.product((1, 4, 16, 64), scatterings)
+            ]
+        )
+        best = fastest(
+            [
+                (replace(choices, sparse=sparse), way)
+                for sparse, way in itertools.product((False, True), ways)
+            ]
+        )
+        self._pass.choices, self._grid.way = choices, way = best
+        touched = ", those that were touched noted" if choices.sparse else ""
+        return f"{choices.parts} parts, gradients by {choices.scattering}, Adam over {way}{touched}"
 
 
-def compare(
-    scene: Scene, grid: int, n_rays: int, thread_counts: list[int], rounds: int
-) -> dict[str, Any]:
-    """Check one case, and time it."""
+def made(scene: Any, model: ModelName, grid: int, n_rays: int) -> Workload:
+    """A case of throughput.py; of dvgo in steps of half a voxel, as everywhere."""
     reach = CAMERA_DISTANCE + math.sqrt(3.0)
-    n_steps = round(reach * (grid - 1))
-    work = make_workload("random", grid, n_rays, n_steps, scene=scene, model="dvgo")
+    n_steps = round(reach * (grid - 1) * (1.0 if model == "dvgo" else 0.5))
+    return make_workload("random", grid, n_rays, n_steps, scene=scene, model=model)
+
+
+def late(scene: wn.Scene, model: ModelName, steps: int, voxels: int) -> Workload:
+    """Where a training stands at nine tenths of its schedule, and a batch of its rays."""
+    config = wn.PRESETS["dvgo" if model == "dvgo" else "fast"]
+    if model != "dvgo":
+        config = replace(config, model=model)
+    config = replace(config, steps=steps, grid=replace(config.grid, voxels=voxels))
+    state = train_until_late(scene, config)
+    trainer = Trainer(scene, state.config, state)
+    grid, march, batch = trainer.grid, trainer.march_steps(), trainer._sampler.draw(steps)
+    if grid.contraction != "none":
+        raise SystemExit(f"against_torch: {scene.name} is unbounded, which torch is not here.")
+    origins = batch.origins.numpy()
+    corners = np.array(list(itertools.product(*zip(grid.box_min, grid.box_max, strict=True))))
+    reach = np.linalg.norm(origins[:, None] - corners, axis=2).max()
+    return Workload(
+        values=grid.values.numpy().reshape(*grid.size, -1),
+        free=trainer.free.distance.numpy().reshape(trainer.free.size),
+        origins=origins,
+        directions=batch.directions.numpy(),
+        target_rgb=batch.target_rgb.numpy(),
+        n_steps=math.ceil(reach / march.step),
+        step=march.step,
+        background=tuple(batch.background.numpy()[0].tolist()),
+        content_distance=trainer.content_distance,
+        box=(grid.box_min, grid.box_max),
+        density_shift=grid.density_shift,
+        density_scale=grid.density_scale,
+        transmittance_min=march.transmittance_min,
+        model=model,
+        network=split_network(MODELS[model], trainer.weights.numpy()),
+    )
+
+
+def compare(work: Workload, thread_counts: list[int], rounds: int) -> dict[str, Any]:
+    """Check one case, and time it."""
     sides = {
         ("warpnerf", 1): warpnerf_step.load(work, 1, "cpu"),
         ("torch", 1): TorchModels(work, Choices(parts=16)),
     }
-    differences = check(sides, AT_KINKS["dvgo"])
+    kinks = AT_KINKS.get(work.model, AT_ENDS if work.transmittance_min > 0.0 else 0.0)
+    differences = check(sides, kinks, max(TOLERANCE, work.transmittance_min))
     n_samples = sides["warpnerf", 1].n_samples()
     del sides
     gc.collect()
     theirs = {threads: TorchStep(work, threads) for threads in thread_counts}
     choices = {threads: step.choose(2) for threads, step in theirs.items()}
     ours = {threads: WarpStep(work, threads) for threads in thread_counts}
+    passes = {threads: warpnerf_step.load(work, threads, "cpu") for threads in thread_counts}
     calls = {("warpnerf", t): ours[t].step for t in ours}
     calls |= {("torch", t): theirs[t].step for t in theirs}
+    calls |= {("warpnerf, pass", t): passes[t].step for t in passes}
+    calls |= {("torch, pass", t): theirs[t].gradient for t in theirs}
     seconds = race(calls, rounds, "cpu")
-    best = {
-        name: [min(s for (n, _), s in turn.items() if n == name) for turn in seconds]
-        for name in ("warpnerf", "torch")
-    }
-    row = {
-        "scene": scene,
-        "n_steps": n_steps,
+
+    def best(name: str) -> list[float]:
+        return [min(s for (n, _), s in turn.items() if n == name) for turn in seconds]
+
+    figures: dict[str, Any] = {}
+    for what, end in (("step", ""), ("pass", ", pass")):
+        ours_best, theirs_best = best("warpnerf" + end), best("torch" + end)
+        figures |= {
+            f"warpnerf_{what}_ms": median_interval(1e3 * s for s in ours_best),
+            f"torch_{what}_ms": median_interval(1e3 * s for s in theirs_best),
+            f"{what}_over_warpnerf": median_interval(
+                b / a for a, b in zip(ours_best, theirs_best, strict=True)
+            ),
+        }
+    return {
+        "model": work.model,
+        "nodes": list(work.values.shape[:3]),
+        "n_rays": len(work.origins),
+        "n_steps": work.n_steps,
         "n_samples": n_samples,
         "differences": differences,
         "torch_choices": choices,
-        **{f"{name}_ms": median_interval(1e3 * s for s in best[name]) for name in best},
-        "over_warpnerf": median_interval(
-            b / a for a, b in zip(best["warpnerf"], best["torch"], strict=True)
-        ),
+        **figures,
     }
+
+
+def print_row(row: dict[str, Any]) -> None:
+    """One model in one scene."""
     print(
-        f"{scene:7s} {n_samples / n_rays:6.1f} samples/ray   warpnerf {show(row['warpnerf_ms'], 0)}"
-        f" ms   torch {show(row['torch_ms'], 0)} ms   torch / warpnerf "
-        f"{show(row['over_warpnerf'], 2)}   ({choices[max(choices)]})",
+        f"{row['scene']:14s}{row['model']:10s}{row['n_samples'] / row['n_rays']:8.1f}   "
+        f"{row['warpnerf_step_ms']['median']:9.1f}{row['torch_step_ms']['median']:9.1f}   "
+        f"{show(row['step_over_warpnerf'], 2):21s}"
+        f"{row['warpnerf_pass_ms']['median']:9.1f}{row['torch_pass_ms']['median']:9.1f}   "
+        f"{show(row['pass_over_warpnerf'], 2):21s}",
         flush=True,
     )
-    return row
 
 
 def main() -> None:
     parser = options(__doc__)
-    parser.add_argument("--grid", type=int, default=160, help="nodes per axis")
-    parser.add_argument("--rays", type=int, default=8192)
+    known = "dense, sphere, builtin:room, folders"
+    parser.add_argument("scenes", nargs="*", default=["builtin:room"], help=known)
+    parser.add_argument("--models", nargs="+", default=list(MODELS), choices=list(MODELS))
+    parser.add_argument("--grid", type=int, default=160, help="nodes along an axis, or their mean")
+    parser.add_argument("--rays", type=int, default=8192, help="of dense and sphere")
+    parser.add_argument("--steps", type=int, default=4000, help="of a capture's training")
+    parser.add_argument("--downscale", type=int, default=1)
     parser.add_argument("--threads", type=int, nargs="+", default=default_threads())
     parser.add_argument("--rounds", type=int, default=8)
     args = parser.parse_args()
     if args.device != "cpu":
         parser.error("this one measures CPUs")
-    print(f"{args.rays} rays, {args.grid}^3, {args.rounds} rounds; median [95 % interval]\n")
-    scenes: tuple[Scene, ...] = ("dense", "sphere")
+    print(
+        f"{args.rounds} rounds; median [95 % interval]\n\n{'scene':14s}{'model':10s}samples/ray  "
+        "a step, ms: ours, torch's; torch's over ours     the pass likewise"
+    )
     rows = []
-    for scene in scenes:
-        rows.append(compare(scene, args.grid, args.rays, args.threads, args.rounds))
-        gc.collect()
+    for name in args.scenes:
+        is_made = name in MADE
+        scene = None if is_made else wn.load_scene(path_of(name), downscale=args.downscale)
+        for model in args.models:
+            if scene is None:
+                work = made(name, model, args.grid, args.rays)
+            else:
+                work = late(scene, model, args.steps, args.grid**3)
+            row = {"scene": name, **compare(work, args.threads, args.rounds)}
+            rows.append(row)
+            print_row(row)
+            del work
+            gc.collect()
     record = {
-        "benchmark": "dvgo_step",
+        "benchmark": "against_torch",
         "machine": machine("cpu", max(args.threads)),
-        "n_rays": args.rays,
         "grid": args.grid,
+        "steps": args.steps,
         "rounds": args.rounds,
         "rows": rows,
     }
-    print(f"\nrecord: {write_record(record, args.output, 'dvgo_step', 'cpu')}")
+    print(f"\nrecord: {write_record(record, args.output, 'against_torch', 'cpu')}")
 
 
 if __name__ == "__main__":

@@ -2,12 +2,12 @@
 
     python benchmarks/models.py lego_200 fox_q
 
-Scenes are as for training.py. Each model is trained on each scene by the same schedule up to nine
-tenths; there the grid has all its nodes, and an update takes as many steps as it ever does. From
-there all go on in turns, each time with the same batches: eight updates, one of which smooths. A
-step is all that training does for 4096 rays: drawing them, the pass, its share of total variation
-and of Adam. Free space is not looked for, nor anything reported. Models differ in what they find to
-be free, too, so samples per ray are given.
+Scenes are as for training.py. Each model is trained on each scene by the preset fast up to nine
+tenths of its schedule; there the grid has all its nodes, and an update takes as many steps as it
+ever does. From there all go on in turns, each time with the same batches: eight updates, one of
+which smooths. A step is all that training does for 4096 rays: drawing them, the pass, its share of
+total variation and of Adam. Free space is not looked for, nor anything reported. Models differ in
+what they find to be free, too, so samples per ray are given.
 
 Ratios are formed round by round; figures are medians with 95 % intervals. Prints a table, with the
 parts of a step, and writes benchmarks/results/models_cpu.json.
@@ -154,7 +154,9 @@ def main() -> None:
     for name in args.scenes:
         scene = wn.load_scene(path_of(name), downscale=args.downscale)
         states = {
-            model: train_until_late(scene, wn.TrainConfig(model=model, steps=args.steps))
+            model: train_until_late(
+                scene, replace(wn.PRESETS["fast"], model=model, steps=args.steps)
+            )
             for model in models
         }
         for threads in args.threads:

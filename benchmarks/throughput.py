@@ -106,7 +106,7 @@ def make_cases(grids: Sequence[int]) -> list[Case]:
 
 
 def check(
-    runs: dict[tuple[str, int], Candidate], at_kinks: float = 0.0
+    runs: dict[tuple[str, int], Candidate], at_kinks: float = 0.0, of_rgb: float = TOLERANCE
 ) -> dict[str, dict[str, float]]:
     """Run all, and compare them with the first.
 
@@ -114,6 +114,7 @@ def check(
         runs: By name and number of threads.
         at_kinks: The share of a gradient's values that is left out, those of greatest difference.
             Where it is not 0, the network's gradient may differ by ten times as much.
+        of_rgb: Of the largest colour, by how much colours may differ.
 
     Returns:
         For each, the greatest differences in colours, gradient and the network's, if there is one,
@@ -139,7 +140,9 @@ def check(
             if what == "gradient" and at_kinks:
                 apart = np.sort(apart)[: int(len(apart) * (1.0 - at_kinks))]
             difference = by_value[what] = float(apart.max() / largest)
-            allowed = TOLERANCE * (10.0 if what == "network" and at_kinks else 1.0)
+            allowed = of_rgb if what == "rgb" else TOLERANCE
+            if what == "network" and at_kinks:
+                allowed *= 10.0
             if not difference < allowed:
                 raise SystemExit(
                     f"throughput: {name} on {threads} threads differs in {what} by "

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -15,7 +15,7 @@ import warp as wp
 from warpnerf_kernels.base.types import real, vec3, vector
 
 from warpnerf.model import interface, models
-from warpnerf.model.grid import FreeCells, VoxelGrid
+from warpnerf.model.grid import FreeCells, VoxelGrid, room_for_nodes
 from warpnerf.rendering.rays import RayBatch
 from warpnerf.rendering.render import Steps
 from warpnerf.runtime.parallel import Workers
@@ -117,6 +117,15 @@ class Workload:
     """rgb in [0, 1]."""
     content_distance: float = 1.0
     """Scene units; most rays have samples on both sides of it."""
+    box: tuple[np.ndarray, np.ndarray] = (-BOX, BOX)
+    """Corners, [3] float64, scene units. Of other boxes than [-1, 1]^3, other densities and rays
+    that end early, which trainings have, only warpnerf and `torch_models` know."""
+    density_shift: float = DENSITY_SHIFT
+    """sigma = density_scale softplus(raw density + density_shift)."""
+    density_scale: float = 1.0
+    """1 / scene unit."""
+    transmittance_min: float = 0.0
+    """A ray ends where less light than this would pass."""
     model: ModelName = "rgb"
     network: tuple[np.ndarray, ...] = ()
     """Of models that have one: weights [inputs, outputs] and biases [outputs] float32, in turn."""
@@ -128,7 +137,13 @@ class Workload:
 
     def voxel_grid(self, workers: Workers) -> VoxelGrid:
         """The grid as warpnerf takes it."""
-        return voxel_grid(self.values, workers)
+        return replace(
+            voxel_grid(self.values, workers),
+            box_min=self.box[0],
+            box_max=self.box[1],
+            density_shift=self.density_shift,
+            density_scale=self.density_scale,
+        )
 
     def warp_model(self) -> interface.Model:
         """The model as warpnerf takes it."""
@@ -160,7 +175,12 @@ class Workload:
 
     def steps(self) -> Steps:
         """The steps as warpnerf takes them."""
-        return Steps(near=0.0, far=self.n_steps * self.step, step=self.step)
+        return Steps(
+            near=0.0,
+            far=self.n_steps * self.step,
+            step=self.step,
+            transmittance_min=self.transmittance_min,
+        )
 
     def batch(self, workers: Workers) -> RayBatch:
         """The rays as warpnerf takes them."""
@@ -188,9 +208,10 @@ class Workload:
 def voxel_grid(values: np.ndarray, workers: Workers) -> VoxelGrid:
     """Raw values [X, Y, Z, n_values] over the box as warpnerf takes them."""
     size, n_values = values.shape[:3], values.shape[3]
-    nodes = values.reshape(-1, n_values)
+    nodes = room_for_nodes(math.prod(size), vector(n_values), workers.device)
+    nodes.assign(values.reshape(-1, n_values))
     return VoxelGrid(
-        values=wp.array(nodes, dtype=vector(n_values), device=workers.device),
+        values=nodes,
         size=(size[0], size[1], size[2]),
         box_min=-BOX,
         box_max=BOX,
@@ -279,6 +300,20 @@ def _network(model: Model, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
         for a, b in itertools.pairwise(sizes)
         for array in (math.sqrt(2.0 / a) * rng.normal(size=(a, b)), 0.1 * rng.normal(size=b))
     )
+
+
+def split_network(model: Model, weights: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Workload.network from the weights as warpnerf has them; the other way round is
+    Workload.weights."""
+    if not model.n_inputs:
+        return ()
+    sizes = [model.n_inputs, *[model.width] * model.n_hidden, 4]
+    arrays: list[np.ndarray] = []
+    for a, b in itertools.pairwise(sizes):
+        arrays += [weights[: a * b].reshape(a, b), weights[a * b : (a + 1) * b]]
+        weights = weights[(a + 1) * b :]
+    arrays[-2:] = (array[..., :3] for array in arrays[-2:])
+    return tuple(np.ascontiguousarray(array) for array in arrays)
 
 
 def free_distances(values: np.ndarray, step: float) -> np.ndarray:

@@ -61,9 +61,9 @@ def test_torch_computes_what_the_oracle_does(model, scene, scaled, grid):
     if scene == "sphere":  # some samples have a colour, some have none
         assert 0.05 < (weights[weights > 0] > 1e-4).mean() < 0.95
     found = torch_models.TorchModels(work, torch_models.Choices())
-    for parts in (1, 3):
+    for parts, sparse in ((1, False), (3, True)):
         for scattering in ("rows", "pairs"):
-            found.choices = torch_models.Choices(parts=parts, scattering=scattering)
+            found.choices = torch_models.Choices(parts=parts, scattering=scattering, sparse=sparse)
             found.step()
             found.step()  # a gradient that is not zeroed would show
             assert reference.relative_error(found.rgb(), rgb) < 1e-5
@@ -93,11 +93,12 @@ def test_pairs_add_what_rows_do(size):
     torch.testing.assert_close(pairs, rows)
 
 
-@pytest.mark.parametrize("way", ["all", "rows"])
-def test_adam_leaves_alone_what_no_ray_has_touched(way):
+@pytest.mark.parametrize(("way", "named"), [("all", False), ("rows", False), ("rows", True)])
+def test_adam_leaves_alone_what_no_ray_has_touched(way, named):
     """The others it updates as torch.optim.Adam does."""
     generator = torch.Generator().manual_seed(0)
     values = torch.rand(50, 4, generator=generator)
+    rows = torch.arange(25) if named else None
     expected = values.clone().requires_grad_()
     theirs = torch.optim.Adam([expected], lr=0.1, betas=(0.9, 0.99))
     gradient = torch.zeros(50, 4)
@@ -106,7 +107,7 @@ def test_adam_leaves_alone_what_no_ray_has_touched(way):
     first = values.clone()
     for _ in range(3):
         gradient[:20, :3] = torch.rand(20, 3, generator=generator) + 0.1
-        ours.step()
+        ours.step(rows)
         expected.grad = gradient.clone()
         theirs.step()
     torch.testing.assert_close(values[:20, :3], expected.detach()[:20, :3])

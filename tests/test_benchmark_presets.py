@@ -1,4 +1,4 @@
-"""The benchmarks of configurations and of DVGO's step run, and write complete records."""
+"""The benchmarks of configurations and of whole steps run, and write complete records."""
 
 import pytest
 from test_benchmarks import is_interval, run
@@ -37,10 +37,19 @@ def test_a_candidate_that_there_is_not_is_refused(text, named):
         presets.configured(text)
 
 
-def test_dvgo_step(tmp_path):
-    options = ("--grid", "10", "--rays", "48", "--rounds", "2", "--threads", "1")
-    record, _ = run("dvgo_step.py", tmp_path / "record.json", *options)
-    assert [row["scene"] for row in record["rows"]] == ["dense", "sphere"]
+@pytest.mark.parametrize(
+    ("scenes", "models"),
+    [(("dense", "sphere"), ("dvgo",)), (("builtin:room",), ("rgb", "features"))],
+)
+def test_against_torch(tmp_path, scenes, models):
+    options = (*scenes, "--models", *models, "--grid", "10", "--rays", "48", "--steps", "250")
+    options += ("--downscale", "8", "--rounds", "2", "--threads", "1")
+    record, _ = run("against_torch.py", tmp_path / "record.json", *options)
+    cases = [(row["scene"], row["model"]) for row in record["rows"]]
+    assert cases == [(scene, model) for scene in scenes for model in models]
     for row in record["rows"]:
-        assert is_interval(row["over_warpnerf"]) and is_interval(row["torch_ms"])
+        for what in ("step", "pass"):
+            assert is_interval(row[f"{what}_over_warpnerf"]) and is_interval(
+                row[f"torch_{what}_ms"]
+            )
         assert row["n_samples"] > 0 and row["torch_choices"]["1"]

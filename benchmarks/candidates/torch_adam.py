@@ -1,7 +1,8 @@
 """Adam in eager torch that leaves entries alone whose gradient is exactly zero, as DVGO's does.
 
 Two ways, decided by timing: all entries, and what has no gradient put back; or those rows of which
-any entry has one, gathered and put back. The former wins where most nodes are touched.
+any entry has one, or that are named, gathered and put back. The former wins where most nodes are
+touched.
 """
 
 from __future__ import annotations
@@ -40,12 +41,20 @@ class MaskedAdam:
         self.way: Way = "all"
 
     @torch.no_grad()
-    def step(self) -> None:
-        """Update all tables from their gradients."""
+    def step(self, rows: torch.Tensor | None = None) -> None:
+        """Update all tables from their gradients.
+
+        Args:
+            rows: [n] those that may have one; None: any. What is not known is looked for.
+        """
         self._update += 1
         rate = self._rate * math.sqrt(1.0 - BETA2**self._update) / (1.0 - BETA1**self._update)
         for table in self._tables:
-            (self._all if self.way == "all" else self._rows)(table, rate)
+            if self.way == "all":
+                self._all(table, rate)
+            else:
+                at = table.gradient.any(dim=1).nonzero()[:, 0] if rows is None else rows
+                self._rows(table, at, rate)
 
     def _all(self, table: Moments, rate: float) -> None:
         none = table.gradient == 0.0
@@ -57,8 +66,7 @@ class MaskedAdam:
         torch.div(table.mean, step, out=step)
         table.values.addcmul_(kept, step, value=-rate)
 
-    def _rows(self, table: Moments, rate: float) -> None:
-        at = table.gradient.any(dim=1).nonzero()[:, 0]
+    def _rows(self, table: Moments, at: torch.Tensor, rate: float) -> None:
         part = Moments(
             *(
                 array.index_select(0, at)

@@ -33,6 +33,9 @@ from workload import DENSITY_SHIFT, Workload
 
 Compositing = Literal["padded", "segmented"]
 
+BLOCK = 8
+"""Steps that are looked at together first, where some space is free."""
+
 
 class ScaleGradient(torch.autograd.Function):
     """The paper's operation: identity forward, gradients times min(1, (t / D)^2) backward."""
@@ -81,37 +84,65 @@ class TorchSpace:
             device: As torch names it.
         """
         self._cells = torch.tensor(free.shape, device=device)
-        self._occupied = torch.from_numpy((free == 0).ravel()).to(device) if free.any() else None
+        self._distance = torch.from_numpy(free.ravel()).to(device) if free.any() else None
 
     def samples(
         self, origins: torch.Tensor, directions: torch.Tensor, steps: torch.Tensor
     ) -> Samples:
-        """Where rays [n_rays, 3] need samples, of those at distances steps [n_steps]."""
+        """Where rays [n_rays, 3] need samples, of those at distances steps [n_steps].
+
+        Args:
+            origins: In coordinates in which the box is [-1, 1]^3.
+            directions: Likewise, a unit of distance long.
+            steps: Evenly spaced.
+        """
         at_faces = torch.stack([(-1.0 - origins) / directions, (1.0 - origins) / directions])
-        t_enter = at_faces.amin(0).amax(1)
-        t_exit = at_faces.amax(0).amin(1)
-        inside = (steps >= t_enter[:, None]) & (steps <= t_exit[:, None])
-        n_rays, n_steps = inside.shape
-        index = inside.view(-1).nonzero().view(-1)
-        if index.shape[0] == n_rays * n_steps:
-            t = steps.expand(n_rays, n_steps).reshape(-1)
-            q = torch.addcmul(origins[:, None], steps[:, None], directions[:, None]).view(-1, 3)
+        first = torch.searchsorted(steps, at_faces.amin(0).amax(1))
+        end = torch.searchsorted(steps, at_faces.amax(0).amin(1), right=True).maximum(first)
+        n_rays, n_steps = len(origins), len(steps)
+        if self._distance is None:
+            ray, k = expand(end - first, first)
+            if len(k) == n_rays * n_steps:
+                q = torch.addcmul(origins[:, None], steps[:, None], directions[:, None])
+                index = torch.arange(len(k), device=k.device)
+                return Samples(index, steps.repeat(n_rays), q.view(-1, 3), True)
         else:
-            ray = index // n_steps
-            t = steps[index - ray * n_steps]
-            q = torch.addcmul(origins[ray], t[:, None], directions[ray])
+            ray, begin = expand((end - first + BLOCK - 1) // BLOCK, first, BLOCK)
+            reach = 0.5 * (BLOCK - 1) * (steps[1] - steps[0])
+            q = torch.addcmul(origins[ray], (steps[begin] + reach)[:, None], directions[ray])
+            in_cells = reach * (directions.abs() * (0.5 * self._cells)).amax(1)
+            near = self._distance[self._cell(q)] <= in_cells.ceil()[ray]
+            ray, begin = ray[near], begin[near]
+            k = begin[:, None] + torch.arange(BLOCK, device=begin.device)
+            at = (k < end[ray, None]).view(-1).nonzero()[:, 0]
+            ray, k = ray[at // BLOCK], k.view(-1)[at]
+        t = steps[k]
+        q = torch.addcmul(origins[ray], t[:, None], directions[ray])
         needed = self.needed(q)
         if needed is not None:
-            index, t, q = index[needed], t[needed], q[needed]
-        return Samples(index, t, q, index.shape[0] == n_rays * n_steps)
+            ray, k, t, q = ray[needed], k[needed], t[needed], q[needed]
+        return Samples(ray * n_steps + k, t, q, False)
 
     def needed(self, q: torch.Tensor) -> torch.Tensor | None:
         """Which of q [n, 3] in the box do not lie in free cells; None: all."""
-        if self._occupied is None:
+        if self._distance is None:
             return None
-        cell = ((q + 1.0) * (0.5 * self._cells)).long().minimum(self._cells - 1)
-        flat = (cell[:, 0] * self._cells[1] + cell[:, 1]) * self._cells[2] + cell[:, 2]
-        return self._occupied[flat].nonzero().view(-1)
+        return (self._distance[self._cell(q)] == 0).nonzero().view(-1)
+
+    def _cell(self, q: torch.Tensor) -> torch.Tensor:
+        """That of each q [n, 3], or the nearest one of what is outside the box."""
+        cell = ((q + 1.0) * (0.5 * self._cells)).long().clamp_(min=0).minimum(self._cells - 1)
+        return (cell[:, 0] * self._cells[1] + cell[:, 1]) * self._cells[2] + cell[:, 2]
+
+
+def expand(
+    counts: torch.Tensor, first: torch.Tensor, stride: int = 1
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """So many entries of each ray: whose they are, and first, first + stride, and so on."""
+    ray = torch.repeat_interleave(counts)
+    begin = counts.cumsum(0) - counts
+    entry = torch.arange(len(ray), device=ray.device) - begin[ray]
+    return ray, first[ray] + stride * entry
 
 
 class TorchScene(TorchSpace):

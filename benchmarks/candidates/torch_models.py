@@ -1,4 +1,4 @@
-"""Eager torch for models with more features than a colour: sh, deferred, features, dvgo.
+"""Eager torch for sh, deferred, features and dvgo; late in trainings, for rgb too.
 
 Samples are packed. embedding_bag reads the grid without a copy of eight nodes for each sample;
 autograd does what lies between nodes and loss, in parts of the rays; gradients go to the nodes in
@@ -26,7 +26,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from measuring import Stopwatch
-from workload import DENSITY_SHIFT, MODELS, Workload
+from workload import MODELS, Workload
 
 from candidates.torch_eager import TorchSpace
 
@@ -110,17 +110,20 @@ class Interpolate(torch.autograd.Function):
         node: torch.Tensor,  # [n_samples, 8] int32
         share: torch.Tensor,  # [n_samples, 8]
         scattering: Scattering,
+        known: torch.Tensor | None,  # [n_samples, n_values] what they read, if somebody has looked
     ) -> torch.Tensor:
         ctx.save_for_backward(node, share)
         ctx.gradient = gradient
         ctx.scattering = scattering
+        if known is not None:
+            return known
         return F.embedding_bag(node, table, mode="sum", per_sample_weights=share)
 
     @staticmethod
     def backward(ctx: Any, *adj: torch.Tensor) -> tuple[None, ...]:
         add = add_by_pairs if ctx.scattering == "pairs" else add_by_rows
         add(ctx.gradient, *ctx.saved_tensors, adj[0])
-        return (None,) * 6
+        return (None,) * 7
 
 
 class Composite(torch.autograd.Function):
@@ -236,6 +239,9 @@ class Choices:
     """Parts into which the rays are cut, so that what one needs stays in the caches."""
     scattering: Scattering = "rows"
     """How gradients are handed to the nodes."""
+    sparse: bool = False
+    """Whether it is noted which nodes a step has touched, so that the next one zeroes no others,
+    nor an optimiser updates them."""
     threads: int = 1
     """torch.set_num_threads."""
 
@@ -243,13 +249,15 @@ class Choices:
 class Part(NamedTuple):
     """Samples of some rays, packed; and where they lie."""
 
-    index: torch.Tensor  # [n_samples] in [n_rays, n_steps], flattened
+    index: torch.Tensor  # [n_samples] in [n_rays, width], flattened
+    width: int  # samples of the ray that has most
     ray: torch.Tensor  # [n_samples], ascending
     first: torch.Tensor  # [n_rays] each one's first sample
     node: torch.Tensor  # [n_samples, 8] int32
     share: torch.Tensor  # [n_samples, 8]
     factor: torch.Tensor  # [n_samples] on gradients
     directions: torch.Tensor  # [n_rays, 3]
+    density: torch.Tensor | None  # [n_samples] raw, where it was needed to find the samples
 
 
 class TorchModels:
@@ -265,6 +273,10 @@ class TorchModels:
             torch.from_numpy(array).to(device)
             for array in (work.origins, work.directions, work.target_rgb)
         ]
+        self._centre, self._half = (
+            torch.from_numpy(0.5 * (work.box[1] + sign * work.box[0])).float().to(device)
+            for sign in (1.0, -1.0)
+        )
         self._background = torch.tensor(work.background, device=device)
         nodes = torch.tensor(work.values.shape[:3], device=device)
         self._to_nodes = 0.5 * (nodes[:, None] - 1)
@@ -277,6 +289,9 @@ class TorchModels:
         self._corners = (corners @ strides).int().to(device)  # [8]
         self._values = torch.from_numpy(work.values.reshape(-1, work.values.shape[3])).to(device)
         self._gradient = torch.zeros_like(self._values)
+        self._cells = torch.zeros(len(self._values), dtype=torch.bool, device=device)
+        self.touched: torch.Tensor | None = None
+        """[n] nodes that the last step has touched; None: any."""
         self._apart = MODELS[work.model].threshold is not None
         if self._apart:  # most samples need nothing but their density
             self._densities = self._values[:, :1].contiguous()
@@ -284,8 +299,10 @@ class TorchModels:
         self.network = [torch.from_numpy(array).to(device) for array in work.network]
         for parameter in self.network:
             parameter.requires_grad_()
+        self._optical_step = work.density_scale * work.step
         self._on = torch.zeros((), device=device, requires_grad=True)
         self._colors: Callable[[Part], torch.Tensor] = {
+            "rgb": self._rgb,
             "sh": self._sh,
             "deferred": self._deferred,
             "features": self._features,
@@ -295,9 +312,12 @@ class TorchModels:
     def step(self) -> None:
         """Forward, loss and adjoint, part after part."""
         torch.set_num_threads(self.choices.threads)
-        self._gradient.zero_()
-        if self._apart:
-            self._density_gradient.zero_()
+        for _, gradient in self.tables():
+            if self.touched is None:
+                gradient.zero_()
+            else:
+                gradient.index_fill_(0, self.touched, 0.0)
+        self._cells.zero_()
         for parameter in self.network:
             parameter.grad = None
         n_rays = len(self._work.origins)
@@ -305,6 +325,14 @@ class TorchModels:
             rgb = self._colors(self._part(part))
             loss = (rgb - self._rays[2][part]).square().sum() / n_rays
             loss.backward()
+        self.touched = self._touched() if self.choices.sparse else None
+
+    def _touched(self) -> torch.Tensor:
+        """The nodes of the cells in which samples were."""
+        touched = self._cells.clone()
+        for corner in self._corners[1:].tolist():
+            touched[corner:] |= self._cells[:-corner]
+        return touched.nonzero()[:, 0]
 
     def _parts(self) -> list[slice]:
         n_rays, parts = len(self._work.origins), self.choices.parts
@@ -315,9 +343,10 @@ class TorchModels:
     def _part(self, part: slice) -> Part:
         work = self._work
         origins, directions, _ = (array[part] for array in self._rays)
-        index, t, q, _ = self._space.samples(origins, directions, self._steps)
+        index, t, q, _ = self._space.samples(
+            (origins - self._centre) / self._half, directions / self._half, self._steps
+        )
         ray = index // work.n_steps
-        counts = torch.bincount(ray, minlength=len(origins))
         # A row for each axis: columns of three or eight numbers are no vectors.
         u = (q.t() + 1.0).mul_(self._to_nodes)
         cell = torch.minimum(u.int(), self._last)
@@ -329,23 +358,63 @@ class TorchModels:
         for i, column in enumerate(columns):
             torch.mul(column, z, out=share[2 * i + 1])
             torch.sub(column, share[2 * i + 1], out=share[2 * i])
+        node, share = base[:, None] + self._corners, share.t().contiguous()
+        first, width, index = self._slots(ray, len(origins))
+        density = None
+        if work.transmittance_min > 0.0:
+            density = self._look(node, share)
+            lit = self._before(density, index, len(origins), width) >= work.transmittance_min
+            at = lit.nonzero()[:, 0]
+            ray, t, node, share, density = (
+                array.index_select(0, at) for array in (ray, t, node, share, density)
+            )
+            first, width, index = self._slots(ray, len(origins))
+        if self.choices.sparse:
+            self._cells.index_fill_(0, node[:, 0].long(), True)
         factor = (t / work.content_distance).square_().clamp_(max=1.0)
         return Part(
             index=index,
+            width=width,
             ray=ray,
-            first=counts.cumsum(0) - counts,
-            node=base[:, None] + self._corners,
-            share=share.t().contiguous(),
+            first=first,
+            node=node,
+            share=share,
             factor=factor if work.scaled else torch.ones_like(factor),
             directions=directions,
+            density=density,
         )
+
+    def _slots(self, ray: torch.Tensor, n_rays: int) -> tuple[torch.Tensor, int, torch.Tensor]:
+        """Each ray's first sample, the samples of the longest, and where in a table of so many
+        columns each lies."""
+        counts = torch.bincount(ray, minlength=n_rays)
+        first = counts.cumsum(0) - counts
+        width = max(1, int(counts.max()))
+        slot = torch.arange(len(ray), device=ray.device) - first.index_select(0, ray)
+        return first, width, slot.add_(ray, alpha=width)
+
+    def _look(self, node: torch.Tensor, share: torch.Tensor) -> torch.Tensor:
+        """Raw densities [n_samples], and nothing else of the nodes."""
+        if self._apart:
+            table = self._densities
+            return F.embedding_bag(node, table, mode="sum", per_sample_weights=share)[:, 0]
+        at = node.view(-1) * self._values.shape[1]
+        return self._values.view(-1).index_select(0, at).view(-1, 8).mul_(share).sum(1)
+
+    def _before(
+        self, raw_density: torch.Tensor, index: torch.Tensor, n_rays: int, width: int
+    ) -> torch.Tensor:
+        """The light that comes to each sample."""
+        tau = F.softplus(raw_density + self._work.density_shift).mul_(self._optical_step)
+        table = tau.new_zeros(n_rays * width).index_copy_(0, index, tau).view(n_rays, width)
+        return torch.exp_(table - table.cumsum(1)).view(-1).index_select(0, index)
 
     def _weights(self, raw_density: torch.Tensor, part: Part) -> tuple[torch.Tensor, torch.Tensor]:
         """Of samples [n_samples], and light that passes [n_rays]."""
-        sigma = Scale.apply(F.softplus(raw_density + DENSITY_SHIFT), part.factor)
-        n_rays, n_steps = len(part.directions), self._work.n_steps
-        tau = sigma.new_zeros(n_rays * n_steps).index_copy(0, part.index, sigma * self._work.step)
-        tau = tau.view(n_rays, n_steps)
+        sigma = Scale.apply(F.softplus(raw_density + self._work.density_shift), part.factor)
+        n_rays, width = len(part.directions), part.width
+        tau = sigma.new_zeros(n_rays * width).index_copy(0, part.index, sigma * self._optical_step)
+        tau = tau.view(n_rays, width)
         depth = tau.cumsum(1)
         weight = torch.exp(tau - depth) * -torch.expm1(-tau)
         return weight.view(-1).index_select(0, part.index), torch.exp(-depth[:, -1])
@@ -353,11 +422,20 @@ class TorchModels:
     def _interpolate(self, node: torch.Tensor, share: torch.Tensor) -> torch.Tensor:
         """All raw values [n_samples, n_values]."""
         scattering = self.choices.scattering
-        return Interpolate.apply(self._on, self._values, self._gradient, node, share, scattering)
+        return Interpolate.apply(
+            self._on, self._values, self._gradient, node, share, scattering, None
+        )
 
     def _read(self, part: Part) -> tuple[torch.Tensor, torch.Tensor]:
         """Raw densities [n_samples] and all raw values [n_samples, n_values]."""
         return Unpack.apply(self._interpolate(part.node, part.share))
+
+    def _rgb(self, part: Part) -> torch.Tensor:
+        density, raw = self._read(part)
+        weight, passed = self._weights(density, part)
+        channels = Scale.apply(torch.sigmoid(raw), part.factor)
+        seen = Composite.apply(weight, channels, part.ray, part.first)[:, 1:]
+        return seen + passed[:, None] * self._background
 
     def _sh(self, part: Part) -> torch.Tensor:
         """Features times harmonics, summed by a product with zeros and ones."""
@@ -383,8 +461,9 @@ class TorchModels:
 
     def _features(self, part: Part) -> torch.Tensor:
         """Of the first layer, what comes of the direction is done once for a ray."""
+        known = None if part.density is None else part.density[:, None]
         density = Interpolate.apply(
-            self._on, self._densities, self._density_gradient, part.node, part.share, "rows"
+            self._on, self._densities, self._density_gradient, part.node, part.share, "rows", known
         )
         weight, passed = self._weights(density[:, 0], part)
         model = MODELS[self._work.model]

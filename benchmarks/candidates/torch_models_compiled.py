@@ -92,9 +92,9 @@ class CompiledModels(TorchModels):
     def _composited(self, density: torch.Tensor, part: Part) -> tuple[torch.Tensor, torch.Tensor]:
         """Weights [n_samples] and light that passes [n_rays]."""
         sigma = scale(F.softplus(density + DENSITY_SHIFT), part.factor)
-        n_rays, n_steps = len(part.directions), self._work.n_steps
-        tau = sigma.new_zeros(n_rays * n_steps).index_copy(0, part.index, sigma * self._work.step)
-        tau = tau.view(n_rays, n_steps)
+        n_rays, width = len(part.directions), part.width
+        tau = sigma.new_zeros(n_rays * width).index_copy(0, part.index, sigma * self._work.step)
+        tau = tau.view(n_rays, width)
         depth = tau.cumsum(1)
         weight = torch.exp(tau - depth) * -torch.expm1(-tau)
         return weight.view(-1)[part.index], torch.exp(-depth[:, -1])

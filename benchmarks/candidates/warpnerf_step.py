@@ -23,9 +23,19 @@ from warpnerf.runtime.parallel import LaunchCache, Workers
 
 @wp.func_native(
     """
-const size_t n = sizeof(*values.data);
-if (count == TILE) memset(values.data + node, 0, TILE * n);  // as long as the compiler knows
-else memset(values.data + node, 0, count * n);
+constexpr size_t BYTES = sizeof(*values.data);
+#if !defined(__CUDA_ARCH__)
+typedef float line __attribute__((ext_vector_type(16)));
+if (BYTES > 16 && count == TILE && ((size_t)values.data & 63) == 0) {  // past the caches
+    char* tile = (char*)(values.data + node);
+    for (size_t at = 0; at < TILE * BYTES; at += 64) {
+        __builtin_nontemporal_store(line(0.0f), (line*)(tile + at));
+    }
+    return;
+}
+#endif
+if (count == TILE) memset(values.data + node, 0, TILE * BYTES);  // as long as the compiler knows
+else memset(values.data + node, 0, count * BYTES);
 """.replace("TILE", str(TILE))
 )
 def clear_nodes(values: wp.array(dtype=Any), node: int, count: int):
