@@ -32,8 +32,16 @@ def options(doc: str) -> argparse.ArgumentParser:
     """A parser of what all benchmarks have in common, described by the first line of their doc."""
     parser = argparse.ArgumentParser(description=doc.split("\n", maxsplit=1)[0])
     parser.add_argument("--device", default="cpu", help="cpu, cuda:0")
-    parser.add_argument("--output", type=Path, help="where the record goes")
+    parser.add_argument("--output", type=_file, help="where the record goes, a file")
     return parser
+
+
+def _file(text: str) -> Path:
+    """A path that is no folder's; said before anything is measured."""
+    path = Path(text)
+    if path.is_dir():
+        raise argparse.ArgumentTypeError(f"{path} is a folder; name a file in it.")
+    return path
 
 
 def add_model(parser: argparse.ArgumentParser) -> None:
