@@ -58,8 +58,8 @@ from warpnerf.runtime.parallel import Workers
 from warpnerf.training.optim import adam_step, first_states
 from warpnerf.training.trainer import Trainer
 
-RATE = 0.1
-"""Of the grid."""
+RATE = 1e-8
+"""How far an update moves an entry: too little to change what the next step has to do."""
 AT_ENDS = 1e-4
 """The share of the gradient's values that may differ by more where rays end early: which sample is
 the last may hang on rounding."""
@@ -75,7 +75,7 @@ class WarpStep:
         self._workers = workers = Workers("cpu", threads)
         self._free, self._batch = work.free_cells(workers), work.batch(workers)
         model, grid, weights = work.warp_model(), work.voxel_grid(workers), work.weights(workers)
-        self._config = OptimConfig(learning_rate_density=RATE, learning_rate_rgb=RATE)
+        self._config = OptimConfig()
         self._parameters = parameters_of(model, grid, weights, self._config)
         self._states = first_states(self._parameters, workers)
         self._update = 0
@@ -93,7 +93,7 @@ class WarpStep:
             self._states,
             self._pass.gradients,
             self._update,
-            1.0,
+            RATE,
             self._config,
             self._workers,
         )
@@ -107,7 +107,7 @@ class TorchStep:
         self._pass = TorchModels(work, Choices(threads=threads))
         self._grid = MaskedAdam(self._pass.tables(), RATE)
         network = self._pass.network
-        self._network = torch.optim.Adam(network, lr=1e-3, betas=(0.9, 0.99)) if network else None
+        self._network = torch.optim.Adam(network, lr=RATE, betas=(0.9, 0.99)) if network else None
 
     def gradient(self) -> None:
         """The pass."""
@@ -156,7 +156,7 @@ class TorchStep:
 
 
 def made(scene: Any, model: ModelName, grid: int, n_rays: int) -> Workload:
-    """A case of throughput.py; of dvgo in steps of half a voxel, as everywhere."""
+    """A case of throughput.py; of dvgo in steps of half a voxel, of others in steps of one."""
     reach = CAMERA_DISTANCE + math.sqrt(3.0)
     n_steps = round(reach * (grid - 1) * (1.0 if model == "dvgo" else 0.5))
     return make_workload("random", grid, n_rays, n_steps, scene=scene, model=model)

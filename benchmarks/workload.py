@@ -89,7 +89,7 @@ MODELS: dict[ModelName, Model] = {
 """Those of warpnerf as they are by default, and `features` as DVGO has it."""
 
 EVERYDAY = tuple(name for name in MODELS if name != "dvgo")
-"""Those that are compared by default; dvgo_step.py is about the other one."""
+"""Those that are compared by default; against_torch.py is about the other one."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -100,7 +100,7 @@ class Workload:
     """[X, Y, Z, n_values] float32 raw density, raw features (of rgb: raw rgb), zeros."""
     free: np.ndarray
     """[MX, MY, MZ] uint8, over the box: cells from each to the nearest needing samples, diagonal
-    neighbours being one apart; 0 there. Nobody has to look: free cells hold no density."""
+    neighbours being one apart; 0 there. Nobody has to look: free cells are left out."""
     origins: np.ndarray
     """[n_rays, 3] float32, scene units."""
     directions: np.ndarray

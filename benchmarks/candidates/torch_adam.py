@@ -45,7 +45,7 @@ class MaskedAdam:
         """Update all tables from their gradients.
 
         Args:
-            rows: [n] those that may have one; None: any. What is not known is looked for.
+            rows: [n] that may have a gradient; None: found by looking.
         """
         self._update += 1
         rate = self._rate * math.sqrt(1.0 - BETA2**self._update) / (1.0 - BETA1**self._update)

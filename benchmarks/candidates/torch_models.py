@@ -240,8 +240,8 @@ class Choices:
     scattering: Scattering = "rows"
     """How gradients are handed to the nodes."""
     sparse: bool = False
-    """Whether it is noted which nodes a step has touched, so that the next one zeroes no others,
-    nor an optimiser updates them."""
+    """Whether it is noted which nodes a step has touched, so that the next one zeroes only these,
+    and an optimiser updates only these."""
     threads: int = 1
     """torch.set_num_threads."""
 
@@ -287,7 +287,7 @@ class TorchModels:
         corners = torch.tensor(list(itertools.product((0, 1), repeat=3)))
         self._strides = strides.int().tolist()
         self._corners = (corners @ strides).int().to(device)  # [8]
-        self._values = torch.from_numpy(work.values.reshape(-1, work.values.shape[3])).to(device)
+        self._values = torch.tensor(work.values.reshape(-1, work.values.shape[3]), device=device)
         self._gradient = torch.zeros_like(self._values)
         self._cells = torch.zeros(len(self._values), dtype=torch.bool, device=device)
         self.touched: torch.Tensor | None = None
@@ -296,7 +296,7 @@ class TorchModels:
         if self._apart:  # most samples need nothing but their density
             self._densities = self._values[:, :1].contiguous()
             self._density_gradient = torch.zeros_like(self._densities)
-        self.network = [torch.from_numpy(array).to(device) for array in work.network]
+        self.network = [torch.tensor(array, device=device) for array in work.network]
         for parameter in self.network:
             parameter.requires_grad_()
         self._optical_step = work.density_scale * work.step

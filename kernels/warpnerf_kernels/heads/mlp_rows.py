@@ -34,8 +34,8 @@ struct Few { enum { value = 4 }; };
 struct Many { enum { value = MOST_ROWS }; };
 struct Several { enum { value = WIDTH % (MOST_VECS * LANES) ? 1 : MOST_VECS }; };  // of a layer
 struct Inputs { enum { value = PADDED % (MOST_VECS * LANES) ? 1 : MOST_VECS }; };
-// Rows that go through a layer before any goes through the next: a vector's column of weights stays
-// in the innermost cache as long. Arrays have as many entries, of which blocks may reach beyond the
+// Rows that go through a layer before any goes through the next: its columns of weights stay in the
+// innermost cache meanwhile. Arrays have an entry for each, as the last block may reach beyond the
 // rows that there are.
 constexpr int GROUP = 32, MOST_BLOCKS = GROUP / Few::value;
 auto by_groups = [&](int n, auto visit) {
@@ -58,8 +58,8 @@ auto units_four_times = [&](const float* h) -> vec {
 auto outputs_four_times = [&](quad q) -> vec {
     return __builtin_shufflevector(q, q, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3);
 };
-// What of a block's inputs is looked at: all, or the units that are not 0 in every one of its rows.
-// Neighbouring samples share them, so ReLU saves a third to two thirds of the work.
+// What of a block's inputs is looked at: all, or the units that at least one of its rows has above
+// 0. Neighbouring samples share them, so ReLU saves a third to two thirds of the work.
 struct Every { int n; int operator[](int k) const { return k; } };
 struct Lit { int n; int units[WIDTH + LANES]; int operator[](int k) const { return units[k]; } };
 const Every every_input = {INPUTS};
