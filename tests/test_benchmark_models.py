@@ -11,7 +11,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 
 import workload
-from candidates import torch_adam, torch_models
+from candidates import torch_adam, torch_models, torch_nodes
 
 
 def oracle(work: workload.Workload) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -85,29 +85,31 @@ def test_pairs_add_what_rows_do(size):
     share = torch.rand(n, 8, generator=generator)
     adj_raw = torch.rand(n, 4, generator=generator)
     rows, pairs = torch.zeros(2, n_nodes, 4)
-    torch_models.add_by_rows(rows, node, share, adj_raw)
-    torch_models.add_by_pairs(pairs, node, share, adj_raw)
+    torch_nodes.add_by_rows(rows, node, share, adj_raw)
+    torch_nodes.add_by_pairs(pairs, node, share, adj_raw)
     torch.testing.assert_close(pairs, rows)
     assert bool((rows > 0).all())
-    torch_models.add_by_pairs(pairs, node[:0], share[:0], adj_raw[:0])
+    torch_nodes.add_by_pairs(pairs, node[:0], share[:0], adj_raw[:0])
     torch.testing.assert_close(pairs, rows)
 
 
 @pytest.mark.parametrize(("way", "named"), [("all", False), ("rows", False), ("rows", True)])
-def test_adam_leaves_alone_what_no_ray_has_touched(way, named):
+def test_adam_leaves_alone_what_no_ray_has_touched(way, named, monkeypatch):
     """The others it updates as torch.optim.Adam does."""
     generator = torch.Generator().manual_seed(0)
     values = torch.rand(50, 4, generator=generator)
-    rows = torch.arange(25) if named else None
+    table = torch_nodes.Table(values, torch.arange(8))
+    table.touched = torch.arange(25) if named else None
     expected = values.clone().requires_grad_()
     theirs = torch.optim.Adam([expected], lr=0.1, betas=(0.9, 0.99))
-    gradient = torch.zeros(50, 4)
-    ours = torch_adam.MaskedAdam([(values, gradient)], 0.1)
+    gradient = table.gradient
+    monkeypatch.setattr(torch_adam, "PIECE", 4 * 7)  # neither the rows nor all of them at once
+    ours = torch_adam.MaskedAdam([table], 0.1)
     ours.way = way
     first = values.clone()
     for _ in range(3):
         gradient[:20, :3] = torch.rand(20, 3, generator=generator) + 0.1
-        ours.step(rows)
+        ours.step()
         expected.grad = gradient.clone()
         theirs.step()
     torch.testing.assert_close(values[:20, :3], expected.detach()[:20, :3])

@@ -1,18 +1,9 @@
 """Eager torch for sh, deferred, features and dvgo; late in trainings, for rgb too.
 
-Samples are packed. embedding_bag reads the grid without a copy of eight nodes for each sample;
-autograd does what lies between nodes and loss, in parts of the rays; gradients go to the nodes in
-place. `features` has its densities apart, since most samples need nothing else, and does once for a
-ray what its network makes of the direction. Milliseconds of the two ways to hand gradients to the
-nodes, in a whole step of 4096 rays on one thread, 160^3 grid, dense:
-
-                      sh    deferred    features
-    index_add       2341        1045        1565
-    add_by_pairs    1594         641        1279
-
-Tried for the adjoint and slower: index_put and scatter_add with rows, a sparse matrix (coordinates
-or rows) times the gradients, sorting all nodes and embedding_bag. For reading: index_select with
-bmm, grid_sample, a sparse matrix. Parts and the way to the nodes are decided by timing.
+Samples are packed; autograd does what lies between nodes and loss, in parts of the rays, and
+torch_nodes.py reads the nodes. `features` has its densities apart, since most samples need nothing
+else, and does once for a ray what its network makes of the direction. How many parts, and how
+gradients go to the nodes, is decided by timing.
 """
 
 from __future__ import annotations
@@ -20,7 +11,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -29,101 +20,7 @@ from measuring import Stopwatch
 from workload import MODELS, Workload
 
 from candidates.torch_eager import TorchSpace
-
-PIECE = 32768
-"""Samples whose gradient is handed to the nodes at once."""
-REST = 0.02
-"""Share of samples for which another round of `add_by_pairs` is not worth it."""
-
-Scattering = Literal["rows", "pairs"]
-
-
-def add_by_rows(
-    gradient: torch.Tensor,  # [n_nodes, n_values], added to
-    node: torch.Tensor,  # [n_samples, 8] int32
-    share: torch.Tensor,  # [n_samples, 8]
-    adj_raw: torch.Tensor,  # [n_samples, n_values]
-) -> None:
-    """Hand the gradients of samples to nodes: a row for each of the eight."""
-    n, n_values = adj_raw.shape
-    if n_values == 1:  # one after the other, which is faster than to sort them
-        gradient.view(-1).scatter_add_(0, node.view(-1).long(), (share * adj_raw).view(-1))
-        return
-    for begin in range(0, n, PIECE):
-        part = slice(begin, min(begin + PIECE, n))
-        parcels = share[part, :, None] * adj_raw[part, None]
-        gradient.index_add_(0, node[part].view(-1), parcels.view(-1, n_values))
-
-
-def add_by_pairs(
-    gradient: torch.Tensor,  # [n_nodes, n_values], added to
-    node: torch.Tensor,  # [n_samples, 8] int32
-    share: torch.Tensor,  # [n_samples, 8]
-    adj_raw: torch.Tensor,  # [n_samples, n_values]
-) -> None:
-    """The same in rounds of samples that lie in different cells.
-
-    Sorting by cell is an eighth of the work of sorting by node, which index_add does. In a round no
-    node is met twice at the same corner: reading, adding and writing runs in parallel, on pairs of
-    nodes that follow each other along z. Pairs from an even node on do not overlap, nor do those
-    from an odd one.
-    """
-    if not len(node):
-        return
-    n_nodes, n_values = gradient.shape
-    pairs = [
-        gradient[odd : odd + (n_nodes - odd) // 2 * 2].view(-1, 2 * n_values) for odd in (0, 1)
-    ]
-    corners = (node[0, ::2] - node[0, 0]).tolist()
-    first, order = torch.sort(node[:, 0])
-    while len(first) > REST * len(node):
-        new = torch.ones_like(first, dtype=torch.bool)
-        torch.ne(first[1:], first[:-1], out=new[1:])
-        for odd in (0, 1):
-            at = (new & (first % 2 == odd)).nonzero()[:, 0]
-            low, sample = first.index_select(0, at), order.index_select(0, at)
-            for begin in range(0, len(low), PIECE // 4):
-                part = slice(begin, begin + PIECE // 4)
-                adj = adj_raw.index_select(0, sample[part])[:, None]
-                weights = share.index_select(0, sample[part]).view(-1, 4, 2, 1)
-                for i, corner in enumerate(corners):
-                    from_odd = (odd + corner) % 2
-                    rows = ((low[part] + (corner - from_odd)) >> 1).long()
-                    values = pairs[from_odd].index_select(0, rows)
-                    values.view(-1, 2, n_values).addcmul_(adj, weights[:, i])
-                    pairs[from_odd].index_copy_(0, rows, values)
-        more = ~new
-        first, order = first[more], order[more]
-    if len(first):
-        add_by_rows(gradient, node[order], share[order], adj_raw[order])
-
-
-class Interpolate(torch.autograd.Function):
-    """Nodes to samples; on the way back gradients are added to a table that stays."""
-
-    @staticmethod
-    def forward(
-        ctx: Any,
-        on: torch.Tensor,  # anything that requires a gradient, or there would be no way back
-        table: torch.Tensor,  # [n_nodes, n_values]
-        gradient: torch.Tensor,  # [n_nodes, n_values], added to
-        node: torch.Tensor,  # [n_samples, 8] int32
-        share: torch.Tensor,  # [n_samples, 8]
-        scattering: Scattering,
-        known: torch.Tensor | None,  # [n_samples, n_values] what they read, if somebody has looked
-    ) -> torch.Tensor:
-        ctx.save_for_backward(node, share)
-        ctx.gradient = gradient
-        ctx.scattering = scattering
-        if known is not None:
-            return known
-        return F.embedding_bag(node, table, mode="sum", per_sample_weights=share)
-
-    @staticmethod
-    def backward(ctx: Any, *adj: torch.Tensor) -> tuple[None, ...]:
-        add = add_by_pairs if ctx.scattering == "pairs" else add_by_rows
-        add(ctx.gradient, *ctx.saved_tensors, adj[0])
-        return (None,) * 7
+from candidates.torch_nodes import Interpolate, Scattering, Table
 
 
 class Composite(torch.autograd.Function):
@@ -287,15 +184,14 @@ class TorchModels:
         corners = torch.tensor(list(itertools.product((0, 1), repeat=3)))
         self._strides = strides.int().tolist()
         self._corners = (corners @ strides).int().to(device)  # [8]
-        self._values = torch.tensor(work.values.reshape(-1, work.values.shape[3]), device=device)
-        self._gradient = torch.zeros_like(self._values)
-        self._cells = torch.zeros(len(self._values), dtype=torch.bool, device=device)
-        self.touched: torch.Tensor | None = None
-        """[n] nodes that the last step has touched; None: any."""
-        self._apart = MODELS[work.model].threshold is not None
-        if self._apart:  # most samples need nothing but their density
-            self._densities = self._values[:, :1].contiguous()
-            self._density_gradient = torch.zeros_like(self._densities)
+        values = torch.tensor(work.values.reshape(-1, work.values.shape[3]), device=device)
+        self._nodes = Table(values, self._corners)
+        self.tables = [self._nodes]
+        """What nodes hold: all of it, or features and densities."""
+        self._densities: Table | None = None
+        if MODELS[work.model].threshold is not None:  # most samples need nothing but their density
+            self._densities = Table(values[:, :1].contiguous(), self._corners)
+            self.tables.append(self._densities)
         self.network = [torch.tensor(array, device=device) for array in work.network]
         for parameter in self.network:
             parameter.requires_grad_()
@@ -312,12 +208,8 @@ class TorchModels:
     def step(self) -> None:
         """Forward, loss and adjoint, part after part."""
         torch.set_num_threads(self.choices.threads)
-        for _, gradient in self.tables():
-            if self.touched is None:
-                gradient.zero_()
-            else:
-                gradient.index_fill_(0, self.touched, 0.0)
-        self._cells.zero_()
+        for table in self.tables:
+            table.clear()
         for parameter in self.network:
             parameter.grad = None
         n_rays = len(self._work.origins)
@@ -325,14 +217,8 @@ class TorchModels:
             rgb = self._colors(self._part(part))
             loss = (rgb - self._rays[2][part]).square().sum() / n_rays
             loss.backward()
-        self.touched = self._touched() if self.choices.sparse else None
-
-    def _touched(self) -> torch.Tensor:
-        """The nodes of the cells in which samples were."""
-        touched = self._cells.clone()
-        for corner in self._corners[1:].tolist():
-            touched[corner:] |= self._cells[:-corner]
-        return touched.nonzero()[:, 0]
+        for table in self.tables:
+            table.find_touched(self.choices.sparse)
 
     def _parts(self) -> list[slice]:
         n_rays, parts = len(self._work.origins), self.choices.parts
@@ -370,7 +256,7 @@ class TorchModels:
             )
             first, width, index = self._slots(ray, len(origins))
         if self.choices.sparse:
-            self._cells.index_fill_(0, node[:, 0].long(), True)
+            (self._densities or self._nodes).note(node[:, 0])
         factor = (t / work.content_distance).square_().clamp_(max=1.0)
         return Part(
             index=index,
@@ -395,11 +281,12 @@ class TorchModels:
 
     def _look(self, node: torch.Tensor, share: torch.Tensor) -> torch.Tensor:
         """Raw densities [n_samples], and nothing else of the nodes."""
-        if self._apart:
-            table = self._densities
+        if self._densities is not None:
+            table = self._densities.values
             return F.embedding_bag(node, table, mode="sum", per_sample_weights=share)[:, 0]
-        at = node.view(-1) * self._values.shape[1]
-        return self._values.view(-1).index_select(0, at).view(-1, 8).mul_(share).sum(1)
+        values = self._nodes.values
+        at = node.view(-1) * values.shape[1]
+        return values.view(-1).index_select(0, at).view(-1, 8).mul_(share).sum(1)
 
     def _before(
         self, raw_density: torch.Tensor, index: torch.Tensor, n_rays: int, width: int
@@ -422,9 +309,7 @@ class TorchModels:
     def _interpolate(self, node: torch.Tensor, share: torch.Tensor) -> torch.Tensor:
         """All raw values [n_samples, n_values]."""
         scattering = self.choices.scattering
-        return Interpolate.apply(
-            self._on, self._values, self._gradient, node, share, scattering, None
-        )
+        return Interpolate.apply(self._on, self._nodes, node, share, scattering, None)
 
     def _read(self, part: Part) -> tuple[torch.Tensor, torch.Tensor]:
         """Raw densities [n_samples] and all raw values [n_samples, n_values]."""
@@ -462,16 +347,17 @@ class TorchModels:
     def _features(self, part: Part) -> torch.Tensor:
         """Of the first layer, what comes of the direction is done once for a ray."""
         known = None if part.density is None else part.density[:, None]
-        density = Interpolate.apply(
-            self._on, self._densities, self._density_gradient, part.node, part.share, "rows", known
-        )
+        density = Interpolate.apply(self._on, self._densities, part.node, part.share, "rows", known)
         weight, passed = self._weights(density[:, 0], part)
         model = MODELS[self._work.model]
         seen = (weight.detach() > model.threshold).nonzero()[:, 0]
         ray = part.ray[seen]
         counts = torch.bincount(ray, minlength=len(passed))
         first = counts.cumsum(0) - counts
-        raw = self._interpolate(part.node[seen], part.share[seen])
+        node = part.node[seen]
+        if self.choices.sparse:
+            self._nodes.note(node[:, 0])
+        raw = self._interpolate(node, part.share[seen])
         encoded = view_encoding(part.directions, model.n_frequencies)
         weights, bias = self.network[:2]
         n_colours = model.n_own_colours
@@ -490,16 +376,11 @@ class TorchModels:
         light = Composite.apply(weight.index_select(0, seen), color, ray, first)
         return light + passed[:, None] * self._background
 
-    def tables(self) -> list[tuple[torch.Tensor, torch.Tensor]]:
-        """What nodes hold, and its gradient: [n_nodes, n] each."""
-        tables = [(self._values, self._gradient)]
-        return [*tables, (self._densities, self._density_gradient)] if self._apart else tables
-
     def gradient(self) -> np.ndarray:
         """[X, Y, Z, n_values]"""
-        gradient = self._gradient
-        if self._apart:
-            gradient = torch.cat([self._density_gradient, gradient[:, 1:]], dim=1)
+        gradient = self._nodes.gradient
+        if self._densities is not None:
+            gradient = torch.cat([self._densities.gradient, gradient[:, 1:]], dim=1)
         return gradient.cpu().numpy().reshape(self._work.values.shape)
 
     def network_gradient(self) -> np.ndarray:

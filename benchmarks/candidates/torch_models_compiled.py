@@ -43,7 +43,7 @@ class CompiledModels(TorchModels):
         self.network = [array.detach() for array in self.network]
         self._read_densities = compile_it(self._densities_of)
         self._train = compile_it(self._train_features if self._is_features else self._train_all)
-        self._seen_rgb = torch.empty(0)
+        self._gradient, self._seen_rgb = torch.empty(0), torch.empty(0)
         self._adj_network: tuple[torch.Tensor, ...] = ()
 
     @property
@@ -103,7 +103,8 @@ class CompiledModels(TorchModels):
         return values.new_zeros(n_rays, values.shape[1]).index_add(0, ray, values)
 
     def _densities_of(self, node: torch.Tensor, part: Part) -> tuple[torch.Tensor, torch.Tensor]:
-        density = self._gather(self._densities, node, part.share)[:, 0]
+        assert self._densities is not None
+        density = self._gather(self._densities.values, node, part.share)[:, 0]
         return density, self._composited(density, part)[0]
 
     def _loss(self, rgb: torch.Tensor) -> torch.Tensor:
@@ -137,9 +138,9 @@ class CompiledModels(TorchModels):
             seen = seen + passed[:, None] * self._background
             return self._loss(seen), seen
 
-        raw = self._gather(self._values, node, part.share)
+        raw = self._gather(self._nodes.values, node, part.share)
         (adj_raw, *adj_network), seen = self._differentiated(loss, raw, *self.network)
-        gradient = self._scatter(torch.zeros_like(self._values), node, part.share, adj_raw)
+        gradient = self._scatter(torch.zeros_like(self._nodes.values), node, part.share, adj_raw)
         return gradient, seen, tuple(adj_network)
 
     def _train_features(
@@ -164,12 +165,13 @@ class CompiledModels(TorchModels):
             return self._loss(seen), seen
 
         near, share = node[chosen], part.share[chosen]
-        raw = self._gather(self._values, near, share)
+        raw = self._gather(self._nodes.values, near, share)
         (adj_density, adj_raw, *adj_network), seen = self._differentiated(
             loss, density, raw, *self.network
         )
-        gradient = self._scatter(torch.zeros_like(self._values), near, share, adj_raw)
-        of_density = torch.zeros_like(self._densities)
+        gradient = self._scatter(torch.zeros_like(self._nodes.values), near, share, adj_raw)
+        assert self._densities is not None
+        of_density = torch.zeros_like(self._densities.values)
         of_density = self._scatter(of_density, node, part.share, adj_density[:, None])
         gradient = torch.cat([of_density, gradient[:, 1:]], dim=1)
         return gradient, seen, tuple(adj_network)

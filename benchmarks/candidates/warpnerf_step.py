@@ -1,4 +1,8 @@
-"""warpnerf: its training pass, and the zeroing that the optimiser does for it in training."""
+"""warpnerf: its training pass, and the zeroing that the optimiser does for it in training.
+
+Adam has just read what it zeroes. Here it has left the caches, where nodes are wide; so it is
+written past them, as reading it back would cost more than writing it.
+"""
 
 from functools import cache
 from typing import Any

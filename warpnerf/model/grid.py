@@ -122,6 +122,16 @@ class VoxelGrid:
         """From raw to density, as kernels take it."""
         return density_struct(types, self.density_shift, self.density_scale)
 
+    def copied_to(self, device: wp.Device) -> VoxelGrid:
+        """The same with values of its own.
+
+        Args:
+            device: Where they lie.
+        """
+        values = room_for_nodes(self.values.shape[0], self.values.dtype, device)
+        wp.copy(values, self.values)
+        return replace(self, values=values)
+
     def resized(
         self,
         workers: Workers,

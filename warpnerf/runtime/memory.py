@@ -21,6 +21,8 @@ CONTAINER_USES = (
     ),
 )
 """Likewise, what it uses, and how much of that are files, which make room when it is asked for."""
+LARGE_PAGE = 2 << 20
+"""Bytes of a large page."""
 MOUNTS = Path("/proc/mounts")
 """Where Linux says which file system a folder is in."""
 CORE_LIMITS = (
@@ -142,8 +144,8 @@ def prefer_large_pages(address: int, n_bytes: int) -> None:
         n_bytes: Its length.
     """
     advice, page = getattr(mmap, "MADV_HUGEPAGE", None), mmap.PAGESIZE
-    begin, end = address // page * page, (address + n_bytes) // page * page
-    if advice is None or end <= begin:
+    begin, end = -(-address // page) * page, (address + n_bytes) // page * page
+    if advice is None or end - begin < LARGE_PAGE:
         return
     with contextlib.suppress(OSError, AttributeError, TypeError):
         ctypes.CDLL(None).madvise(ctypes.c_void_p(begin), ctypes.c_size_t(end - begin), advice)

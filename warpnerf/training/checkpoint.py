@@ -18,7 +18,7 @@ from warpnerf_kernels.base.types import vector
 
 from warpnerf.checks import InputError
 from warpnerf.config import GROW_AT, Contraction, TrainConfig, config_from_json, config_to_json
-from warpnerf.model.grid import FreeCells, VoxelGrid, grid_size
+from warpnerf.model.grid import FreeCells, VoxelGrid, grid_size, room_for_nodes
 from warpnerf.model.interface import Model, n_weights
 from warpnerf.model.models import MODELS, Rgb, decode, to_json
 from warpnerf.model.parameters import parameters_of
@@ -298,12 +298,10 @@ def _field(header: _Header, tensors: dict[str, np.ndarray], path: Path, workers:
     )
     if not fits:
         refuse(path, "it holds values that cannot be rendered")
+    nodes = room_for_nodes(math.prod(values.shape[:3]), vector(model.n_floats), workers.device)
+    nodes.assign(values.reshape(-1, model.n_floats))
     grid = VoxelGrid(
-        values=wp.array(
-            values.reshape(-1, model.n_floats),
-            dtype=vector(model.n_floats),
-            device=workers.device,
-        ),
+        values=nodes,
         size=(values.shape[0], values.shape[1], values.shape[2]),
         box_min=np.array(header.box_min),
         box_max=np.array(header.box_max),

@@ -12,7 +12,7 @@ import warp as wp
 
 from warpnerf.checks import InputError
 from warpnerf.config import TrainConfig
-from warpnerf.model.grid import FreeCells, grid_size, room_for_nodes
+from warpnerf.model.grid import FreeCells, grid_size
 from warpnerf.model.interface import Model, parts_of
 from warpnerf.model.parameters import Parameter, first_weights, parameters_of
 from warpnerf.rendering.field import Field
@@ -297,10 +297,7 @@ class Trainer:
             return wp.clone(array, device=self.workers.device)
 
         field = state.field
-        values = field.grid.values
-        nodes = room_for_nodes(values.shape[0], values.dtype, self.workers.device)
-        wp.copy(nodes, values)
-        self.grid = replace(field.grid, values=nodes)
+        self.grid = field.grid.copied_to(self.workers.device)
         self.free = replace(field.free, distance=copy(field.free.distance))
         self.weights = copy(field.weights)
         self.optimiser = {

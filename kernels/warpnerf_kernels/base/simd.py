@@ -92,8 +92,8 @@ auto bits = [&](ivec x) -> unsigned {  // bit n: lane n is not 0
 auto each = [&](unsigned lanes, auto visit) {  // the lanes whose bits are set
     for (; lanes; lanes &= lanes - 1) visit(__builtin_ctz(lanes));
 };
-// Writes first + lane for each of them, one after the other, where there is room for sixteen; how
-// many they are.
+// Writes first + lane for each lane whose bit is set, one after the other; out needs room for
+// sixteen. Returns how many there are.
 auto list_lanes = [&](unsigned lanes, int first, int* out) -> int {
 #ifdef __AVX512F__
     const ivec numbers = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};

@@ -38,6 +38,7 @@ struct Inputs { enum { value = PADDED % (MOST_VECS * LANES) ? 1 : MOST_VECS }; }
 // innermost cache meanwhile. Arrays have an entry for each, as the last block may reach beyond the
 // rows that there are.
 constexpr int GROUP = 32, MOST_BLOCKS = GROUP / Few::value;
+static_assert(GROUP % Many::value == 0, "a block reaches beyond the group");
 auto by_groups = [&](int n, auto visit) {
     for (int begin = 0; begin < n; begin += GROUP) visit(begin, least(GROUP, n - begin));
 };
@@ -61,7 +62,7 @@ auto outputs_four_times = [&](quad q) -> vec {
 // What of a block's inputs is looked at: all, or the units that at least one of its rows has above
 // 0. Neighbouring samples share them, so ReLU saves a third to two thirds of the work.
 struct Every { int n; int operator[](int k) const { return k; } };
-struct Lit { int n; int units[WIDTH + LANES]; int operator[](int k) const { return units[k]; } };
+struct Lit { int n; int units[WIDTH]; int operator[](int k) const { return units[k]; } };
 const Every every_input = {INPUTS};
 auto all_inputs = [&](int) -> const Every& { return every_input; };
 auto find_lit = [&](int n, const float* const* h, Lit* lit) {
