@@ -127,7 +127,7 @@ def test_69_a_duplicate_key_in_a_checkpoint(checkpoint: Path, command: str, key:
 LIMITED = """
 import resource, sys
 from warpnerf.cli.main import main
-resource.setrlimit(resource.RLIMIT_FSIZE, (20_000_000, 20_000_000))
+resource.setrlimit(resource.RLIMIT_FSIZE, (40_000_000, 40_000_000))
 sys.exit(main(sys.argv[1:]))
 """
 

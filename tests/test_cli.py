@@ -325,7 +325,7 @@ def test_other_threads_are_allowed_and_noted(trained: tuple[Path, str]) -> None:
         (("--near", "0.1"), "march.near is 0.1"),
         (("--seed", "1"), "seed is 1"),
         (("--model", "sh"), "model"),
-        (("--model-options", "width=64"), "model.width is 64"),
+        (("--model-options", "width=48"), "model.width is 48"),
         (("--downscale", "8"), "--downscale does not go with --resume"),
         (("--downscale", "0"), "--downscale does not go with --resume"),
         (("--preset", "fast"), "--preset does not go with --resume"),

@@ -157,7 +157,7 @@ def test_costs_grow_with_what_is_asked(tmp_path: Path) -> None:
     one, four = (inspect(folder, threads=n).costs for n in (1, 4))
     assert one["quality"].seconds > 2.0 * one["fast"].seconds > 0.0
     assert one["quality"].memory > 2.0 * one["fast"].memory
-    assert four["fast"].memory == one["fast"].memory >= 96 * 160**3  # 8 numbers a node
+    assert four["fast"].memory == one["fast"].memory >= 192 * 160**3  # 16 numbers a node
     assert four["fast"].seconds == pytest.approx(one["fast"].seconds / 4)
 
 

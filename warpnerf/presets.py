@@ -35,6 +35,11 @@ from dataclasses import replace
 from warpnerf.config import GridConfig, LossConfig, MarchConfig, OptimConfig, TrainConfig
 from warpnerf.model.models import Deferred, Features
 
+_EVERYDAY = TrainConfig(
+    model=Deferred(specular=12, width=64),
+    loss=LossConfig(distortion=0.01),
+)
+
 _DVGO = TrainConfig(
     steps=20_000,
     rays_per_step=8192,
@@ -63,14 +68,13 @@ _DVGO = TrainConfig(
 )
 
 PRESETS: dict[str, TrainConfig] = {
-    "fast": TrainConfig(loss=LossConfig(distortion=0.01)),
-    "quality": TrainConfig(
+    "fast": _EVERYDAY,
+    "quality": replace(
+        _EVERYDAY,
         steps=200_000,
         time_limit=900.0,
-        model=Deferred(specular=12, width=64),
         grid=GridConfig(voxels=224**3),
         optim=OptimConfig(decay=0.03),
-        loss=LossConfig(distortion=0.01),
     ),
     "dvgo": _DVGO,
     "dvgo-unbounded": replace(
