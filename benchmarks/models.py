@@ -82,7 +82,7 @@ class Late:
 
     def about(self) -> dict[str, Any]:
         """Steps of an update, samples per ray, nodes, and the share of cells that is not free."""
-        n_steps = self._trainer._steps_an_update(LATE)
+        n_steps = self._trainer.schedule.steps_an_update(LATE)
         rays = self._trainer._pass.n_rays
         return {
             "steps_an_update": n_steps,

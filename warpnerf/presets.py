@@ -35,10 +35,7 @@ from dataclasses import replace
 from warpnerf.config import GridConfig, LossConfig, MarchConfig, OptimConfig, TrainConfig
 from warpnerf.model.models import Deferred, Features
 
-_EVERYDAY = TrainConfig(
-    model=Deferred(specular=12, width=64),
-    loss=LossConfig(distortion=0.01),
-)
+_FAST = TrainConfig(model=Deferred(specular=12, width=64), loss=LossConfig(distortion=0.01))
 
 _DVGO = TrainConfig(
     steps=20_000,
@@ -68,9 +65,9 @@ _DVGO = TrainConfig(
 )
 
 PRESETS: dict[str, TrainConfig] = {
-    "fast": _EVERYDAY,
+    "fast": _FAST,
     "quality": replace(
-        _EVERYDAY,
+        _FAST,
         steps=200_000,
         time_limit=900.0,
         grid=GridConfig(voxels=224**3),

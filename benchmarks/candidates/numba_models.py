@@ -21,9 +21,6 @@ from candidates.numba_cpu import (
     ALPHA,
     ATTENUATION,
     BACK,
-    FX,
-    FY,
-    FZ,
     LIGHT,
     RAW,
     TILE,
@@ -36,17 +33,14 @@ from candidates.numba_cpu import (
     exponential,
     has_gradient,
     log1p,
-    sigmoid,
     walk,
 )
 from candidates.numba_cpu import (
     obstacle as obstacle,
 )
-from candidates.numba_network import Network, add_to, clear, layer, network_of
-
-N_ROWS = RAW + 1
-FACTOR = N_ROWS
-"""One more row: what a sample's gradients are multiplied by."""
+from candidates.numba_heads import FACTOR, colors, shape_of, view_of
+from candidates.numba_network import Network, add_to, clear, network, network_of
+from candidates.numba_nodes import gather_densities, nodes
 
 
 @njit(fastmath=True, error_model="numpy")
@@ -120,246 +114,17 @@ def rows_of(k, thread):
     )
 
 
-@njit(fastmath=True, error_model="numpy")
-def gather_densities(scene, n_values, n, rows, base):
-    """Raw densities at the samples, into row RAW."""
-    v = scene.values
-    y = U(n_values) * U(scene.size[2])
-    x = y * U(scene.size[1])
-    side = U(n_values)
-    for s in range(n):
-        fx, fy, fz = rows[FX, s], rows[FY, s], rows[FZ, s]
-        gx, gy = F(1.0) - fx, F(1.0) - fy
-        near = U(n_values) * U(base[s])
-        far = near + x
-        a = gx * (gy * v[near] + fy * v[near + y]) + fx * (gy * v[far] + fy * v[far + y])
-        near, far = near + side, far + side
-        b = gx * (gy * v[near] + fy * v[near + y]) + fx * (gy * v[far] + fy * v[far + y])
-        rows[RAW, s] = a + fz * (b - a)
-
-
-@njit(fastmath=True, inline="always")
-def shares_of(rows, s):
-    """Of a sample in its eight nodes, by where they lie: x, y, z, the last the fastest."""
-    fx, fy, fz = rows[FX, s], rows[FY, s], rows[FZ, s]
-    gx, gy, gz = F(1.0) - fx, F(1.0) - fy, F(1.0) - fz
-    return (
-        gx * gy * gz,
-        gx * gy * fz,
-        gx * fy * gz,
-        gx * fy * fz,
-        fx * gy * gz,
-        fx * gy * fz,
-        fx * fy * gz,
-        fx * fy * fz,
-    )
-
-
 @cache
 def functions(name: ModelName) -> Callable[..., None]:
     """The step of a model."""
     model = MODELS[name]
-    n_values, width = model.n_values, model.width
-    n_channels = model.n_features if name == "deferred" else 3
-    n_own = {"sh": 1, "deferred": model.n_inputs, "features": 9}[name]
-    n_view = model.n_inputs - 9
-    forward1, adj_inputs1, adj_weights1 = layer(n_own, width)
-    forward2, adj_inputs2, adj_weights2 = layer(width, width)
-    forward3, adj_inputs3, adj_weights3 = layer(width, 3)
-    is_sh, is_deferred, is_features = (name == m for m in ("sh", "deferred", "features"))
-    threshold = F(model.threshold)
-    n_frequencies = model.n_frequencies
-
-    @njit(fastmath=True, error_model="numpy")
-    def gather(scene, s, rows, base, out):
-        """All that the nodes hold at a sample."""
-        v = scene.values
-        y = U(n_values) * U(scene.size[2])
-        x = y * U(scene.size[1])
-        w000, w001, w010, w011, w100, w101, w110, w111 = shares_of(rows, s)
-        at = U(n_values) * U(base[s])
-        side = U(n_values)
-        for c in range(n_values):
-            i = at + U(c)
-            low = w000 * v[i] + w010 * v[i + y] + w100 * v[i + x] + w110 * v[i + x + y]
-            i += side
-            out[c] = low + (w001 * v[i] + w011 * v[i + y] + w101 * v[i + x] + w111 * v[i + x + y])
-
-    @njit(fastmath=True, error_model="numpy")
-    def add(out, at, share, adj):
-        """Add to a node: all is read before anything is written."""
-        for c in range(0, n_values, 8):
-            i = at + U(c)
-            a, b = out[i] + share * adj[c], out[i + U(1)] + share * adj[c + 1]
-            d, e = out[i + U(2)] + share * adj[c + 2], out[i + U(3)] + share * adj[c + 3]
-            f, g = out[i + U(4)] + share * adj[c + 4], out[i + U(5)] + share * adj[c + 5]
-            h, k = out[i + U(6)] + share * adj[c + 6], out[i + U(7)] + share * adj[c + 7]
-            out[i], out[i + U(1)], out[i + U(2)], out[i + U(3)] = a, b, d, e
-            out[i + U(4)], out[i + U(5)], out[i + U(6)], out[i + U(7)] = f, g, h, k
-
-    @njit(fastmath=True, error_model="numpy")
-    def adj_gather(scene, s, rows, base, adj, out, touched):
-        """Hand a sample's gradient to the nodes."""
-        y = U(scene.size[2])
-        x = y * U(scene.size[1])
-        w000, w001, w010, w011, w100, w101, w110, w111 = shares_of(rows, s)
-        at, side = U(base[s]), U(n_values)
-        add(out, side * at, w000, adj)
-        add(out, side * (at + U(1)), w001, adj)
-        add(out, side * (at + y), w010, adj)
-        add(out, side * (at + y + U(1)), w011, adj)
-        add(out, side * (at + x), w100, adj)
-        add(out, side * (at + x + U(1)), w101, adj)
-        add(out, side * (at + x + y), w110, adj)
-        add(out, side * (at + x + y + U(1)), w111, adj)
-        for node in (at, at + y, at + x, at + x + y):
-            if not touched[node // TILE]:
-                touched[node // TILE] = True
-
-    @njit(fastmath=True, error_model="numpy")
-    def adj_gather_density(scene, s, rows, base, out, touched):
-        """The same of a sample that has no gradient but its density's."""
-        y = U(scene.size[2])
-        x = y * U(scene.size[1])
-        w000, w001, w010, w011, w100, w101, w110, w111 = shares_of(rows, s)
-        at, side, adj = U(base[s]), U(n_values), rows[RAW, s]
-        out[side * at] += w000 * adj
-        out[side * (at + U(1))] += w001 * adj
-        out[side * (at + y)] += w010 * adj
-        out[side * (at + y + U(1))] += w011 * adj
-        out[side * (at + x)] += w100 * adj
-        out[side * (at + x + U(1))] += w101 * adj
-        out[side * (at + x + y)] += w110 * adj
-        out[side * (at + x + y + U(1))] += w111 * adj
-        for node in (at, at + y, at + x, at + x + y):
-            if not touched[node // TILE]:
-                touched[node // TILE] = True
-
-    @njit(fastmath=True, error_model="numpy")
-    def encode(d, out):
-        """The direction, its sines and cosines."""
-        for axis in range(3):
-            out[axis] = d[axis]
-            for k in range(n_frequencies):
-                angle = d[axis] * F(1 << k)
-                out[3 + 6 * k + axis] = F(np.sin(angle))
-                out[6 + 6 * k + axis] = F(np.cos(angle))
-
-    @njit(fastmath=True, error_model="numpy")
-    def harmonics(d, out):
-        """Up to degree 2."""
-        x, y, z = d[0], d[1], d[2]
-        out[0] = F(0.28209479177387814)
-        out[1] = F(-0.4886025119029199) * y
-        out[2] = F(0.4886025119029199) * z
-        out[3] = F(-0.4886025119029199) * x
-        out[4] = F(1.0925484305920792) * x * y
-        out[5] = F(-1.0925484305920792) * y * z
-        out[6] = F(0.31539156525252005) * (F(2.0) * z * z - x * x - y * y)
-        out[7] = F(-1.0925484305920792) * x * z
-        out[8] = F(0.5462742152960396) * (x * x - y * y)
-
-    @njit(fastmath=True, error_model="numpy")
-    def run_network(n, net, k):
-        """Rows x to y; the first layer begins with base[0]."""
-        forward1(n, k.x, net.w1, k.base[0], k.h1)
-        for s in range(n):
-            for j in range(width):
-                k.h1[s, j] = max(k.h1[s, j], F(0.0))
-        forward2(n, k.h1, net.w2, net.b2, k.h2)
-        for s in range(n):
-            for j in range(width):
-                k.h2[s, j] = max(k.h2[s, j], F(0.0))
-        forward3(n, k.h2, net.w3, net.b3, k.y)
-
-    @njit(fastmath=True, error_model="numpy")
-    def adj_run_network(n, net, k, gradient):
-        """From what flows back in rows y to rows adj_x; the network's is added to, but for what
-        the first layer begins with: that goes to base[1]."""
-        adj_weights3(n, k.h2, k.y, gradient.w3)
-        adj_inputs3(n, k.y, net.t3, k.adj2)
-        for s in range(n):
-            for j in range(3):
-                gradient.b3[j] += k.y[s, j]
-            for j in range(width):
-                k.adj2[s, j] = k.adj2[s, j] if k.h2[s, j] > F(0.0) else F(0.0)
-                gradient.b2[j] += k.adj2[s, j]
-        adj_weights2(n, k.h1, k.adj2, gradient.w2)
-        adj_inputs2(n, k.adj2, net.t2, k.adj1)
-        for j in range(width):
-            k.base[1, j] = F(0.0)
-        for s in range(n):
-            for j in range(width):
-                k.adj1[s, j] = k.adj1[s, j] if k.h1[s, j] > F(0.0) else F(0.0)
-                k.base[1, j] += k.adj1[s, j]
-        adj_weights1(n, k.x, k.adj1, gradient.w1)
-        adj_inputs1(n, k.adj1, net.t1, k.adj_x)
-
-    @njit(fastmath=True, error_model="numpy")
-    def color_samples(n, rows, k, view, net):
-        """Rows raw to color; of `features`, n are those that have one."""
-        if is_sh:
-            for s in range(n):
-                red, green, blue = F(0.0), F(0.0), F(0.0)
-                for b in range(9):
-                    red += view[b] * k.raw[s, 1 + 3 * b]
-                    green += view[b] * k.raw[s, 2 + 3 * b]
-                    blue += view[b] * k.raw[s, 3 + 3 * b]
-                k.color[s, 0], k.color[s, 1], k.color[s, 2] = red, green, blue
-        elif is_deferred:
-            for s in range(n):
-                for c in range(n_channels):
-                    k.color[s, c] = k.raw[s, 1 + c]
-        else:
-            for s in range(n):
-                for i in range(n_own):
-                    k.x[s, i] = k.raw[s, 4 + i]
-            for j in range(width):
-                k.base[0, j] = net.b1[j]
-            for i in range(n_view):
-                for j in range(width):
-                    k.base[0, j] += view[i] * net.w1[n_own + i, j]
-            run_network(n, net, k)
-            for s in range(n):
-                for c in range(3):
-                    k.color[s, c] = k.raw[s, 1 + c] + k.y[s, c]
-        for s in range(n):
-            for c in range(n_channels):
-                k.color[s, c] = sigmoid(k.color[s, c])
-
-    @njit(fastmath=True, error_model="numpy")
-    def adj_color_samples(n, rows, k, view, net, adj_channels, gradient):
-        """Rows color to what flows back into raw values but densities, in rows raw."""
-        for r in range(n):
-            s = k.lit[r]
-            share = rows[FACTOR, s] * rows[WEIGHT, s]
-            for c in range(n_channels):
-                color = k.color[r, c]
-                k.color[r, c] = share * adj_channels[c] * color * (F(1.0) - color)
-        if is_sh:
-            for r in range(n):
-                for b in range(9):
-                    for c in range(3):
-                        k.raw[r, 1 + 3 * b + c] = view[b] * k.color[r, c]
-        elif is_deferred:
-            for r in range(n):
-                for c in range(n_channels):
-                    k.raw[r, 1 + c] = k.color[r, c]
-        else:
-            for r in range(n):
-                for c in range(3):
-                    k.y[r, c] = k.color[r, c]
-            adj_run_network(n, net, k, gradient)
-            for j in range(width):
-                gradient.b1[j] += k.base[1, j]
-            for i in range(n_view):
-                for j in range(width):
-                    gradient.w1[n_own + i, j] += view[i] * k.base[1, j]
-            for r in range(n):
-                for c in range(3):
-                    k.raw[r, 1 + c] = k.color[r, c]
-                for i in range(n_own):
-                    k.raw[r, 4 + i] = k.adj_x[r, i]
+    n_values, width, threshold = model.n_values, model.width, F(model.threshold)
+    n_channels, n_own, _ = shape_of(name)
+    gather, adj_gather, adj_gather_density = nodes(n_values)
+    run_network, adj_run_network = network(n_own, width)
+    color_samples, adj_color_samples = colors(name)
+    see = view_of(name)
+    is_deferred, is_features = name == "deferred", name == "features"
 
     @njit(fastmath=True, error_model="numpy")
     def train_ray(
@@ -381,10 +146,7 @@ def functions(name: ModelName) -> Callable[..., None]:
         if is_features:
             for r in range(lit):
                 gather(scene, k.lit[r], rows, base, k.raw[r])
-        if is_sh:
-            harmonics(d, view)
-        else:
-            encode(d, view)
+        see(d, view)
         color_samples(lit, rows, k, view, net)
         seen = np.zeros(n_channels, np.float32)
         for r in range(lit):
@@ -516,14 +278,13 @@ class NumbaModels:
         n_steps, width = work.n_steps, model.width
         arrays = work.network or tuple(np.zeros(s, F) for s in [(1, 1), 1] * 3)
         transposed = (np.ascontiguousarray(array.T) for array in arrays[::2])
-        n_channels = model.n_features if work.model == "deferred" else 3
 
         def room(*shape: int) -> np.ndarray:
             return np.zeros(shape, F)
 
         rows = Rows(
             raw=room(threads, n_steps, model.n_values),
-            color=room(threads, n_steps, n_channels),
+            color=room(threads, n_steps, shape_of(work.model).n_channels),
             x=room(threads, n_steps, max(1, model.n_inputs)),
             h1=room(threads, n_steps, width),
             h2=room(threads, n_steps, width),
@@ -552,7 +313,7 @@ class NumbaModels:
             self._network_gradients,
             self._gradients,
             np.zeros(-(-work.values.size // run), np.bool_),
-            np.zeros((threads, N_ROWS + 1, n_steps), F),
+            np.zeros((threads, FACTOR + 1, n_steps), F),
             np.zeros((threads, n_steps), S),
             self._rgb,
         )

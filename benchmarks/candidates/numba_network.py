@@ -129,3 +129,57 @@ def add_to(net, other):
     net.b2[:] += other.b2
     net.w3[:] += other.w3
     net.b3[:] += other.b3
+
+
+@cache
+def network(n_own: int, width: int) -> tuple[Callable[..., None], Callable[..., None]]:
+    """Two hidden layers with ReLU and three outputs, on rows of samples.
+
+    Args:
+        n_own: Inputs that differ from row to row.
+        width: Of the hidden layers.
+
+    Returns:
+        run_network(n, net, k), adj_run_network(n, net, k, gradient).
+    """
+    forward1, adj_inputs1, adj_weights1 = layer(n_own, width)
+    forward2, adj_inputs2, adj_weights2 = layer(width, width)
+    forward3, adj_inputs3, adj_weights3 = layer(width, 3)
+
+    @njit(fastmath=True, error_model="numpy")
+    def run_network(n, net, k):
+        """Rows x to y; the first layer begins with base[0]."""
+        forward1(n, k.x, net.w1, k.base[0], k.h1)
+        for s in range(n):
+            for j in range(width):
+                k.h1[s, j] = max(k.h1[s, j], F(0.0))
+        forward2(n, k.h1, net.w2, net.b2, k.h2)
+        for s in range(n):
+            for j in range(width):
+                k.h2[s, j] = max(k.h2[s, j], F(0.0))
+        forward3(n, k.h2, net.w3, net.b3, k.y)
+
+    @njit(fastmath=True, error_model="numpy")
+    def adj_run_network(n, net, k, gradient):
+        """From what flows back in rows y to rows adj_x; the network's is added to, but for what
+        the first layer begins with: that goes to base[1]."""
+        adj_weights3(n, k.h2, k.y, gradient.w3)
+        adj_inputs3(n, k.y, net.t3, k.adj2)
+        for s in range(n):
+            for j in range(3):
+                gradient.b3[j] += k.y[s, j]
+            for j in range(width):
+                k.adj2[s, j] = k.adj2[s, j] if k.h2[s, j] > F(0.0) else F(0.0)
+                gradient.b2[j] += k.adj2[s, j]
+        adj_weights2(n, k.h1, k.adj2, gradient.w2)
+        adj_inputs2(n, k.adj2, net.t2, k.adj1)
+        for j in range(width):
+            k.base[1, j] = F(0.0)
+        for s in range(n):
+            for j in range(width):
+                k.adj1[s, j] = k.adj1[s, j] if k.h1[s, j] > F(0.0) else F(0.0)
+                k.base[1, j] += k.adj1[s, j]
+        adj_weights1(n, k.x, k.adj1, gradient.w1)
+        adj_inputs1(n, k.adj1, net.t1, k.adj_x)
+
+    return run_network, adj_run_network

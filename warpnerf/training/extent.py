@@ -1,4 +1,4 @@
-"""What a training begins with: the warp of space, the first grid, content distances."""
+"""Where a training looks: the warp of space, the first grid, content distances, steps of rays."""
 
 from __future__ import annotations
 
@@ -9,11 +9,15 @@ import warp as wp
 from warpnerf_kernels.base.types import vector
 
 from warpnerf.checks import InputError
-from warpnerf.config import TrainConfig
+from warpnerf.config import MarchConfig, TrainConfig
 from warpnerf.model.grid import VoxelGrid, grid_size, require_memory, room_for_nodes
 from warpnerf.model.interface import Model
+from warpnerf.rendering.render import Steps
 from warpnerf.scenes.frustum import FARTHEST, contraction_of, fit_frustum
 from warpnerf.scenes.scene import Scene
+
+FAR_BOXES = 64.0
+"""How far an unbounded scene is sampled, in half edges of its box; beyond lies the background."""
 
 
 def require_grid(scene: Scene, config: TrainConfig, device: wp.Device) -> None:
@@ -131,3 +135,28 @@ def reach(scene: Scene) -> float:
     centre = 0.5 * (scene.box_min + scene.box_max)
     cameras = [scene.views[i].camera.position for i in scene.splits["train"]]
     return corner + max(float(np.linalg.norm(p - centre)) for p in cameras)
+
+
+def march_steps(march: MarchConfig, grid: VoxelGrid, reach: float) -> Steps:
+    """How rays are marched through a grid.
+
+    Args:
+        march: What is configured.
+        grid: As it stands.
+        reach: See there, scene units: how far steps have one length where space is folded.
+    """
+    step = march.step_voxels * float(grid.voxel_size.min())
+    half = float(0.5 * (grid.box_max - grid.box_min).max())
+    far = march.far
+    if far is None:
+        far = march.near + FAR_BOXES * half + reach if grid.folded else math.inf
+    n_linear = max(0, math.ceil((reach - march.near) / step))
+    return Steps(
+        near=march.near,
+        far=min(far, 1e30),
+        step=step,
+        n_linear=n_linear if grid.folded else 0,
+        growth=march.growth if grid.folded else 0.0,
+        transmittance_min=march.transmittance_min,
+        in_ndc=grid.frustum is not None,
+    )

@@ -25,12 +25,10 @@ from warpnerf.scenes.points import SeenExtent, seen_scene
 from warpnerf.scenes.scene import Scene
 from warpnerf.training import extent
 from warpnerf.training.optim import RULES, adam_step, add_total_variation, first_states
+from warpnerf.training.schedule import Schedule
 from warpnerf.training.smoothing import strengths
 from warpnerf.training.state import Progress, TrainingState, scene_digest
 from warpnerf.training.warmup import training_kernels
-
-FAR_BOXES = 64.0
-"""How far an unbounded scene is sampled, in half edges of its box; beyond lies the background."""
 
 REPORT_EVERY = 25
 """Steps between two reports, which come after an update."""
@@ -108,8 +106,7 @@ class Trainer:
             config.seed,
             self.workers,
         )
-        self._accumulation = config.optim.accumulates_at(scene.kind)
-        self._grow_at = config.grid.grows_at(scene.kind)
+        self.schedule = Schedule(config=config, kind=scene.kind)
         self._grown = 0
         self._updates = 0
         self._restarted = 0
@@ -197,7 +194,7 @@ class Trainer:
         if self._updates % config.occupancy_every == 0:
             self._look_for_free_space()
         before = self.steps_done
-        n_steps = min(self._steps_an_update(fraction), config.steps - before)
+        n_steps = min(self.schedule.steps_an_update(fraction), config.steps - before)
         batch = self._sampler.draw(before, n_steps)
         self._pass.run(self.free, batch, n_steps, self._seen)
         if self._updates % config.optim.tv_every == 0 and fraction < config.optim.tv_until:
@@ -218,7 +215,7 @@ class Trainer:
             self.optimiser,
             self._pass.gradients,
             self._updates - self._restarted,
-            config.optim.decay ** (fraction - self._decay_from()) * n_steps**0.25,
+            self.schedule.rate(fraction, self._grown, n_steps),
             config.optim,
             self.workers,
         )
@@ -325,41 +322,15 @@ class Trainer:
 
     def march_steps(self) -> Steps:
         """How rays are marched through the grid as it stands."""
-        march = self.config.march
-        step = march.step_voxels * float(self.grid.voxel_size.min())
-        half = float(0.5 * (self.grid.box_max - self.grid.box_min).max())
-        folded = self.grid.folded
-        far = march.far
-        if far is None:
-            far = march.near + FAR_BOXES * half + self._reach if folded else math.inf
-        n_linear = max(0, math.ceil((self._reach - march.near) / step))
-        return Steps(
-            near=march.near,
-            far=min(far, 1e30),
-            step=step,
-            n_linear=n_linear if folded else 0,
-            growth=march.growth if folded else 0.0,
-            transmittance_min=march.transmittance_min,
-            in_ndc=self.grid.frustum is not None,
-        )
+        return extent.march_steps(self.config.march, self.grid, self._reach)
 
     def parameters(self) -> tuple[Parameter, ...]:
         """What is trained."""
         return parameters_of(self.model, self.grid, self.weights, self.config.optim)
 
-    def _steps_an_update(self, fraction: float) -> int:
-        """Steps whose losses are added up for one, after that share of the training."""
-        return 1 << sum(fraction >= at for at in self._accumulation)
-
-    def _decay_from(self) -> float:
-        """The share of the training at which learning rates were those of the start."""
-        if self._grown == 0 or not self.config.optim.restart_at_growth:
-            return 0.0
-        return self._grow_at[self._grown - 1]
-
     def _training_pass(self) -> TrainingPass:
         return TrainingPass(
-            self.config.rays_per_step << len(self._accumulation),
+            self.config.rays_per_step * self.schedule.most_steps_an_update,
             self.model,
             self.grid,
             self.weights,
@@ -382,7 +353,7 @@ class Trainer:
 
     def _grow(self, fraction: float) -> None:
         """Carry grid and optimiser over to more voxels, once the schedule says so."""
-        grown = sum(fraction >= at for at in self._grow_at)
+        grown = self.schedule.growths(fraction)
         if grown == self._grown or self.steps_done < FIRST_LOOK:
             return
         box, nodes = self._tight_box(), self.config.grid.nodes_after(grown, self.scene.kind)
@@ -441,9 +412,8 @@ class Trainer:
             self._seen = self._sampler.keep_to(self.grid, self.free)
 
     def _find_free_space(self) -> None:
-        model = self.config.model
-        march = march_struct(model, "float32", self.march_steps(), self.workers)
-        sampler = parts_of(model, "float32").sampler
+        march = march_struct(self.model, "float32", self.march_steps(), self.workers)
+        sampler = parts_of(self.model, "float32").sampler
         self.free = FreeCells.of(self.grid, self.workers, march, self.config.alpha_min, sampler)
         self._occupied = self.free.share()
 
