@@ -7,7 +7,8 @@ A candidate is a preset, and fields of its TrainConfig that are something else, 
 JSON. Scenes are as for training.py. Trainings of a scene and a seed take turns of a fraction of a
 second, each for as long on a clock of its own; so a machine that is slow for a while is slow for
 all. Where the extent is looked for first, that is off the clock. Prints PSNR and SSIM on the test
-views, and of a sample of training views PSNR, the mean and half of the range over the seeds; writes
+views, where depths are known their error in scene units, and of a sample of training views PSNR,
+the mean and half of the range over the seeds; writes
 benchmarks/results/presets_<device>.json.
 """
 
@@ -69,10 +70,12 @@ def main() -> None:
             of_seeds = [r for r in rows if (r["scene"], r["candidate"]) == (scene.name, candidate)]
             psnr = [row["psnr"] for row in of_seeds]
             mean = {key: float(np.mean([r[key] for r in of_seeds])) for key in FIGURES}
+            errors = [row["depth_error"] for row in of_seeds if "depth_error" in row]
+            depth = f"  (depth error {np.mean(errors):.3f})" if errors else ""
             print(
                 f"  {mean['psnr']:5.2f} +-{np.ptp(psnr) / 2:5.2f}  {mean['ssim']:.4f}  "
                 f"{mean['training_psnr']:8.2f}  {mean['steps']:7.0f}  "
-                f"{mean['samples_per_ray']:7.1f}  {candidate}",
+                f"{mean['samples_per_ray']:7.1f}  {candidate}{depth}",
                 flush=True,
             )
         record = {
@@ -116,6 +119,7 @@ def race(scene: wn.Scene, candidates: dict[str, TrainConfig], seed: int) -> dict
         field = trainer.field()
         mean = wn.evaluate(field, scene).mean
         found[text] = {
+            **{name: mean[name] for name in ("depth_error",) if name in mean},
             "psnr": mean["psnr"],
             "ssim": mean["ssim"],
             "training_psnr": wn.evaluate(field, scene, split="training").mean["psnr"],

@@ -70,9 +70,9 @@ def test_warm_up_covers_the_presets_and_is_done_once(presets: tuple[str, ...], d
     names = [kernel.name for kernel in first]
     assert len(set(names)) == len(names)
     for scaling in ("none", "quadratic", "clamped"):
-        assert f"render train, scaling {scaling}, distortion" in names
-        assert f"render train, space folded in, scaling {scaling}, distortion" in names
-        assert f"render train, in NDC, scaling {scaling}, distortion" in names
+        assert f"render train, scaling {scaling}, distortion, entropy" in names
+        assert f"render train, space folded in, scaling {scaling}, distortion, entropy" in names
+        assert f"render train, in NDC, scaling {scaling}, distortion, entropy" in names
     assert {"render forward", "render forward, space folded in", "adam step"} < set(names)
     again = warm_up(device, configs=configs)
     assert [kernel.name for kernel in again] == names

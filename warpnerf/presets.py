@@ -35,7 +35,11 @@ from dataclasses import replace
 from warpnerf.config import GridConfig, LossConfig, MarchConfig, OptimConfig, TrainConfig
 from warpnerf.model.models import Deferred, Features
 
-_FAST = TrainConfig(model=Deferred(specular=12, width=64), loss=LossConfig(distortion=0.01))
+_FAST = TrainConfig(
+    model=Deferred(specular=12, width=64),
+    # Without the entropy of remaining light, colours of the MLP make up for walls that stay soft.
+    loss=LossConfig(distortion=0.01, entropy=1e-3),
+)
 
 _DVGO = TrainConfig(
     steps=20_000,
