@@ -27,11 +27,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measuring import default_threads, machine, median_interval, options, show, write_record
+from measuring import (
+    HERE,
+    commit,
+    default_threads,
+    machine,
+    median_interval,
+    options,
+    show,
+    write_record,
+)
 from throughput import TOLERANCE, Case, make_cases
-
-HERE = Path(__file__).resolve().parent.parent
-
 
 Times = tuple[float, float]
 """Seconds of a step, and of the cores in it."""
@@ -189,16 +195,6 @@ def main() -> None:
         "rows": records,
     }
     print(f"\nrecord: {write_record(record, args.output, 'against', 'cpu')}")
-
-
-def commit(tree: Path) -> str | None:
-    """Which one is checked out, with a plus where files were changed; None: it is no checkout."""
-    command = ["git", "-C", str(tree), "describe", "--always", "--abbrev=12", "--dirty=+"]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True)
-    except OSError:
-        return None
-    return done.stdout.strip() or None if done.returncode == 0 else None
 
 
 if __name__ == "__main__":

@@ -37,7 +37,7 @@ from candidates.torch_eager import Choices, ScaleGradient, TorchPipeline, fastes
 from measuring import Stopwatch, machine, median_interval, options, write_record
 from warpnerf_kernels.base.types import real, vec3
 from warpnerf_kernels.launch import assembly
-from workload import EVERYDAY, Workload, make_workload
+from workload import DEFAULT_MODELS, Workload, make_workload
 
 from warpnerf.config import Scaling
 from warpnerf.model.grid import FreeCells
@@ -334,7 +334,9 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=200)
     parser.add_argument("--repeats", type=int, default=2, help="of each side in a pair")
     parser.add_argument("--threads", type=int, default=usable_cores())
-    parser.add_argument("--models", nargs="+", default=list(EVERYDAY), choices=list(EVERYDAY))
+    parser.add_argument(
+        "--models", nargs="+", default=list(DEFAULT_MODELS), choices=list(DEFAULT_MODELS)
+    )
     parser.add_argument("--launch", nargs=2, metavar=("SCALING", "N"), help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.launch:  # the process that counted_instructions watches

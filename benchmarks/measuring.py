@@ -10,6 +10,7 @@ import math
 import os
 import platform
 import shlex
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable
@@ -22,7 +23,8 @@ import warp as wp
 from warpnerf.model.models import MODELS
 from warpnerf.runtime.memory import usable_cores
 
-RESULTS = Path(__file__).parent / "results"
+HERE = Path(__file__).resolve().parent.parent
+RESULTS = HERE / "benchmarks" / "results"
 
 Interval = dict[str, float]
 """low, median, high: a median and its 95 % interval."""
@@ -110,8 +112,19 @@ def machine(device: str, threads: int) -> dict[str, Any]:
         **{package: _version(package) for package in ("torch", "numba", "taichi", "drjit")},
         "system": platform.platform(),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "commit": commit(HERE),
         "command": shlex.join(["python", *map(_without_folders, sys.argv)]),
     }
+
+
+def commit(tree: Path) -> str | None:
+    """Which one is checked out, with a plus where files were changed; None: it is no checkout."""
+    command = ["git", "-C", str(tree), "describe", "--always", "--abbrev=12", "--dirty=+"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True)
+    except OSError:
+        return None
+    return done.stdout.strip() or None if done.returncode == 0 else None
 
 
 def default_threads() -> list[int]:

@@ -47,7 +47,7 @@ from measuring import (
     write_record,
 )
 from plotting import plot_throughput
-from workload import EVERYDAY, ModelName, Rays, Scene, Workload, make_workload
+from workload import DEFAULT_MODELS, ModelName, Rays, Scene, Workload, make_workload
 
 TOLERANCE = 1e-4
 """Of the largest value: by how much candidates may differ from the first."""
@@ -98,7 +98,7 @@ def make_cases(grids: Sequence[int]) -> list[Case]:
         Case("random", last, scaled=False),
         *(
             Case("random", last, scene=scene, model=model)
-            for model in EVERYDAY
+            for model in DEFAULT_MODELS
             if model != "rgb"
             for scene in scenes
         ),
@@ -376,7 +376,9 @@ def main() -> None:
     parser.add_argument(
         "--threads", type=int, nargs="+", default=default_threads(), help="CPU threads, from 1 up"
     )
-    parser.add_argument("--models", nargs="+", default=list(EVERYDAY), choices=list(EVERYDAY))
+    parser.add_argument(
+        "--models", nargs="+", default=list(DEFAULT_MODELS), choices=list(DEFAULT_MODELS)
+    )
     parser.add_argument(
         "--without", nargs="+", default=[], choices=list(candidates.MODULES)[1:], metavar="NAME"
     )

@@ -88,7 +88,7 @@ MODELS: dict[ModelName, Model] = {
 }
 """Those of warpnerf as they are by default, and `features` as DVGO has it."""
 
-EVERYDAY = tuple(name for name in MODELS if name != "dvgo")
+DEFAULT_MODELS = tuple(name for name in MODELS if name != "dvgo")
 """Those that are compared by default; against_torch.py is about the other one."""
 
 

@@ -113,6 +113,15 @@ def test_content_distance_of_a_room(
         assert (np.abs(middle - [0.0, 0.0, 1.3]) < 0.5).all()
 
 
+def test_trainings_with_and_without_scaling_have_one_extent() -> None:
+    scene, config = of_room(outward(12))[0], wn.TrainConfig(model="rgb", threads=2, coarse_steps=60)
+    one, other = (
+        find_sight(scene, replace(config, scaling=scaling))[0] for scaling in ("none", "clamped")
+    )
+    assert one is not None and other is not None
+    np.testing.assert_array_equal(one.distances, other.distances)
+
+
 def test_it_is_for_scenes_without_points() -> None:
     scene = guessed_scene()
     known = replace(scene, content_distances=np.ones(6))

@@ -9,8 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tiny_scenes import ring, tiny_scene
+from tiny_trainings import tiny_config
 
+import warpnerf as wn
+from warpnerf.model import grid
 from warpnerf.runtime import memory
+from warpnerf.training.trainer import Trainer
 
 GIB = 2**30
 
@@ -126,6 +131,19 @@ def test_large_pages_are_asked_for() -> None:
     assert "hg" not in flags_of(address)
     memory.prefer_large_pages(address + 64, (8 << 20) - 64)
     assert "hg" in flags_of(address + 4096)
+
+
+def test_values_of_nodes_lie_on_large_pages(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    asked: list[int] = []
+    monkeypatch.setattr(grid, "prefer_large_pages", lambda ptr, n: asked.append(ptr))
+    trainer = Trainer(tiny_scene(ring(4)), tiny_config())
+    box = (trainer.grid.box_min, trainer.grid.box_max)
+    held = [trainer.grid, trainer.grid.resized(trainer.workers, (6, 6, 6), box)]
+    wn.save_field(tmp_path / "field.safetensors", trainer.field())
+    held.append(wn.load_field(tmp_path / "field.safetensors").grid)
+    assert all(one.values.ptr in asked for one in held)
 
 
 def flags_of(address: int) -> list[str]:

@@ -250,7 +250,7 @@ class LossConfig:
     """Where that line begins, of colours in [0, 1]."""
     distortion: float = 0.0
     """Weight of the distortion loss: matter of a ray comes together. Distances count as
-    t / (D + t), with D the content distance in use; with per-camera, the scene's."""
+    t / (D + t), with D the content distance in use; with auto and per-camera, the scene's."""
     entropy: float = 0.0
     """Weight of the entropy of the remaining light: a ray ends in matter, or meets none."""
     sample_colour: float = 0.0
@@ -311,9 +311,10 @@ class TrainConfig:
     distance of what it sees, as points or short trainings tell; auto: where that is known, the
     geometric mean of it and of the scene's estimate, else that."""
     coarse_steps: int = 200
-    """Steps, at most, of a short training on a small grid that finds the content distance of
-    photographs without points; two of them find the box as well where cameras look at no common
-    point. 0: none, and the extent stays what the cameras suggest."""
+    """Steps, at most, of a short training on a small grid, with clamped scaling, that finds the
+    content distance of captures without points, but for objects with alpha; two of them find the
+    box as well where cameras look at no common point. 0: none, and the extent stays what the
+    scene says."""
     jacobian: Jacobian = "none"
     """Whether the scaling takes the contraction's change of volume into account."""
     rays_per_step: int = 4096

@@ -131,6 +131,7 @@ def find_sight(
         steps=_steps(config),
         time_limit=None if limit is None else TIME_SHARE * limit / rounds,
         content_distance="auto" if isinstance(given, str) else given,
+        scaling="clamped",  # so that trainings with and without have one extent
         grid=replace(
             config.grid,
             voxels=min(VOXELS, config.grid.voxels),

@@ -360,14 +360,16 @@ class Trainer:
         size = grid_size((box[1] - box[0]) * (1.0 + self.grid.border), nodes)
         del self._pass  # gives its memory back before more is asked for
         grid = self.grid.resized(self.workers, size, box)
-        for parameter in self.parameters():
-            state = self.optimiser[parameter.name]
-            resized = RULES[parameter.kind].resized(state, self.grid, grid, self.workers)
-            self.optimiser[parameter.name] = resized
+        anew = self.config.optim.restart_at_growth
+        if not anew:
+            for parameter in self.parameters():
+                state = self.optimiser[parameter.name]
+                resized = RULES[parameter.kind].resized(state, self.grid, grid, self.workers)
+                self.optimiser[parameter.name] = resized
         shift = (grown - self._grown) * self.config.grid.shift_at_growth
         self.grid = replace(grid, density_shift=grid.density_shift - shift)
         self._grown = grown
-        if self.config.optim.restart_at_growth:
+        if anew:
             self.optimiser = first_states(self.parameters(), self.workers)
             self._restarted = self._updates
         give_back()
