@@ -39,7 +39,10 @@ def test_a_candidate_that_there_is_not_is_refused(text, named):
 
 @pytest.mark.parametrize(
     ("scenes", "models"),
-    [(("dense", "sphere"), ("dvgo",)), (("builtin:room",), ("rgb", "features"))],
+    [
+        (("dense", "sphere"), ("dvgo",)),
+        pytest.param(("builtin:room",), ("rgb", "features"), marks=pytest.mark.slow),
+    ],
 )
 def test_against_torch(tmp_path, scenes, models):
     options = (*scenes, "--models", *models, "--grid", "10", "--rays", "48", "--steps", "250")

@@ -33,10 +33,8 @@ def test_compiled_torch_agrees(model):
     assert set(differences) == {"warpnerf, 2 threads", "torch.compile, 1 threads"}
 
 
-@pytest.mark.parametrize(
-    "model",
-    [*(pytest.param(name, marks=pytest.mark.slow) for name in ("sh", "features")), "deferred"],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["sh", "features", "deferred"])
 def test_numba_agrees(model):
     """Likewise."""
     found, missing = candidates.find("cpu", model)
