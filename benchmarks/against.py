@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 from measuring import (
-    HERE,
+    ROOT,
     commit,
     default_threads,
     machine,
@@ -52,7 +52,7 @@ class Process:
         path = os.pathsep.join(str(tree / part) for part in ("benchmarks", ".", "kernels"))
         # -P: the script's own folder is not this tree's benchmarks.
         self._process = subprocess.Popen(
-            [sys.executable, "-P", str(HERE / "benchmarks" / "one_tree.py")],
+            [sys.executable, "-P", str(ROOT / "benchmarks" / "one_tree.py")],
             env=os.environ | {"PYTHONPATH": path},
             cwd=tree,
             stdin=subprocess.PIPE,
@@ -137,9 +137,9 @@ def main() -> None:
     differences: dict[tuple[Case, int], dict[str, float]] = {}
     for start in range(args.starts):
         # Whoever is first may get the better memory.
-        trees = (HERE, tree) if start % 2 else (tree, HERE)
+        trees = (ROOT, tree) if start % 2 else (tree, ROOT)
         processes = {at: Process(at) for at in trees}
-        ours, theirs = processes[HERE], processes[tree]
+        ours, theirs = processes[ROOT], processes[tree]
         for case, threads in rows:
             if not (ours.ask("knows", case.model) and theirs.ask("knows", case.model)):
                 left_out += [str(case)] if str(case) not in left_out else []
@@ -186,7 +186,7 @@ def main() -> None:
     record = {
         "benchmark": "against",
         "machine": machine("cpu", max(args.threads)),
-        "commits": {"here": commit(HERE), "there": commit(tree)},
+        "commits": {"here": commit(ROOT), "there": commit(tree)},
         "n_rays": args.rays,
         "n_steps": args.steps,
         "starts": args.starts,

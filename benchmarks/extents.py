@@ -25,7 +25,7 @@ from training import path_of
 import warpnerf as wn
 from warpnerf.model.models import MODELS
 from warpnerf.runtime.parallel import Workers
-from warpnerf.scenes.scene import estimate_extent
+from warpnerf.scenes.focus import estimate_extent
 from warpnerf.training.coarse import begin
 
 

@@ -23,8 +23,8 @@ import warp as wp
 from warpnerf.model.models import MODELS
 from warpnerf.runtime.memory import usable_cores
 
-HERE = Path(__file__).resolve().parent.parent
-RESULTS = HERE / "benchmarks" / "results"
+ROOT = Path(__file__).resolve().parent.parent
+RESULTS = ROOT / "benchmarks" / "results"
 
 Interval = dict[str, float]
 """low, median, high: a median and its 95 % interval."""
@@ -112,19 +112,22 @@ def machine(device: str, threads: int) -> dict[str, Any]:
         **{package: _version(package) for package in ("torch", "numba", "taichi", "drjit")},
         "system": platform.platform(),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "commit": commit(HERE),
+        "commit": commit(ROOT),
         "command": shlex.join(["python", *map(_without_folders, sys.argv)]),
     }
 
 
 def commit(tree: Path) -> str | None:
-    """Which one is checked out, with a plus where files were changed; None: it is no checkout."""
-    command = ["git", "-C", str(tree), "describe", "--always", "--abbrev=12", "--dirty=+"]
+    """Which one is checked out, with a plus where code was changed; None: it is no checkout."""
+    git = ["git", "-C", str(tree)]
     try:
-        done = subprocess.run(command, capture_output=True, text=True)
+        head = subprocess.run([*git, "rev-parse", "--short=12", "HEAD"], capture_output=True)
+        changed = subprocess.run([*git, "diff", "--quiet", "HEAD", "--", "*.py"], capture_output=True)
     except OSError:
         return None
-    return done.stdout.strip() or None if done.returncode == 0 else None
+    if head.returncode:
+        return None
+    return head.stdout.decode().strip() + ("+" if changed.returncode else "")
 
 
 def default_threads() -> list[int]:

@@ -180,6 +180,26 @@ def test_models(tmp_path):
 
 
 @pytest.mark.slow
+def test_floaters(tmp_path):
+    script = [sys.executable, str(ROOT / "benchmarks" / "floaters.py"), "--output", str(tmp_path)]
+    options = ["--steps", "20", "40", "--seeds", "0", "1", "--downscale", "8"]
+    path = os.pathsep.join([str(ROOT), str(ROOT / "kernels")])
+    env = {**os.environ, "PYTHONPATH": path}
+    printed = subprocess.run([*script, *options], env=env, check=True, capture_output=True).stdout
+    rows = json.loads((tmp_path / "floaters_cpu.json").read_text())["rows"]
+    assert [(row["steps"], row["scaling"]) for row in rows] == [
+        (steps, scaling) for steps in (20, 40) for scaling in ("none", "clamped")
+    ]
+    for row in rows:
+        for name in ("psnr", "depth_error", "pulled_psnr", "near_density"):
+            one, other = row[name]
+            assert one > 0 and other > 0 and one != other
+            assert f"{np.mean(row[name]):.4f}" in printed.decode()
+    for scaling in ("none", "clamped"):
+        assert (tmp_path / f"floaters_{scaling}.png").exists()
+
+
+@pytest.mark.slow
 def test_heads(tmp_path):
     options = ("builtin:room-sparse", "--downscale", "8", "--time-limit", "2", "--points", "3")
     options += ("--models", "rgb", "deferred", "--seeds", "0", "1")

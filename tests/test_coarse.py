@@ -22,7 +22,8 @@ from watched_command import command, make_scene
 import warpnerf as wn
 from warpnerf.model.nodes import points_of
 from warpnerf.scenes.builtin.room import first_hit, photograph
-from warpnerf.scenes.scene import Scene, View, estimate_extent, find_focus
+from warpnerf.scenes.focus import estimate_extent, find_focus
+from warpnerf.scenes.scene import Scene, View
 from warpnerf.training import coarse
 from warpnerf.training.coarse import begin, find_sight, is_needed, median_distances
 from warpnerf.training.run import Run

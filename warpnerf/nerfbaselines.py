@@ -18,8 +18,9 @@ from warpnerf.checks import InputError
 from warpnerf.config import TrainConfig
 from warpnerf.presets import PRESETS
 from warpnerf.scenes.camera import Camera
+from warpnerf.scenes.focus import estimate_extent
 from warpnerf.scenes.points import Points, extent_by_points, usable
-from warpnerf.scenes.scene import Scene, View, estimate_extent
+from warpnerf.scenes.scene import Scene, View
 from warpnerf.scenes.undistort import seen_pixels
 from warpnerf.training.checkpoint import load_checkpoint, save_checkpoint
 from warpnerf.training.coarse import begin

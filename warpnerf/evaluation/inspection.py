@@ -21,9 +21,10 @@ from warpnerf.presets import EVERYDAY, PRESETS
 from warpnerf.runtime.memory import usable_cores
 from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.fisheye import angle_of
+from warpnerf.scenes.focus import find_focus, share_aimed_at, up_direction
 from warpnerf.scenes.frustum import HELD, contraction_of
 from warpnerf.scenes.load import load_scene
-from warpnerf.scenes.scene import Scene, find_focus, share_aimed_at, up_direction
+from warpnerf.scenes.scene import Scene
 from warpnerf.scenes.survey import Survey, survey
 from warpnerf.scenes.undistort import COEFFICIENTS
 

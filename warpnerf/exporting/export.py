@@ -11,7 +11,8 @@ from warpnerf.exporting import cameras as scenes
 from warpnerf.exporting import mesh, page, splats, surface, volume
 from warpnerf.exporting.sight import look
 from warpnerf.rendering.field import Field
-from warpnerf.scenes.scene import Scene, up_direction
+from warpnerf.scenes.focus import up_direction
+from warpnerf.scenes.scene import Scene
 from warpnerf.writing import write_atomically
 
 SURFACES = (".glb", ".obj", ".ply", ".points.ply", "")

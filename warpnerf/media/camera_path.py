@@ -12,13 +12,8 @@ import numpy as np
 from warpnerf.checks import InputError, require_one_of, require_positive, require_whole
 from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.fisheye import angle_of
-from warpnerf.scenes.scene import (
-    MIN_SHARE_AIMED,
-    Scene,
-    find_focus,
-    share_aimed_at,
-    up_direction,
-)
+from warpnerf.scenes.focus import MIN_SHARE_AIMED, find_focus, share_aimed_at, up_direction
+from warpnerf.scenes.scene import Scene
 
 PathKind = Literal["orbit", "through", "back"]
 

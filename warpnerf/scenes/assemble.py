@@ -14,12 +14,13 @@ from warpnerf.runtime.memory import usable_cores
 from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.depths import Depth, DepthFile, read_depth
 from warpnerf.scenes.files import exists, find_image
+from warpnerf.scenes.focus import estimate_extent
 from warpnerf.scenes.images import exif_orientation, image_shape
 from warpnerf.scenes.lens import Lens
 from warpnerf.scenes.masks import Mask, PackedMask, masks_of_folder, read_mask
 from warpnerf.scenes.photographs import Keeping, Photograph, keep
 from warpnerf.scenes.points import Points, extent_by_points
-from warpnerf.scenes.scene import Scene, View, estimate_extent
+from warpnerf.scenes.scene import Scene, View
 from warpnerf.scenes.undistort import seen_pixels
 
 LITTLE = 0.1

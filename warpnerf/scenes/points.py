@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from warpnerf.scenes.camera import Camera
+from warpnerf.scenes.focus import Extent
 from warpnerf.scenes.poses import MAX_COORDINATE
-from warpnerf.scenes.scene import Extent, Scene, View
+from warpnerf.scenes.scene import Scene, View
 
 MAX_PROJECTED = 5000
 """Points without tracks that are looked for in each photograph; of more every n-th is taken."""

@@ -20,7 +20,7 @@ import numpy as np
 
 from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.colmap import PARAMETERS
-from warpnerf.scenes.scene import up_direction
+from warpnerf.scenes.focus import up_direction
 
 SEED = 0
 MAX_FEATURES = 4096

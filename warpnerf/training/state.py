@@ -14,7 +14,8 @@ from warpnerf.checks import InputError
 from warpnerf.config import TrainConfig
 from warpnerf.model.interface import Model
 from warpnerf.rendering.field import Field
-from warpnerf.scenes.scene import Scene, find_focus
+from warpnerf.scenes.focus import find_focus
+from warpnerf.scenes.scene import Scene
 
 MAY_CHANGE = ("device", "threads", "checkpoint_every")
 """Fields of TrainConfig that a resumed training may change: what is computed stays the same. The

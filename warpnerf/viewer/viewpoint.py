@@ -14,7 +14,7 @@ import numpy as np
 
 from warpnerf.media.camera_path import MAX_SIDE, path_lens
 from warpnerf.scenes.camera import Camera
-from warpnerf.scenes.scene import up_direction
+from warpnerf.scenes.focus import up_direction
 
 if TYPE_CHECKING:
     import viser

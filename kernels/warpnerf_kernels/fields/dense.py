@@ -86,8 +86,8 @@ typedef float pair_vec __attribute__((ext_vector_type(2 * FLOATS)));  // a colum
 typedef float node_at __attribute__((ext_vector_type(FLOATS), aligned(4), may_alias));
 typedef float pair_at __attribute__((ext_vector_type(2 * FLOATS), aligned(4), may_alias));
 typedef float quad_at __attribute__((ext_vector_type(4), aligned(4), may_alias));
-// Bring the four columns of nodes around a sample into the second cache, ahead of their use: more
-// requests fit on the way there than on the way into the first. Every other column of nodes of 32
+// Bring the four columns of nodes around a sample into L2, ahead of their use: more requests
+// fit on the way there than on the way into L1. Every other column of nodes of 32
 // bytes lies across two cache lines.
 auto fetch_column = [&](const auto* node) {
     const char* column = (const char*)node;

@@ -34,9 +34,9 @@ struct Few { enum { value = 4 }; };
 struct Many { enum { value = MOST_ROWS }; };
 struct Several { enum { value = WIDTH % (MOST_VECS * LANES) ? 1 : MOST_VECS }; };  // of a layer
 struct Inputs { enum { value = PADDED % (MOST_VECS * LANES) ? 1 : MOST_VECS }; };
-// Rows that go through a layer before any goes through the next: its columns of weights stay in the
-// innermost cache meanwhile. Arrays have an entry for each, as the last block may reach beyond the
-// rows that there are.
+// Rows that go through a layer before any goes through the next: its columns of weights stay in
+// L1 meanwhile. Arrays have an entry for each, as the last block may reach beyond the rows that
+// there are.
 constexpr int GROUP = 32, MOST_BLOCKS = GROUP / Few::value;
 static_assert(GROUP % Many::value == 0, "a block reaches beyond the group");
 auto by_groups = [&](int n, auto visit) {
