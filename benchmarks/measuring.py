@@ -121,8 +121,13 @@ def commit(tree: Path) -> str | None:
     """Which one is checked out, with a plus where code was changed; None: it is no checkout."""
     git = ["git", "-C", str(tree)]
     try:
-        head = subprocess.run([*git, "rev-parse", "--short=12", "HEAD"], capture_output=True)
-        changed = subprocess.run([*git, "diff", "--quiet", "HEAD", "--", "*.py"], capture_output=True)
+        head, changed = (
+            subprocess.run([*git, *words], capture_output=True)
+            for words in (
+                ["rev-parse", "--short=12", "HEAD"],
+                ["diff", "--quiet", "HEAD", "--", "*.py"],
+            )
+        )
     except OSError:
         return None
     if head.returncode:
