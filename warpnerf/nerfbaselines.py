@@ -19,6 +19,7 @@ from warpnerf.config import TrainConfig
 from warpnerf.presets import PRESETS
 from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.focus import estimate_extent
+from warpnerf.scenes.overlap import in_picture
 from warpnerf.scenes.points import Points, extent_by_points, usable
 from warpnerf.scenes.scene import Scene, View
 from warpnerf.scenes.undistort import seen_pixels
@@ -293,7 +294,7 @@ def _points(positions: Any, cameras: Sequence[Camera]) -> Points | None:
     points = Points(positions=given[usable(given)], tracks=None, source="the dataset")
     if not len(points.positions):
         return None
-    in_pictures = np.sum([points.in_picture(camera) for camera in cameras], axis=0)
+    in_pictures = np.sum([in_picture(camera, points.sample) for camera in cameras], axis=0)
     return points if np.mean(in_pictures >= 2) >= MIN_IN_PICTURES else None
 
 

@@ -87,7 +87,7 @@ def train_command(
         scaling: How a sample's gradient depends on its distance from the camera.
         content_distance: Where gradients reach full strength, in the scene's units; per-camera: of
             each camera what it sees, as points or a short training tell; by default between that
-            and the scene's.
+            and the scene's, or less where many cameras see the same.
         voxels: Nodes of the final grid, in all; memory goes with their number.
         contraction: How space outside the box is held: none, folded in (linf, l2), or ndc, for
             cameras that look the same way; by default ndc for LLFF's captures that do, else folded
@@ -343,6 +343,15 @@ def _train(run: Run, scene: Scene, trainer: Trainer, session: Session | None) ->
     return 0
 
 
+def _scaling(trainer: Trainer) -> str:
+    """How gradients are scaled, and up to where if that is not the content distance."""
+    scaling, distances = f"scaling {trainer.config.scaling}", trainer.content_distances
+    least, most = f"{min(distances):.3g}", f"{max(distances):.3g}"
+    if trainer.config.scaling == "none" or set(distances) == {trainer.content_distance}:
+        return scaling
+    return f"{scaling} up to {least}" + (f" to {most} by camera" if least != most else "")
+
+
 def _describe(scene: Scene, trainer: Trainer) -> None:
     """What was understood of a scene."""
     from warpnerf.scenes.frustum import HELD, contraction_of
@@ -357,12 +366,7 @@ def _describe(scene: Scene, trainer: Trainer) -> None:
         print(f"  warning: {warning}")
     for note in scene.notes:
         print(f"  note: {note}")
-    least, most = min(trainer.content_distances), max(trainer.content_distances)
-    by_camera = f" ({least:.3g} to {most:.3g} by camera)" if least < most else ""
-    print(
-        f"  content distance {trainer.content_distance:.4g} scene units{by_camera}, "
-        f"scaling {trainer.config.scaling}"
-    )
+    print(f"  content distance {trainer.content_distance:.4g} scene units, {_scaling(trainer)}")
     print(
         f"  box {extent[0]:.4g} x {extent[1]:.4g} x {extent[2]:.4g} scene units, {outside}",
         flush=True,

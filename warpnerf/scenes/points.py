@@ -9,6 +9,7 @@ import numpy as np
 
 from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.focus import Extent
+from warpnerf.scenes.overlap import in_picture
 from warpnerf.scenes.poses import MAX_COORDINATE
 from warpnerf.scenes.scene import Scene, View
 
@@ -69,25 +70,7 @@ class Points:
             indices = self.tracks.get(name, np.empty(0, np.int64))
             points = self.positions[_spread(indices, MAX_SEEN)]
             return points[(points - camera.position) @ camera.forward > 0.0]
-        return self.sample[self.in_picture(camera)]
-
-    def in_picture(self, camera: Camera) -> np.ndarray:
-        """Which points of ``sample`` fall into a camera's picture, [n] bool.
-
-        Args:
-            camera: The camera; its distortion is left out of account.
-        """
-        points = self.sample
-        x, y, z = ((points - camera.position) @ camera.c2w[:, :3]).T
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            if camera.fisheye:  # as far from the middle as the angle to the axis is large
-                aside = np.hypot(x, y)
-                scale = np.where(aside > 0.0, np.arctan2(aside, -z) / aside, 0.0)
-            else:
-                scale = -1.0 / z
-            u, v = camera.cx + camera.fx * x * scale, camera.cy - camera.fy * y * scale
-        inside = (u >= 0.0) & (u < camera.width) & (v >= 0.0) & (v < camera.height)
-        return np.asarray(inside & (z < 0.0))
+        return self.sample[in_picture(camera, self.sample)]
 
     @property
     def sample(self) -> np.ndarray:
