@@ -10,6 +10,7 @@ from tiny_scenes import camera_at, ring, tiny_scene
 
 from warpnerf import GridConfig, TrainConfig
 from warpnerf.scenes.overlap import in_picture, views_of_content
+from warpnerf.scenes.scene import Scene
 from warpnerf.training.extent import content_distances
 
 
@@ -49,17 +50,36 @@ def test_a_fisheye_sees_farther_aside() -> None:
     assert not in_picture(camera, -points).any()
 
 
-def test_where_many_see_the_same_gradients_are_scaled_less_far() -> None:
-    """Up to seven cameras the whole distance, from fourteen on half of it."""
+def in_circle(n_cameras: int, turned: float) -> Scene:
+    """Cameras in a circle at one height, turned from its middle by so many degrees."""
+    angle = np.radians(turned)
+    around = np.array(
+        [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
+    )
+    poses = ring(n_cameras + 1, radius=4.0, height=0.0)  # the last is for testing
+    for pose in poses:
+        pose[:3, :3] = around @ pose[:3, :3]
+    return replace(
+        tiny_scene(poses), content_distance=4.0, content_distances=np.full(n_cameras + 1, 4.0)
+    )
+
+
+def test_where_many_look_around_and_see_the_same_gradients_are_scaled_less_far() -> None:
+    """Half as far at least; all the way where few do, or all look at one thing."""
     auto = TrainConfig(model="rgb", grid=GridConfig(voxels=8**3))
-    for n_cameras, share in ((4, 1.0), (7, 1.0), (10, 0.7), (14, 0.5), (30, 0.5)):
-        scene = tiny_scene(ring(n_cameras + 1, radius=4.0))  # the last is for testing
-        scene = replace(scene, content_distance=4.0, content_distances=np.full(n_cameras + 1, 4.0))
+    shares = []
+    for n_cameras in (8, 50, 200):
+        scene = in_circle(n_cameras, 60.0)
+        cameras = scene.training_cameras
+        seen_by = views_of_content(cameras, np.full(n_cameras, 4.0))
         one, each = content_distances(scene, auto)
-        assert one == 4.0
-        assert each == pytest.approx([share * 4.0] * n_cameras)
-        as_asked = replace(auto, content_distance="per-camera")
-        assert content_distances(scene, as_asked)[1] == [4.0] * n_cameras
+        shares.append(each[0] / 4.0)
+        assert one == 4.0 and each == [each[0]] * n_cameras
+        assert shares[-1] == pytest.approx(np.clip(7.0 / seen_by, 0.5, 1.0))
+        unlike = replace(scene, content_distances=None)
+        for given in (in_circle(n_cameras, 0.0), unlike):
+            assert content_distances(given, auto)[1] == [4.0] * n_cameras
+        own = replace(auto, content_distance="per-camera")
+        assert content_distances(scene, own)[1] == [4.0] * n_cameras
         assert content_distances(scene, replace(auto, content_distance=3.0))[1] == [3.0] * n_cameras
-        unknown = replace(scene, content_distances=None)
-        assert content_distances(unknown, auto)[1] == [4.0] * n_cameras
+    assert shares[0] == 1.0 and 0.5 < shares[1] < 1.0 and shares[-1] == 0.5

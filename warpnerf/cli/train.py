@@ -87,7 +87,7 @@ def train_command(
         scaling: How a sample's gradient depends on its distance from the camera.
         content_distance: Where gradients reach full strength, in the scene's units; per-camera: of
             each camera what it sees, as points or a short training tell; by default between that
-            and the scene's, or less where many cameras see the same.
+            and the scene's, or less where many look around.
         voxels: Nodes of the final grid, in all; memory goes with their number.
         contraction: How space outside the box is held: none, folded in (linf, l2), or ndc, for
             cameras that look the same way; by default ndc for LLFF's captures that do, else folded

@@ -13,6 +13,7 @@ from warpnerf.config import MarchConfig, TrainConfig
 from warpnerf.model.grid import VoxelGrid, grid_size, require_memory, room_for_nodes
 from warpnerf.model.interface import Model
 from warpnerf.rendering.render import Steps
+from warpnerf.scenes.focus import find_focus
 from warpnerf.scenes.frustum import FARTHEST, contraction_of, fit_frustum
 from warpnerf.scenes.overlap import views_of_content
 from warpnerf.scenes.scene import Scene
@@ -23,7 +24,7 @@ FAR_BOXES = 64.0
 FEW_VIEWS = 7.0
 """Cameras that see the same content, up to which auto scales all the way to its distance."""
 LEAST_SHARE = 0.5
-"""Of the way, that auto scales where many more cameras see the same."""
+"""Of the way, that auto scales where many more cameras see the same, and look at no one thing."""
 
 
 def require_grid(scene: Scene, config: TrainConfig, device: wp.Device) -> None:
@@ -80,9 +81,9 @@ def content_distances(scene: Scene, config: TrainConfig) -> tuple[float, list[fl
 
     With auto, a camera's is the geometric mean of the scene's and of its own where that is known: a
     camera close to a wall shall draw the wall, but in a scene of few photographs a camera's own is
-    the distance of its floaters as often as not. Where many cameras see the same, it is less, down
-    to half: they contradict a floater before one of them, and scaling would only slow down what the
-    nearer of them draw.
+    the distance of its floaters as often as not. Cameras that look at no common point see content
+    at all distances; where many of them see the same, it is less, down to half: they contradict a
+    floater before one of them, and scaling would only slow down what the nearer of them draw.
 
     Raises:
         InputError: It is per-camera, and the scene has none.
@@ -104,8 +105,10 @@ def content_distances(scene: Scene, config: TrainConfig) -> tuple[float, list[fl
         return scene.content_distance, [float(scene.content_distances[i]) for i in train]
     if chosen == "auto" and scene.content_distances is not None:
         one, each = scene.content_distance, scene.content_distances[list(train)]
-        share = max(LEAST_SHARE, FEW_VIEWS / views_of_content(scene.training_cameras, each))
-        return one, [min(1.0, share) * math.sqrt(one * float(own)) for own in each]
+        cameras, share = scene.training_cameras, 1.0
+        if find_focus(cameras).guessed:
+            share = min(1.0, max(LEAST_SHARE, FEW_VIEWS / views_of_content(cameras, each)))
+        return one, [share * math.sqrt(one * float(own)) for own in each]
     one = scene.content_distance if chosen == "auto" else float(chosen)
     return one, [one] * len(train)
 
