@@ -349,7 +349,7 @@ def _scaling(trainer: Trainer) -> str:
     least, most = f"{min(distances):.3g}", f"{max(distances):.3g}"
     if trainer.config.scaling == "none" or set(distances) == {trainer.content_distance}:
         return scaling
-    return f"{scaling} up to {least}" + (f" to {most} by camera" if least != most else "")
+    return f"{scaling} below {least}" + (f" to {most}, by camera" if least != most else "")
 
 
 def _describe(scene: Scene, trainer: Trainer) -> None:
