@@ -65,7 +65,7 @@ def in_circle(n_cameras: int, turned: float) -> Scene:
 
 
 def test_where_many_look_around_and_see_the_same_gradients_are_scaled_less_far() -> None:
-    """Half as far at least; all the way where few do, or all look at one thing."""
+    """By how many do, and never less than half as far; all the way where they look at one thing."""
     auto = TrainConfig(model="rgb", grid=GridConfig(voxels=8**3))
     shares = []
     for n_cameras in (8, 50, 200):
@@ -76,8 +76,8 @@ def test_where_many_look_around_and_see_the_same_gradients_are_scaled_less_far()
         shares.append(each[0] / 4.0)
         assert one == 4.0 and each == [each[0]] * n_cameras
         assert shares[-1] == pytest.approx(np.clip(7.0 / seen_by, 0.5, 1.0))
-        unlike = replace(scene, content_distances=None)
-        for given in (in_circle(n_cameras, 0.0), unlike):
+        unknown = replace(scene, content_distances=None)
+        for given in (in_circle(n_cameras, 0.0), unknown):
             assert content_distances(given, auto)[1] == [4.0] * n_cameras
         own = replace(auto, content_distance="per-camera")
         assert content_distances(scene, own)[1] == [4.0] * n_cameras

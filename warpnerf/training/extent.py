@@ -81,9 +81,9 @@ def content_distances(scene: Scene, config: TrainConfig) -> tuple[float, list[fl
 
     With auto, a camera's is the geometric mean of the scene's and of its own where that is known: a
     camera close to a wall shall draw the wall, but in a scene of few photographs a camera's own is
-    the distance of its floaters as often as not. Cameras that look at no common point see content
-    at all distances; where many of them see the same, it is less, down to half: they contradict a
-    floater before one of them, and scaling would only slow down what the nearer of them draw.
+    the distance of its floaters as often as not. Where cameras look at no common point and many see
+    the same, it is less, down to half: they contradict a floater before one of them, and scaling
+    would only slow down what the nearer of them draw.
 
     Raises:
         InputError: It is per-camera, and the scene has none.
