@@ -138,6 +138,55 @@ def test_overwriting_removes_what_was_written_and_nothing_else(
     assert len(list(photos.iterdir())) == N
 
 
+def test_a_scene_can_be_posed_anew_in_place(tmp_path: Path, photos: Path, colmap: Colmap) -> None:
+    scene = tmp_path / "scene"
+    pose(photos, scene)
+    for path in photos.iterdir():
+        path.unlink()  # its photographs are the only ones now
+    pose(scene, scene, overwrite=True)
+    assert len(load_scene(scene).views) == N
+    pose(photographs(tmp_path / "others", 4), scene, overwrite=True)  # they still go with it
+    assert len(load_scene(scene).views) == len(list((scene / "images").iterdir())) == 4
+
+
+def test_interrupted_at_any_file_of_the_new_scene_a_whole_one_is_there(
+    tmp_path: Path, photos: Path, colmap: Colmap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    others = photographs(tmp_path / "others", 4)
+    replace_file, done = Path.replace, 0
+
+    def cut(self: Path, target: Path) -> Path:
+        nonlocal done
+        if done == last:
+            raise KeyboardInterrupt
+        done += 1
+        return replace_file(self, target)
+
+    for last in range(8):
+        scene, done = tmp_path / f"scene {last}", 0
+        pose(photos, scene)
+        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+            patch.setattr(Path, "replace", cut)
+            pose(others, scene, overwrite=True)
+        assert len(json.loads((scene / "transforms.json").read_text())["frames"]) == N
+        assert all((scene / "images" / f"{k:02}.png").exists() for k in range(N))
+        pose(others, scene, overwrite=True)
+        assert len(load_scene(scene).views) == 4
+
+
+def test_photographs_of_one_name_may_share_a_mask(
+    tmp_path: Path, photos: Path, colmap: Colmap
+) -> None:
+    Image.open(photos / "03.png").save(photos / "03.jpg")
+    masks = tmp_path / "my masks"
+    masks.mkdir()
+    Image.new("L", (8, 6), 255).save(masks / "03.png")
+    pose(photos, tmp_path / "scene", PoseConfig(masks=masks))
+    frames = json.loads((tmp_path / "scene" / "transforms.json").read_text())["frames"]
+    named = [frame["file_path"] for frame in frames if frame.get("mask_path") == "masks/03.png"]
+    assert sorted(named) == ["images/03.jpg", "images/03.png"]
+
+
 def test_a_record_from_elsewhere_removes_nothing_outside(
     tmp_path: Path, photos: Path, colmap: Colmap
 ) -> None:

@@ -20,6 +20,7 @@ from warpnerf.cli.render import render_command
 from warpnerf.scenes.load import load_scene
 from warpnerf.sfm import pose as module
 from warpnerf.sfm import worker
+from warpnerf.training import run_files
 from warpnerf.training.lock import only_writer
 from warpnerf.training.run import Run
 from warpnerf.training.trainer import Trainer
@@ -106,6 +107,20 @@ def test_the_same_photographs_serve_both_runs(
     assert images_of(old / "previous") == 12
     train(tmp_path / "old", old, overwrite=True)
     assert images_of(old) == 12 and not (old / "previous").exists()
+
+
+@pytest.mark.parametrize("inside", ["transforms.json", "sparse/0"])
+def test_a_new_run_of_a_file_in_the_run_s_scene_keeps_it(old: Path, inside: str) -> None:
+    (old / "scene" / "sparse" / "0").mkdir(parents=True, exist_ok=True)
+    run_files.set_aside(old, in_use=old / "scene" / inside)
+    assert len(load_scene(old / "scene").views) == 12
+
+
+def test_a_scene_in_the_place_of_older_runs_is_refused(old: Path) -> None:
+    before = listing(old)
+    with pytest.raises(InputError, match="lies in .*previous, which makes room"):
+        run_files.set_aside(old, in_use=old / "previous" / "scene")
+    assert listing(old) == before
 
 
 def test_poses_for_a_run_that_never_began_go_with_the_next(

@@ -7,7 +7,7 @@ import json
 import os
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence, Set
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -134,7 +134,9 @@ def pose(
             posing, notes=(*_notes(source, photographs, matching, is_video), *posing.notes)
         )
         shutil.rmtree(prepared / WORK)
-        _write(prepared, posing, found, in_scene, photographs, made_of)
+        older = scene_files.read_record(output)
+        staying = {*in_scene.values()}.intersection([] if older is None else older.written)
+        _write(prepared, posing, found, in_scene, photographs, made_of, staying)
         scene_files.move_into(prepared, output)
     on_progress(1.0, f"{posing.registered} of {posing.photographs} photographs placed")
     return posing
@@ -234,7 +236,7 @@ def _into_scene(
         Their paths relative to the scene's folder.
     """
     root, paths = output.resolve(), {}
-    for file in files:
+    for file in dict.fromkeys(files):
         inside = [
             place for place in (prepared.resolve(), root) if file.resolve().is_relative_to(place)
         ]
@@ -314,8 +316,9 @@ def _write(
     in_scene: dict[Path, str],
     photographs: Sequence[UnposedPhotograph],
     made_of: dict[str, Any],
+    staying: Set[str],
 ) -> None:
-    """Write transforms.json and pose.json."""
+    """Write transforms.json and pose.json, to which files of the older scene may go on to belong."""
     placed = [p for p in photographs if p.path.name in found["registered"]]
     files = [
         PosedFile(
@@ -339,7 +342,7 @@ def _write(
         "not_registered": posing.missing,
         "notes": posing.notes,
         "made_of": made_of,
-        "written": sorted([*written, scene_files.SUMMARY]),
+        "written": sorted({*written, *staying, scene_files.SUMMARY}),
     }
     (prepared / scene_files.SUMMARY).write_text(
         json.dumps(content, indent=1) + "\n", encoding="utf-8"

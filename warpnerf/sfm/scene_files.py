@@ -75,9 +75,10 @@ def require_free(folder: Path, source: Path, overwrite: bool) -> None:
 
 
 def move_into(prepared: Path, folder: Path) -> None:
-    """Put the files of a prepared folder in their place, transforms.json last.
+    """Put the files of a prepared folder in their place, its record and transforms.json last.
 
-    A posed scene that is there already loses the files that its record lists.
+    A posed scene that is there already loses the files that its record lists and the new one's does
+    not, once the new one is whole: until then the older one can still be loaded.
 
     Raises:
         OSError: They cannot be moved.
@@ -86,14 +87,16 @@ def move_into(prepared: Path, folder: Path) -> None:
         folder.parent.mkdir(parents=True, exist_ok=True)
         prepared.replace(folder)
         return
-    older = read_record(folder)
-    if older is not None:
-        remove_written(folder, older)
-    files = [path for path in prepared.rglob("*") if path.is_file()]
-    for path in sorted(files, key=lambda path: path.name == TRANSFORMS):
+    older, newer = read_record(folder), read_record(prepared)
+    last = [prepared / SUMMARY, prepared / TRANSFORMS]
+    files = [path for path in prepared.rglob("*") if path.is_file() and path not in last]
+    for path in [*files, *filter(exists, last)]:
         target = folder / path.relative_to(prepared)
         target.parent.mkdir(parents=True, exist_ok=True)
         path.replace(target)
+    if older is not None:
+        kept = set() if newer is None else set(newer.written)
+        remove_written(folder, Record(older.made_of, sorted({*older.written} - kept)))
     shutil.rmtree(prepared)  # empty folders
 
 

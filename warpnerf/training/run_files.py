@@ -75,7 +75,7 @@ def stored_place(folder: Path, source: str) -> str:
     """A scene's place as config.json has it, so that a run can be moved with its scene."""
     if source.startswith("builtin:"):
         return source
-    if _same(source, folder / NEXT_IN_RUN):
+    if _lies_in(source, folder / NEXT_IN_RUN):
         return IN_RUN
     path, root = Path(source).resolve(), folder.resolve()
     return path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
@@ -111,8 +111,16 @@ def set_aside(folder: Path, in_use: Path) -> None:
 
     Args:
         folder: Of the older run, and soon of the new one.
-        in_use: What the new run is made of; stays, even if it is the older one's scene.
+        in_use: What the new run is made of; stays, even if it is the older one's scene, or in it.
+
+    Raises:
+        InputError: What the new run is made of lies in previous/ itself.
     """
+    if _lies_in(in_use, folder / PREVIOUS):
+        raise InputError(
+            f"{in_use}: lies in {folder / PREVIOUS}, which makes room for the older run; move it "
+            "somewhere else first, or name another --output."
+        )
     sweep(folder)
     scene = _own_scene(folder)
     if results(folder):
@@ -128,7 +136,7 @@ def set_aside(folder: Path, in_use: Path) -> None:
     else:
         for path in _by_products(folder):
             path.unlink()
-    if scene is not None and not _same(in_use, scene):
+    if scene is not None and not _lies_in(in_use, scene):
         remove_posed(scene)
 
 
@@ -151,7 +159,7 @@ def discard_previous(folder: Path) -> None:
 def take_scene(folder: Path, source: str) -> None:
     """Put the scene that waits in next/ in its place if it is the source, and else remove it."""
     waiting = folder / NEXT_IN_RUN
-    if not source.startswith("builtin:") and _same(source, waiting):
+    if not source.startswith("builtin:") and _lies_in(source, waiting):
         move_into(waiting, folder / IN_RUN)
     remove_posed(waiting)
     with suppress(OSError):  # not empty, or not there
@@ -180,10 +188,12 @@ def _own_scene(folder: Path) -> Path | None:
     """The posed scene in the folder; None where there is none, or the run is not of it."""
     scene = folder / IN_RUN
     try:
-        return scene if _same(read_config(folder).scene, scene) and read_record(scene) else None
+        is_own = _lies_in(read_config(folder).scene, scene)
+        return scene if is_own and read_record(scene) else None
     except InputError:
         return None
 
 
-def _same(path: str | Path, other: Path) -> bool:
-    return Path(path).resolve() == other.resolve()
+def _lies_in(path: str | Path, folder: Path) -> bool:
+    """Whether a path is that of a folder or of something in it."""
+    return Path(path).resolve().is_relative_to(folder.resolve())
