@@ -157,6 +157,20 @@ def test_reduced_photographs_have_a_reduced_lens(tmp_path: Path) -> None:
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (5.0, 5.5, 2.125, 1.375)
 
 
+@pytest.mark.parametrize(
+    ("size", "reduced"),
+    [((3115, 2078), (1558, 1039)), ((3118, 2078), (780, 520)), ((4946, 3286), (1237, 822))],
+)
+def test_reduced_photographs_have_whole_pixels(
+    tmp_path: Path, size: tuple[int, int], reduced: tuple[int, int]
+) -> None:
+    # size * (reduced / size) misses one of these sides by its last bit.
+    camera = colmap._Camera("SIMPLE_PINHOLE", *size, (900.0, 1000.0, 500.0))
+    Image.new("L", reduced).save(tmp_path / "a.png")
+    lens = colmap._lens(Path("cameras.bin"), 1, camera, tmp_path / "a.png", True)
+    assert (lens.values["w"], lens.values["h"]) == reduced
+
+
 def change(file: Path, before: str, after: str) -> None:
     text = file.read_text()
     assert before in text

@@ -14,7 +14,7 @@ from PIL import Image
 from tiny_scenes import hand_made_png, picture
 
 from warpnerf.checks import InputError
-from warpnerf.scenes.images import read_image
+from warpnerf.scenes.images import exif_orientation, read_image
 
 
 def saved(path: Path, image: Image.Image, **options: object) -> Path:
@@ -85,6 +85,14 @@ def test_sixteen_bit_gray_is_scaled_to_eight(tmp_path: Path, suffix: str) -> Non
     else:
         saved(path, Image.fromarray(values))
     assert read_image(path)[0, :, 0].tolist() == [0, 0, 1, 100, 255, 255]
+
+
+@pytest.mark.parametrize("ending", ["jpg", "webp"])
+def test_orientation_is_read_where_exif_is(tmp_path: Path, ending: str) -> None:
+    exif = Image.Exif()
+    exif[274] = 6
+    path = saved(tmp_path / f"a.{ending}", Image.fromarray(picture(6)), exif=exif)
+    assert exif_orientation(path) == 6
 
 
 def test_exif_rotation_is_not_applied(tmp_path: Path) -> None:

@@ -118,7 +118,7 @@ def test_a_new_run_of_a_file_in_the_run_s_scene_keeps_it(old: Path, inside: str)
 
 def test_a_scene_in_the_place_of_older_runs_is_refused(old: Path) -> None:
     before = listing(old)
-    with pytest.raises(InputError, match="lies in .*previous, which makes room"):
+    with pytest.raises(InputError, match=r"lies in .*previous, which makes room"):
         run_files.set_aside(old, in_use=old / "previous" / "scene")
     assert listing(old) == before
 

@@ -14,6 +14,7 @@ from tiny_scenes import write_transforms
 from warpnerf.checks import InputError
 from warpnerf.cli.export import export_command
 from warpnerf.cli.render import render_command
+from warpnerf.cli.train import train_command
 from warpnerf.config import TrainConfig
 from warpnerf.exporting import export as exporting
 from warpnerf.scenes.load import load_scene
@@ -58,6 +59,22 @@ def test_commands_keep_the_masks_of_the_training(
     monkeypatch.setattr(exporting, "look", look)
     assert export_command(run, tmp_path / "a.npz", scene=place, threads=1) == 0
     assert looked and all(mask[:, 4:].all() and not mask[:, :4].any() for mask in looked)
+
+
+def test_a_training_of_a_scene_that_moved_goes_on_with_its_masks(tmp_path: Path) -> None:
+    write_transforms(tmp_path / "scene", 6, scale=2)
+    masks = tmp_path / "scene/hide"
+    masks.mkdir()
+    for number in range(6):
+        Image.new("L", (16, 12), 255).save(masks / f"{number:03d}.png")
+    run = tmp_path / "run"
+    tiny = {"steps": 2, "threads": 1, "voxels": 512}
+    assert train_command(str(tmp_path / "scene"), output=run, masks=masks, **tiny) == 0
+    (tmp_path / "scene").rename(tmp_path / "elsewhere")
+    assert train_command(str(tmp_path / "elsewhere"), resume=run) == 0
+    (tmp_path / "elsewhere/hide").rename(tmp_path / "hidden")
+    with pytest.raises(InputError, match="scene/hide: the masks that the run was trained with"):
+        train_command(str(tmp_path / "elsewhere"), resume=run)
 
 
 def test_the_viewer_shows_no_photograph_that_is_masked_wholly(tmp_path: Path) -> None:

@@ -258,13 +258,15 @@ def _go_on(
     changed: Callable[[TrainConfig], TrainConfig],
     page: PageOptions | None,
 ) -> int:
+    from warpnerf.training.run_scene import masks_of
     from warpnerf.training.trainer import Trainer
 
     begun = run.read_config()
     state, notes = run.load_state()
     config = changed(state.config)
     state.require_same_config(config)
-    scene = _read(moved or begun.scene, begun.downscale, masks or begun.masks, images, run.folder)
+    masks = masks or masks_of(begun, moved)
+    scene = _read(moved or begun.scene, begun.downscale, masks, images, run.folder)
     trainer = Trainer(scene, config, state)
     scene = begun.as_trained(scene)
     _describe(scene, trainer)

@@ -286,15 +286,16 @@ def _lens(file: Path, number: int, camera: _Camera, photograph: Path, reduced: b
             values[name] = value
     if min(values["fl_x"], values["fl_y"]) <= 0.0 or min(camera.width, camera.height) < 1:
         raise InputError(f"{file}: {place}: its size and focal lengths must be above 0.")
-    across = along = 1.0
+    size = camera.width, camera.height
     if reduced:
         width, height = image_size(photograph)
         # Sides are rounded to whole pixels, so that one may be off by one.
         if abs(width / camera.width * camera.height - height) <= 1.0:
-            across, along = width / camera.width, height / camera.height
+            size = width, height
+    across, along = size[0] / camera.width, size[1] / camera.height
     for name, factor in (("fl_x", across), ("cx", across), ("fl_y", along), ("cy", along)):
         values[name] *= factor
-    values |= {"w": camera.width * across, "h": camera.height * along}
+    values |= {"w": size[0], "h": size[1]}
     return Lens(
         file=file,
         values=values,

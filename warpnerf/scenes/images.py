@@ -93,8 +93,8 @@ def exif_orientation(path: Path) -> int:
 def read_exif(path: Path, look: Callable[[Image.Exif], T]) -> T | None:
     """What something finds in a photograph's EXIF; None where there is none that can be read."""
     try:
-        # Of a PNG all pixels would be decoded first.
-        with Image.open(path, formats=("JPEG", "MPO", "WEBP")) as image:
+        # Of a PNG all pixels would be decoded first. MPO, several JPEGs in a file, opens as JPEG.
+        with Image.open(path, formats=("JPEG", "WEBP")) as image:
             return look(image.getexif())
     except Exception:  # tags are damaged in more ways than Pillow has names for
         return None

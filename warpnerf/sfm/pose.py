@@ -318,7 +318,7 @@ def _write(
     made_of: dict[str, Any],
     staying: Set[str],
 ) -> None:
-    """Write transforms.json and pose.json, to which files of the older scene may go on to belong."""
+    """Write transforms.json and pose.json, which lists files of the older scene that stay, too."""
     placed = [p for p in photographs if p.path.name in found["registered"]]
     files = [
         PosedFile(

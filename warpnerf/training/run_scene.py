@@ -21,14 +21,24 @@ def load_run_scene(config: RunConfig, moved: str | None = None) -> Scene:
     Raises:
         InputError: The scene cannot be read, or the run's masks are gone.
     """
-    masks = _masks(config, moved)
+    masks = masks_of(config, moved)
     scene = load_scene(
         moved or config.scene, downscale=config.downscale, masks=masks, images="files"
     )
     return config.as_trained(scene)
 
 
-def _masks(config: RunConfig, moved: str | None) -> Path | None:
+def masks_of(config: RunConfig, moved: str | None = None) -> Path | None:
+    """The folder of the masks that a run was trained with; None where there were none.
+
+    Args:
+        config: Of the run.
+        moved: Where its scene is now; None: where it was. Masks that lay inside it are looked for
+            there first.
+
+    Raises:
+        InputError: They are gone.
+    """
     if config.masks is None:
         return None
     masks, scene = Path(config.masks), Path(config.scene)
