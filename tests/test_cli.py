@@ -45,7 +45,7 @@ def run(*arguments: str | Path) -> tuple[int, str, str]:
 def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """A tiny run, and what it printed."""
     folder = tmp_path_factory.mktemp("runs") / "room"
-    code, out, err = run("train", *TINY, "--steps", "3e1", "--output", folder)
+    code, out, err = run("train", *TINY, "--steps=3e1", "--output", folder)
     assert code == 0, err
     assert "CUDA" not in err
     return folder, out

@@ -70,7 +70,7 @@ def test_depth_of_another_size_is_taken_from_the_nearest(tmp_path: Path) -> None
     camera = camera_at(np.eye(4), width=16, height=12, fx=1e6, fy=1e6, cx=8.0, cy=6.0)
     found = read_depth(DepthFile(tmp_path / "d.png", 1.0), camera).read()
     np.testing.assert_allclose(found, np.kron(VALUES, np.ones((2, 2))), rtol=1e-6)
-    found = read_depth(DepthFile(tmp_path / "d.png", 1.0), camera.downscaled(4)).read()
+    found = read_depth(DepthFile(tmp_path / "d.png", 1.0), camera, 4).read()
     np.testing.assert_allclose(found, VALUES[1::2, 1::2], rtol=1e-6)
 
 
@@ -81,10 +81,22 @@ def test_no_more_than_the_file_has_or_the_photograph_needs_is_kept(tmp_path: Pat
     kept = read_depth(file, large)
     assert kept.values.shape == (6, 8) and kept.shape == kept.read().shape == (600, 800)
     small = camera_at(np.eye(4)).downscaled(2)
-    kept = read_depth(file, small)
+    kept = read_depth(file, camera_at(np.eye(4)), 2)
     assert kept.values.shape == kept.shape == (3, 4)
     along = kept.read() * -rays(small)[..., 2]
     np.testing.assert_allclose(along, VALUES[1::2, 1::2], rtol=1e-6)
+
+
+@pytest.mark.parametrize("times", [1, 2, 7])
+def test_depth_is_cropped_as_the_reduced_photograph(tmp_path: Path, times: int) -> None:
+    # Of 63 x 31 pixels, blocks of 8 cover 56 x 24.
+    camera = camera_at(np.eye(4), width=63, height=31, fx=1e6, fy=1e6, cx=31.5, cy=15.5)
+    rows, columns = 31 * times, 63 * times
+    values = np.arange(columns) + 0.5 + 1000.0 * (np.arange(rows)[:, None] + 0.5)
+    np.save(tmp_path / "d.npy", values / times)
+    found = read_depth(DepthFile(tmp_path / "d.npy", 1.0), camera, 8).read()
+    middles = 8.0 * np.arange(1, 8) - 4.0 + 1000.0 * (8.0 * np.arange(1, 4)[:, None] - 4.0)
+    assert np.abs(found - middles).max() <= 500.5 / times + 1e-3
 
 
 @pytest.mark.parametrize(

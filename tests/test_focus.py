@@ -10,11 +10,8 @@ from warpnerf.checks import InputError
 from warpnerf.scenes.camera import Camera
 from warpnerf.scenes.focus import (
     UNBOUNDED_BOX_SHARE,
-    estimate_box,
-    estimate_content_distance,
     estimate_extent,
     find_focus,
-    focus_point,
     share_aimed_at,
     up_direction,
 )
@@ -33,9 +30,10 @@ def test_focus_is_where_all_axes_meet() -> None:
     target = (1.0, -2.0, 0.5)
     positions = [(4.0, 0.0, 1.0), (0.0, 3.0, 2.0), (-3.0, -2.0, 0.0), (1.0, -6.0, 4.0)]
     cameras = cameras_at([look_at(position, target) for position in positions])
-    np.testing.assert_allclose(focus_point(cameras), target, atol=1e-12)
+    focus = find_focus(cameras)
+    np.testing.assert_allclose(focus.point, target, atol=1e-12)
     distances = [np.linalg.norm(np.subtract(position, target)) for position in positions]
-    assert estimate_content_distance(cameras) == pytest.approx(np.median(distances))
+    assert focus.distance == pytest.approx(np.median(distances))
 
 
 def test_focus_minimises_squared_distance_to_the_axes() -> None:
@@ -51,7 +49,7 @@ def test_focus_minimises_squared_distance_to_the_axes() -> None:
             np.sum(np.cross(camera.forward, point - camera.position) ** 2) for camera in cameras
         )
 
-    focus = focus_point(cameras)
+    focus = find_focus(cameras).point
     assert cost(focus) > 0.1
     for shift in 1e-3 * np.concatenate([np.eye(3), -np.eye(3)]):
         assert cost(focus + shift) > cost(focus)
@@ -70,15 +68,15 @@ def test_extent_moves_and_scales_with_the_cameras() -> None:
 
 def test_box_of_an_object_is_what_the_larger_field_of_view_spans() -> None:
     cameras = [camera_at(pose, width=8, fx=8.0, height=30, fy=10.0) for pose in ring(5)]
-    box_min, box_max = estimate_box(cameras, unbounded=False)
-    np.testing.assert_allclose(box_max, np.sqrt(10.0) * 1.5)
-    np.testing.assert_allclose(box_min, -np.sqrt(10.0) * 1.5)
+    extent = estimate_extent(cameras, unbounded=False)
+    np.testing.assert_allclose(extent.box_max, np.sqrt(10.0) * 1.5)
+    np.testing.assert_allclose(extent.box_min, -np.sqrt(10.0) * 1.5)
 
 
 def test_box_of_photographs_is_a_share_of_the_content_distance() -> None:
-    box_min, box_max = estimate_box(cameras_at(ring(5)), unbounded=True)
-    np.testing.assert_allclose(box_max, np.sqrt(10.0) * UNBOUNDED_BOX_SHARE)
-    np.testing.assert_allclose(box_min, -np.sqrt(10.0) * UNBOUNDED_BOX_SHARE)
+    extent = estimate_extent(cameras_at(ring(5)), unbounded=True)
+    np.testing.assert_allclose(extent.box_max, np.sqrt(10.0) * UNBOUNDED_BOX_SHARE)
+    np.testing.assert_allclose(extent.box_min, -np.sqrt(10.0) * UNBOUNDED_BOX_SHARE)
 
 
 def test_cameras_that_look_outward_fall_back_to_their_spread() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 from tiny_scenes import ring, save, write_blender, write_transforms
 
 from warpnerf.scenes.survey import survey
@@ -21,6 +22,19 @@ def test_formats_are_named(tmp_path: Path) -> None:
     assert found.format == "Blender / NeRF-synthetic (transforms_train.json, transforms_test.json)"
     assert survey("builtin:room").format.startswith("built in")
     assert survey(tmp_path / "nowhere").files == ()
+
+
+def test_a_file_that_is_named_is_the_one_that_is_surveyed(tmp_path: Path) -> None:
+    write_blender(tmp_path, "train", ring(4))
+    content = write_transforms(tmp_path, 4)
+    for name in ("transforms.json", "transforms_mine.json"):
+        save(tmp_path / name, content | {"exposure": 2.0})
+        found = survey(tmp_path / name)
+        assert found.format == f"instant-ngp / nerfstudio ({name})"
+        assert found.files == (tmp_path / name,) and "exposure" in found.oddities[0]
+    assert survey(tmp_path).format.startswith("Blender")
+    np.savez(tmp_path / "a.npz", a=1)
+    assert survey(tmp_path / "a.npz").format == "npz (a.npz)"
 
 
 def test_all_poses_that_are_refused_are_named(tmp_path: Path) -> None:

@@ -65,6 +65,18 @@ def test_mp4_is_h264_at_the_asked_rate(tmp_path: Path) -> None:
         assert float(stream.average_rate) == pytest.approx(30000 / 1001)
 
 
+@pytest.mark.parametrize("fps", [24.0, 30.0, 49.0])
+def test_a_gif_lasts_as_long_as_it_should(tmp_path: Path, fps: float) -> None:
+    pictures = [np.full((4, 4, 3), 10 * number, np.uint8) for number in range(24)]
+    write_video(tmp_path / "film.gif", iter([*pictures, pictures[-1]]), fps)
+    with Image.open(tmp_path / "film.gif") as image:
+        pauses = []
+        for number in range(image.n_frames):
+            image.seek(number)
+            pauses.append(image.info["duration"])
+    assert sum(pauses) == 10 * round(100 * 25 / fps)
+
+
 @pytest.mark.parametrize("error", [KeyboardInterrupt, MemoryError])
 @pytest.mark.parametrize("name", NAMES)
 def test_interrupted_it_leaves_what_was_there(

@@ -12,10 +12,17 @@ CHUNK = 1 << 24
 def write_atomically(path: str | Path, *pieces: bytes | memoryview) -> None:
     """Write a file so that its name always leads to all of the old content or all of the new.
 
+    A link stays, and what it leads to is replaced. Pipes and devices are written to as they are.
+
     Raises:
         OSError: It cannot be written.
     """
     path = Path(path)
+    if _takes_a_stream(path):
+        with path.open("wb") as stream:
+            stream.writelines(pieces)
+        return
+    path = Path(os.path.realpath(path))
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | getattr(os, "O_BINARY", 0)
@@ -38,3 +45,10 @@ def write_atomically(path: str | Path, *pieces: bytes | memoryview) -> None:
             os.fsync(folder)
         finally:
             os.close(folder)
+
+
+def _takes_a_stream(path: Path) -> bool:
+    """Whether a path is that of a pipe or a device, or of this process's standard output."""
+    if path.parts[:2] in (("/", "dev"), ("/", "proc")):
+        return True
+    return path.exists() and not (path.is_file() or path.is_dir())

@@ -44,11 +44,11 @@ def _meant(option: str, word: str) -> str:
     Raises:
         InputError: It is None, by which Python's default would be meant.
     """
-    if (option.startswith("--") and word == "None") or re.fullmatch(r"--[\w-]+=None", word):
-        raise InputError(
-            f"{option if word == 'None' else word.removesuffix('=None')} cannot be None; leave it "
-            "out for what it is by default."
-        )
+    if option.startswith("--") and word == "None":
+        raise InputError(f"{option} cannot be None; leave it out for what it is by default.")
+    joined = re.fullmatch(r"(--[\w-]+)=(.*)", word)
+    if joined:
+        return f"{joined[1]}={_meant(joined[1], joined[2])}"
     if option in ("--steps", "--voxels") and re.fullmatch(r"\d+(\.\d+)?e\d{1,2}", word.lower()):
         count = Decimal(word)
         return str(int(count)) if count == count.to_integral_value() else word

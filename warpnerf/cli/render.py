@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from warpnerf.scenes.camera import Camera
     from warpnerf.scenes.scene import Scene
 
+FPS = 30.0
+"""Frames per second, unless asked for."""
+
 SECONDS = 8.0
 """Length of a video along a path that has no length of its own."""
 
@@ -30,7 +33,7 @@ def render_command(
     stills: Literal["test", "train", "val", "all"] | None = None,
     output: Path | None = None,
     size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="WIDTH HEIGHT")] = None,
-    fps: float = 30.0,
+    fps: float | None = None,
     seconds: float | None = None,
     distance: float | None = None,
     depths: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="NEAR FAR")] = None,
@@ -50,7 +53,7 @@ def render_command(
             PATH.mp4 (video.mp4 for auto, and for a recorded path its file's name) or stills/ in
             the run's folder.
         size: Of the colour picture, pixels; by default as the photographs, or as recorded.
-        fps: Frames per second.
+        fps: Frames per second, by default 30.
         seconds: Length of the video; by default 8, or as recorded.
         distance: How far `back` backs away, scene units; by default half the content distance.
         depths: What gets the first and the last colour, scene units; by default what is seen.
@@ -69,7 +72,12 @@ def render_command(
         raise InputError("--distance is how far --path back backs away; give both or neither.")
     if stills is not None and path != "auto":
         raise InputError("--stills renders the views of a split, along no path; give one of them.")
+    if stills is not None and not (fps is None and seconds is None):
+        raise InputError("--fps and --seconds are of a video, not of --stills; leave them out.")
     recorded = _recorded(path)
+    if recorded is not None and scene is not None:
+        raise InputError(f"--scene is not needed for the cameras of {path}; leave it out.")
+    fps = FPS if fps is None else fps
     run = Run(folder)
     config = run.read_config()
     if stills is None:

@@ -123,12 +123,19 @@ def _even(pixels: np.ndarray) -> np.ndarray:
 
 def _gif(frames: Iterator[np.ndarray], fps: float) -> memoryview:
     """256 colours for each frame, repeated for ever."""
-    first = Image.fromarray(next(frames))
-    rest = (Image.fromarray(pixels) for pixels in frames)
+    pictures = _timed(frames, fps)
     file = BytesIO()
-    pause = 10 * round(100.0 / fps)  # milliseconds
-    first.save(file, "GIF", save_all=True, append_images=rest, duration=pause, loop=0)
+    next(pictures).save(file, "GIF", save_all=True, append_images=pictures, loop=0)
     return file.getbuffer()
+
+
+def _timed(frames: Iterator[np.ndarray], fps: float) -> Iterator[Image.Image]:
+    """Pictures with their pauses, milliseconds: in hundredths, which add up to the video's time."""
+    for number, pixels in enumerate(frames):
+        picture = Image.fromarray(pixels)
+        begin, end = (10 * round(100.0 * n / fps) for n in (number, number + 1))
+        picture.info["duration"] = end - begin
+        yield picture
 
 
 def _write_folder(path: Path, frames: Iterator[np.ndarray]) -> None:

@@ -366,14 +366,13 @@ def _read_frame(frame: Frame, downscale: int) -> _Read | None:
     """What belongs to a frame; None where its mask leaves no pixel of it."""
     shape = image_shape(frame.path) if frame.image is None else frame.image.shape
     height, width, channels = shape
-    camera = frame.lens.camera(width=width, height=height, c2w=frame.c2w, image=frame.name)
+    whole = frame.lens.camera(width=width, height=height, c2w=frame.c2w, image=frame.name)
     if downscale > min(width, height):
         raise InputError(
             f"downscale is {downscale}, but {frame.path} has {width}x{height} pixels; choose a "
             "smaller factor."
         )
-    if downscale > 1:
-        camera = camera.downscaled(downscale)
+    camera = whole if downscale == 1 else whole.downscaled(downscale)
     mask = seen_pixels(camera)
     if frame.mask is not None:
         given = read_mask(frame.mask, width=width, height=height, downscale=downscale)
@@ -388,7 +387,7 @@ def _read_frame(frame: Frame, downscale: int) -> _Read | None:
         downscale=downscale,
         image=frame.image,
     )
-    depth = None if frame.depth is None else read_depth(frame.depth, camera)
+    depth = None if frame.depth is None else read_depth(frame.depth, whole, downscale)
     return _Read(
         name=frame.name,
         camera=camera,

@@ -36,7 +36,10 @@ class Depth:
     unit: float
     """What one of its units is, scene units."""
     camera: Camera
-    """Of the photograph."""
+    """Of the photograph, reduced as it is."""
+    share: tuple[float, float] = (1.0, 1.0)
+    """Of the file's rows and columns, what the camera sees: less than 1 where reducing the
+    photograph leaves out pixels at the bottom or right that fill no block."""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -50,28 +53,29 @@ class Depth:
             [H, W] float32, scene units; NaN where it is not known: where the file has 0, less, or
             what is not finite, and behind a fisheye's plane.
         """
-        along = _nearest(self.values, self.shape).astype(np.float64) * self.unit
+        along = _nearest(self.values, self.shape, self.share).astype(np.float64) * self.unit
         cosine = axis_cosines(self.camera)
         known = np.isfinite(along) & (along > 0.0) & (cosine > 0.0)
         distance = np.divide(along, cosine, out=np.full(along.shape, np.nan), where=known)
         return distance.astype(np.float32)
 
 
-def _nearest(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """The values nearest to the pixels of an image of the same view but another size."""
+def _nearest(values: np.ndarray, shape: tuple[int, int], share: tuple[float, float]) -> np.ndarray:
+    """The values nearest to the pixels of an image of a share of the view, but another size."""
     row, column = (
-        ((np.arange(size) + 0.5) * given / size).astype(int)
-        for size, given in zip(shape, values.shape, strict=True)
+        ((np.arange(size) + 0.5) * (given * seen) / size).astype(int)
+        for size, given, seen in zip(shape, values.shape, share, strict=True)
     )
     return np.asarray(values[row[:, None], column])
 
 
-def read_depth(file: DepthFile, camera: Camera) -> Depth:
+def read_depth(file: DepthFile, camera: Camera, downscale: int = 1) -> Depth:
     """Read a depth file; of one that is larger than the photograph only what that needs is kept.
 
     Args:
         file: Depths along the optical axis.
-        camera: Of the photograph, with its pixels.
+        camera: Of the photograph, with its pixels as they are in its file.
+        downscale: Edge of the blocks of pixels that become one.
 
     Raises:
         InputError: The file cannot be read, or is of another shape than the photograph.
@@ -89,6 +93,9 @@ def read_depth(file: DepthFile, camera: Camera) -> Depth:
             f"{file.path}: has {columns}x{rows} pixels, which is another shape than the "
             f"{camera.width}x{camera.height} of its photograph; give depth of the whole photograph."
         )
-    if rows * columns > camera.height * camera.width:
-        values = _nearest(values, (camera.height, camera.width))
-    return Depth(values, file.unit, camera)
+    reduced = camera if downscale == 1 else camera.downscaled(downscale)
+    shape = reduced.height, reduced.width
+    share = shape[0] * downscale / camera.height, shape[1] * downscale / camera.width
+    if rows * columns > shape[0] * shape[1]:
+        return Depth(_nearest(values, shape, share), file.unit, reduced)
+    return Depth(values, file.unit, reduced, share)

@@ -65,16 +65,6 @@ class Extent:
     """As of ``Focus``."""
 
 
-def focus_point(cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the point that the cameras look at, [3] scene units; see ``find_focus``."""
-    return find_focus(cameras).point
-
-
-def estimate_content_distance(cameras: Sequence[Camera]) -> float:
-    """Return the median distance from a camera to what all look at; see ``find_focus``."""
-    return find_focus(cameras).distance
-
-
 def find_focus(cameras: Sequence[Camera]) -> Focus:
     """Find the point closest to all optical axes, and its median depth.
 
@@ -180,8 +170,8 @@ def up_direction(cameras: Sequence[Camera]) -> np.ndarray:
     return normal if level and normal @ mean > 0.5 else mean
 
 
-def estimate_box(cameras: Sequence[Camera], unbounded: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corners (min, max), [3] each, of the cube around what the cameras look at.
+def estimate_extent(cameras: Sequence[Camera], *, unbounded: bool) -> Extent:
+    """Estimate content distance and box, a cube around what the cameras look at, and say how.
 
     half edge = content_distance * tan(half the larger field of view)   for objects,
     half edge = content_distance * UNBOUNDED_BOX_SHARE                  for photographs.
@@ -193,12 +183,6 @@ def estimate_box(cameras: Sequence[Camera], unbounded: bool) -> tuple[np.ndarray
     Raises:
         InputError: As ``find_focus``.
     """
-    extent = estimate_extent(cameras, unbounded=unbounded)
-    return extent.box_min, extent.box_max
-
-
-def estimate_extent(cameras: Sequence[Camera], *, unbounded: bool) -> Extent:
-    """Estimate box and content distance, and say how; see ``estimate_box`` and ``find_focus``."""
     focus = find_focus(cameras)
     if unbounded:
         half = focus.distance * UNBOUNDED_BOX_SHARE

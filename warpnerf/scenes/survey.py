@@ -86,26 +86,36 @@ def _files(path: str | Path) -> tuple[str, list[Path]]:
     path = Path(path)
     if not exists(path):
         return "none", []
-    folder = path if path.is_dir() else path.parent
-    if path.name in map(split_file, SPLITS) or exists(folder / split_file("train")):
-        files = [folder / split_file(split) for split in SPLITS]
-        names = [file for file in files if exists(file)]
-        return f"Blender / NeRF-synthetic ({', '.join(file.name for file in names)})", names
-    if path.suffix == ".npz" and path.is_file():
+    if path.is_dir():
+        return _files_of_folder(path)
+    if path.name in map(split_file, SPLITS):
+        return _blender(path.parent)
+    if path.name == llff.FILE:
+        return f"LLFF ({llff.FILE})", []
+    if path.suffix == ".npz":
         return f"npz ({printable(path.name)})", []
-    if path.name == llff.FILE or not exists(folder / "transforms.json"):
-        model = find_model(folder)
-        kind = None if model is None else model_kind(model)
-        if model is not None and path.name != llff.FILE:
-            words = {"bin": "binary", "txt": "text"}[str(kind)]
-            return f"COLMAP ({model.relative_to(folder).as_posix()}, {words})", []
-        if exists(folder / llff.FILE):
-            return f"LLFF ({llff.FILE})", []
-        archive = single_npz(folder)
-        if archive is not None:
-            return f"npz ({printable(archive.name)})", []
-    file = path / "transforms.json" if path.is_dir() else path
-    return f"instant-ngp / nerfstudio ({file.name})", [file] if exists(file) else []
+    return f"instant-ngp / nerfstudio ({printable(path.name)})", [path]
+
+
+def _files_of_folder(folder: Path) -> tuple[str, list[Path]]:
+    if exists(folder / split_file("train")):
+        return _blender(folder)
+    if exists(folder / "transforms.json"):
+        return "instant-ngp / nerfstudio (transforms.json)", [folder / "transforms.json"]
+    model = find_model(folder)
+    if model is not None:
+        words = {"bin": "binary", "txt": "text"}[str(model_kind(model))]
+        return f"COLMAP ({model.relative_to(folder).as_posix()}, {words})", []
+    if exists(folder / llff.FILE):
+        return f"LLFF ({llff.FILE})", []
+    archive = single_npz(folder)
+    return "none" if archive is None else f"npz ({printable(archive.name)})", []
+
+
+def _blender(folder: Path) -> tuple[str, list[Path]]:
+    files = [folder / split_file(split) for split in SPLITS]
+    files = [file for file in files if exists(file)]
+    return f"Blender / NeRF-synthetic ({', '.join(file.name for file in files)})", files
 
 
 def _unread_keys(raw: dict[str, Any]) -> list[str]:
