@@ -20,7 +20,7 @@ def _of(name: str) -> SimpleNamespace:
     activation = precision.load(name, "base.activation")
     contraction = precision.load(name, "space.contraction")
     gradscale = precision.load(name, "volume.gradscale")
-    real, vec3, vec4 = types.real, types.vec3, types.vec4
+    real, vec3, vec4 = types.real, types.vec3, types.vector(4)
     Gradient = types.gradient_type(4)
 
     @wp.kernel(module="unique", enable_backward=False)

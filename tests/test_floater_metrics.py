@@ -10,7 +10,7 @@ import pytest
 import warp as wp
 from tiny_fields import tiny_field
 from tiny_scenes import camera_at
-from warpnerf_kernels.base.types import vec4
+from warpnerf_kernels.base.types import vector
 
 from warpnerf.evaluation.floater_metrics import clearance, directions_around, near_density
 
@@ -43,7 +43,7 @@ def test_near_density_is_density_times_clearance() -> None:
     field = tiny_field()
     raw = np.zeros((5 * 6 * 7, 4), np.float32)
     raw[:, 0] = 0.7
-    grid = replace(field.grid, values=wp.array(raw, dtype=vec4, device="cpu"))
+    grid = replace(field.grid, values=wp.array(raw, dtype=vector(4), device="cpu"))
     steps = replace(field.steps, near=0.0, step=0.001)
     field = replace(field, grid=grid, steps=steps)
     sigma = grid.density_scale * np.log1p(np.exp(0.7 + grid.density_shift))

@@ -11,6 +11,7 @@ import pytest
 from solid_fields import FRUSTUM, ball_field, camera_at
 from tiny_scenes import camera_at as tiny_camera
 from tiny_scenes import look_at, picture
+from warpnerf_kernels.space import ndc
 
 import warpnerf as wn
 from warpnerf.checks import InputError
@@ -89,6 +90,10 @@ def test_all_that_cameras_see_lies_in_the_box() -> None:
     assert np.prod(size / size[2] * 15) == pytest.approx(4000, rel=0.1)  # cubes, 16 planes
     tight = fit_frustum(replace(scene, splits={"train": (1, 4), "test": (0,)}), 16, 4000)[1]
     assert (tight[1] - tight[0])[:2].prod() < size[:2].prod()
+
+
+def test_kernels_end_where_the_box_does() -> None:
+    assert ndc.FARTHEST == FARTHEST
 
 
 def test_the_near_plane_lies_before_the_nearest_content() -> None:

@@ -9,7 +9,7 @@ import pytest
 import reference
 import torch
 import warp as wp
-from warpnerf_kernels.base.types import vec4
+from warpnerf_kernels.base.types import vector
 
 from warpnerf.checks import InputError
 from warpnerf.model.grid import FreeCells, VoxelGrid, grid_size, require_memory
@@ -28,7 +28,9 @@ def workers(device: str) -> Workers:
 def grid_of(values: Any, workers: Workers, **changes: Any) -> VoxelGrid:
     size = values.shape[:3]
     array = wp.array(
-        np.ascontiguousarray(values.reshape(-1, 4), np.float32), dtype=vec4, device=workers.device
+        np.ascontiguousarray(values.reshape(-1, 4), np.float32),
+        dtype=vector(4),
+        device=workers.device,
     )
     grid = VoxelGrid(values=array, size=size, box_min=BOX_MIN, box_max=BOX_MAX)
     return replace(grid, **changes)

@@ -15,13 +15,13 @@ BOX_MIN, BOX_MAX = np.array([-1.0, -0.8, -0.9]), np.array([1.2, 0.9, 0.7])
 N_CELLS = (22, 17, 16)
 
 
-def looking(seed: int, away: float) -> Any:
+def looking(seed: int, away: float, aside: float = 0.15) -> Any:
     """c2w of a camera at a distance from the box's middle, which it sees somewhere in its image."""
     rng = np.random.default_rng(seed)
     back = rng.normal(size=3)
     back /= np.linalg.norm(back)
     eye = 0.5 * (BOX_MIN + BOX_MAX) + away * back
-    back += rng.normal(scale=0.15, size=3)
+    back += rng.normal(scale=aside, size=3)
     back /= np.linalg.norm(back)
     right = np.cross(rng.normal(size=3), back)
     right /= np.linalg.norm(right)
@@ -122,3 +122,16 @@ def test_nothing_and_everything(kernels64: Kernels) -> None:
     away = looking(1, 3.0)
     away[:, [0, 2]] *= -1.0
     assert not covered(kernels64, view(kernels64, away, {}), np.ones(N_CELLS, bool), 4).any()
+
+
+@pytest.mark.parametrize("away", [3.0, 3e2, 3e3, 3e4])
+def test_it_ends_however_far_the_camera_is(packed: Kernels, away: float) -> None:
+    """Through a long lens: at such t a thousandth of a cell is less than float32 tells apart."""
+    occupied = np.zeros((80, 80, 80), bool)
+    occupied[40, 40, 40] = occupied[30, 45, 38] = True
+    lens = {"focal": packed.types.vec2(0.4 * FX * away, 0.4 * FY * away)}
+    for seed in range(20):
+        found = covered(
+            packed, view(packed, looking(seed, away, 0.05 / away), {}, **lens), occupied, 4
+        )
+        assert found.any()

@@ -26,11 +26,11 @@ def problem(seed: int) -> tuple[Any, Any, Any]:
 
 def gather(kernels: Kernels, values: Any, u: Any) -> Any:
     types, n = kernels.types, len(u)
-    out = kernels.zeros(n, types.vec4)
+    out = kernels.zeros(n, types.vector(4))
     kernels.workers.launch(
         drive_kernels.of(kernels).gather_points,
         n,
-        kernels.array(values.reshape(-1, 4), types.vec4),
+        kernels.array(values.reshape(-1, 4), types.vector(4)),
         wp.vec3i(*values.shape[:3]),
         kernels.array(u, types.vec3),
         out,
@@ -46,7 +46,7 @@ def adj_gather(kernels: Kernels, shape: Any, u: Any, adj: Any) -> Any:
         n,
         wp.vec3i(*shape[:3]),
         kernels.array(u, types.vec3),
-        kernels.array(adj, types.vec4),
+        kernels.array(adj, types.vector(4)),
         gradient,
     )
     return gradient.values.numpy().reshape(shape)
@@ -109,7 +109,7 @@ def test_only_tiles_around_the_point_are_flagged(kernels64: Kernels) -> None:
             1,
             wp.vec3i(*size),
             kernels64.array(u, types.vec3),
-            kernels64.array(np.ones((1, 4)), types.vec4),
+            kernels64.array(np.ones((1, 4)), types.vector(4)),
             gradient,
         )
         nodes = np.flatnonzero(gradient.values.numpy().any(axis=-1))

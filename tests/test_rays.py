@@ -182,6 +182,21 @@ def test_the_share_that_is_drawn_is_of_pixels_that_count(on_cpu: None) -> None:
     assert PixelSampler(masked, *options).keep_to(*little_occupied(views)) == 1.0
 
 
+def test_of_few_pixels_that_are_left_all_rays_are_drawn(on_cpu: None) -> None:
+    """Each ray tries until it has found one, also where that is one in two hundred."""
+    views = small_scene().views[:3]
+    sampler = PixelSampler(
+        views, np.full(3, 2.0), (0.0, 0.0, 0.0), 100_000, False, 3, Workers("cpu", 2)
+    )
+    sampler.keep_to(*little_occupied(views))
+    few = np.zeros(len(sampler._covered), np.uint8)
+    few[:: len(few) // 2] = 1  # two or three blocks
+    sampler._covered.assign(few)
+    batch = drawn(sampler.draw(0))
+    directions = np.unique(batch["directions"], axis=0)
+    assert len(directions) <= 3 * sampler._block**2
+
+
 def test_where_nothing_or_everything_is_seen_all_pixels_are_drawn(on_cpu: None) -> None:
     views = masked_views()
     options = ((0.0, 0.0, 0.0), 500, False, 3, Workers("cpu", 2))

@@ -150,6 +150,19 @@ def test_resumed_it_draws_from_the_same_pixels(tmp_path: Path, on_cpu: None) -> 
         assert_same_state(without_seconds(resumed), without_seconds(whole))
 
 
+def test_resumed_with_a_single_cell_it_ends_the_same(tmp_path: Path, on_cpu: None) -> None:
+    grid = GridConfig(voxels=30, grow_at=(), alpha_init=0.5)
+    config = tiny_config(**QUICK | {"grid": grid, "optim": OptimConfig(accumulate_at=())})
+    # Many a ray misses the box.
+    scene = replace(large_ball(), box_min=np.full(3, -0.3), box_max=np.full(3, 0.3))
+    whole = stopped_at(60, tmp_path / "whole", config, scene)
+    for step in (52, 54, 59):
+        begun = stopped_at(step, tmp_path / "begun", config, scene)
+        assert begun.field.free.size == (1, 1, 1)
+        resumed = stopped_at(60, tmp_path / "resumed", config, scene, begun)
+        assert_same_state(without_seconds(resumed), without_seconds(whole))
+
+
 def test_total_variation_ends_when_it_is_told_to(tmp_path: Path, on_cpu: None) -> None:
     def values(**changes: Any) -> np.ndarray:
         optim = replace(tiny_config().optim, **changes)

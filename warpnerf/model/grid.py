@@ -239,6 +239,12 @@ def free_struct(
     return free
 
 
+def reach_of_places(box_min: np.ndarray, box_max: np.ndarray, places: np.ndarray) -> float:
+    """Distance from the outermost of some places, [n, 3], to the farthest corner of a box."""
+    centre, corner = 0.5 * (box_min + box_max), 0.5 * float(np.linalg.norm(box_max - box_min))
+    return corner + float(np.linalg.norm(places - centre, axis=1).max(initial=0.0))
+
+
 def grid_size(extent: np.ndarray, voxels: int) -> tuple[int, int, int]:
     """Nodes along each axis so that voxels are cubes and about `voxels` in all.
 

@@ -9,7 +9,7 @@ import warp as wp
 from warpnerf_kernels.base.types import real, vec3
 
 from warpnerf.checks import require_rays
-from warpnerf.model.grid import FreeCells, VoxelGrid
+from warpnerf.model.grid import FreeCells, VoxelGrid, reach_of_places
 from warpnerf.model.interface import Model
 from warpnerf.rendering.rays import camera_rays
 from warpnerf.rendering.render import RenderedRays, Steps, render_rays
@@ -62,7 +62,8 @@ class Field:
         """
         camera.check()  # its pose is an array, which may have changed since it was made
         rays = camera_rays(camera, self.workers)
-        return self._rendering(self._render(*rays), (camera.height, camera.width))
+        seen = self._render(*rays, places=camera.position[None])
+        return self._rendering(seen, (camera.height, camera.width))
 
     def render_rays(self, origins: np.ndarray, directions: np.ndarray) -> Rendering:
         """Look along rays.
@@ -83,16 +84,17 @@ class Field:
             wp.array(np.ascontiguousarray(origins, np.float32), dtype=vec3, device=device),
             wp.array(np.ascontiguousarray(directions, np.float32), dtype=vec3, device=device),
         )
-        return self._rendering(self._render(*rays), (len(origins),))
+        return self._rendering(self._render(*rays, places=origins), (len(origins),))
 
-    def _render(self, origins: wp.array, directions: wp.array) -> RenderedRays:
+    def _render(self, origins: wp.array, directions: wp.array, places: np.ndarray) -> RenderedRays:
+        """Look along rays from some places, [n, 3]."""
         device = self.workers.device
         return render_rays(
             self.model,
             self.grid,
             self.weights,
             self.free,
-            self.steps,
+            self.steps.reaching(reach_of_places(self.grid.box_min, self.grid.box_max, places)),
             origins,
             directions,
             wp.full(1, 0.5, dtype=real, device=device),

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import warp as wp
 from warpnerf_kernels.base.types import real
 from warpnerf_kernels.launch import assembly
@@ -39,6 +40,10 @@ KEPT_PACKS_OF_BATCH = 255
 """The same of the rays of a batch together, where the head shades several at a time."""
 
 
+MOST_LINEAR = 2**24
+"""Equal steps of a ray: float32 counts no more of them one by one."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Steps:
     """Where along a ray samples may sit: n_linear equal steps from near on, then growing ones."""
@@ -59,6 +64,17 @@ class Steps:
     """Whether steps are lengths in the coordinates of a grid's frustum, and begin where a ray
     enters it. Near and far are in scene units all the same; the grid's box minds them."""
 
+    def reaching(self, distance: float) -> Steps:
+        """With equal steps for a distance at least, scene units, before steps grow.
+
+        So that a camera farther away than those of the training sees the inside of the box in steps
+        as short as theirs.
+        """
+        if self.growth == 0.0:
+            return self
+        n_linear = min(math.ceil((distance - self.near) / self.step), MOST_LINEAR)
+        return replace(self, n_linear=max(self.n_linear, n_linear))
+
     def most(self, length: float) -> int:
         """How many steps a ray can take, at most.
 
@@ -72,7 +88,8 @@ class Steps:
             shortest, in_all = self.step, (self.far - self.near) / self.step
         else:
             shortest = min(self.step, self.growth * linear)
-            in_all = self.n_linear + math.log(self.far / linear) / math.log1p(self.growth)
+            ratio = float(np.float32(1.0 + self.growth))  # as kernels have it
+            in_all = self.n_linear + math.log(self.far / linear) / math.log(ratio)
         # prepare_ray rounds outwards, and adds a step at each end.
         return int(min(in_all, length / shortest, 1e9)) + 4
 

@@ -10,7 +10,13 @@ from warpnerf_kernels.base.types import vector
 
 from warpnerf.checks import InputError
 from warpnerf.config import MarchConfig, TrainConfig
-from warpnerf.model.grid import VoxelGrid, grid_size, require_memory, room_for_nodes
+from warpnerf.model.grid import (
+    VoxelGrid,
+    grid_size,
+    reach_of_places,
+    require_memory,
+    room_for_nodes,
+)
 from warpnerf.model.interface import Model
 from warpnerf.rendering.render import Steps
 from warpnerf.scenes.focus import find_focus
@@ -143,10 +149,8 @@ def require_samples(scene: Scene, config: TrainConfig) -> None:
 
 def reach(scene: Scene) -> float:
     """Distance from the outermost training camera to the farthest corner of the box."""
-    corner = 0.5 * float(np.linalg.norm(scene.box_max - scene.box_min))
-    centre = 0.5 * (scene.box_min + scene.box_max)
-    cameras = [scene.views[i].camera.position for i in scene.splits["train"]]
-    return corner + max(float(np.linalg.norm(p - centre)) for p in cameras)
+    places = np.array([scene.views[i].camera.position for i in scene.splits["train"]])
+    return reach_of_places(scene.box_min, scene.box_max, places)
 
 
 def march_steps(march: MarchConfig, grid: VoxelGrid, reach: float) -> Steps:

@@ -130,7 +130,7 @@ class Trainer:
             self._restore(resume)
         self._occupied = self.free.share()
         self._seen = 1.0
-        if resume is not None and self.free.size != (1, 1, 1):
+        if resume is not None:
             self._keep_to_what_is_seen()
         self._pass, self._strength = self._training_pass(), self._smoothing()
 
@@ -409,8 +409,12 @@ class Trainer:
         self._keep_to_what_is_seen()
 
     def _keep_to_what_is_seen(self) -> None:
-        """Draw no pixels whose rays meet free space only; in folded space all see something."""
-        if self.config.skip_empty_rays and self.grid.contraction == "none":
+        """Draw no pixels whose rays meet free space only; in folded space all see something.
+
+        A single cell tells nothing: it is what there is before the first look, too.
+        """
+        looked = self.free.size != (1, 1, 1)
+        if looked and self.config.skip_empty_rays and self.grid.contraction == "none":
             self._seen = self._sampler.keep_to(self.grid, self.free)
 
     def _find_free_space(self) -> None:

@@ -32,7 +32,6 @@ typedef float quad __attribute__((ext_vector_type(4)));
 // The same where they lie in memory.
 typedef float vec_at __attribute__((ext_vector_type(LANES), aligned(4), may_alias));
 typedef int ivec_at __attribute__((ext_vector_type(LANES), aligned(4), may_alias));
-typedef float octet_at __attribute__((ext_vector_type(8), aligned(4), may_alias));
 
 auto load = [&](const auto& x) -> vec { return *(const vec_at*)&x; };
 auto load_int = [&](const auto& x) -> ivec { return *(const ivec_at*)&x; };

@@ -13,7 +13,6 @@ import warp as wp
 real = wp.float64 if __name__.startswith("warpnerf_kernels_float64") else wp.float32
 vec2 = wp.types.vector(2, real)
 vec3 = wp.types.vector(3, real)
-vec4 = wp.types.vector(4, real)
 mat33 = wp.types.matrix((3, 3), real)
 
 

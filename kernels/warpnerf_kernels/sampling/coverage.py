@@ -61,5 +61,6 @@ def cover_blocks(
             covered = wp.uint8(1)
             break
         free_way = free_length(free, ray, m, distance - wide, NONE)
-        t += wp.max(free_way, real(1.0e-3) * edge)  # over the edge between two cells
+        # Over the edge between two cells, and by more than t is rounded to.
+        t += wp.max(free_way, wp.max(real(1.0e-3) * edge, real(4.0e-7) * t))
     out_covered[first_block + i] = covered

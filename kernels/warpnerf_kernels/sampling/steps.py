@@ -135,8 +135,8 @@ def place_steps(march: March, ray: Ray, step: int, packs: wp.array(dtype=Any), s
 def longest_step(march: March, box: Box, c: vec3, contraction: int) -> real:
     """How long steps can be where contracted coordinates are no larger than c, on each axis.
 
-    A point n boxes out is at most n times as far from a camera as equal steps reach: these go to
-    the farthest corner of the box.
+    A point n boxes out is at most n times as far from a training camera as equal steps reach: these
+    go from all of them to the farthest corner of the box.
     """
     norm = norm_of(c, contraction)
     if norm <= real(1.0) or march.growth == real(0.0):
