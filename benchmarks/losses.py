@@ -41,7 +41,7 @@ from warpnerf.rendering.rays import PixelSampler
 from warpnerf.rendering.render import TrainingPass
 from warpnerf.runtime.parallel import Workers
 
-NAMES = ("huber", "distortion", "entropy", "near_clip", "sample_colour")
+NAMES = ("huber", "distortion", "entropy", "opacity", "near_clip", "sample_colour")
 
 
 def losses_of(scene: wn.Scene, config: wn.TrainConfig) -> dict[str, LossConfig]:
@@ -56,6 +56,8 @@ def losses_of(scene: wn.Scene, config: wn.TrainConfig) -> dict[str, LossConfig]:
             near_clip_distance=0.1 * scene.content_distance,
         ),
     }
+    if not scene.has_alpha:
+        found["opacity"] = LossConfig(opacity=0.001)
     if config.model.name != "deferred":
         found["sample_colour"] = LossConfig(sample_colour=0.03)
     return found

@@ -20,6 +20,7 @@ LOSSES = {
     "huber": LossConfig(photometric="huber", huber_delta=0.2),
     "distortion": LossConfig(distortion=0.7),
     "entropy": LossConfig(entropy=0.3),
+    "opacity": LossConfig(opacity=0.3),
     "sample_colour": LossConfig(sample_colour=0.4),
     "near_clip": LossConfig(near_clip=0.05, near_clip_distance=0.9),
     "all": LossConfig(
@@ -27,6 +28,7 @@ LOSSES = {
         huber_delta=0.2,
         distortion=0.7,
         entropy=0.3,
+        opacity=0.2,
         sample_colour=0.4,
         near_clip=0.05,
         near_clip_distance=0.9,
@@ -70,6 +72,8 @@ def oracle_losses(p: Problem, raw: Tensor, weights: Tensor, scaling: str = "none
         )
     if config.entropy:
         total = total + config.entropy * reference.entropy_loss(out.transmittance)
+    if config.opacity:
+        total = total + config.opacity * reference.opacity_loss(out.transmittance)
     if config.sample_colour:
         threshold = p.model.threshold if isinstance(p.model, Features) else -1.0
         total = total + config.sample_colour * reference.sample_colour_loss(

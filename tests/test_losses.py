@@ -13,6 +13,7 @@ from problems import N_SEEDS, in_float32
 from seams.ray_losses import WithLosses
 from test_heads_scaling import at_one_distance
 from tiny_scenes import ring, tiny_scene
+from tiny_trainings import ball
 
 import warpnerf as wn
 from warpnerf.checks import InputError
@@ -50,7 +51,7 @@ def test_distortion_where_colours_are_right(kernels64: Kernels) -> None:
         assert_close(kernels64.train(p)[1], oracle_minimised(p)[1], 1e-7)
 
 
-@pytest.mark.parametrize("name", ["huber", "distortion", "entropy", "near_clip"])
+@pytest.mark.parametrize("name", ["huber", "distortion", "entropy", "opacity", "near_clip"])
 def test_gradients_against_central_differences(name: str, kernels64: Kernels) -> None:
     """Of the others weights are constants, which differences do not know."""
     h, found, expected = 2e-5, [], []
@@ -142,6 +143,7 @@ def test_a_ray_of_one_sample_by_hand(kernels64: Kernels) -> None:
     by_hand = {
         "distortion": 0.7 * w**2 * (0.5 / 2.0 - 0.4 / 1.9) / 3.0,
         "entropy": -0.3 * (rest * np.log(rest) + w * np.log(w)),
+        "opacity": -0.3 * np.log(w),
         "sample_colour": 0.4 * w * ((c - p.target) ** 2).sum(axis=1),
     }
     squared = ((seen.rgb - p.target) ** 2).sum(axis=1)
@@ -183,6 +185,21 @@ def test_light_that_is_all_there_or_gone_has_no_entropy(kernels64: Kernels) -> N
             assert np.abs(gradient - squared[1]).max() < 1e-5
 
 
+def test_a_ray_that_meets_hardly_anything_has_a_slope_that_ends(kernels64: Kernels) -> None:
+    """That of an opacity of 0.01; where there is no matter left, there is nothing to change."""
+    for shift in (-9.0, -12.0):
+        p = replace(problem_with(LOSSES["opacity"], 0), density_shift=shift)
+        assert kernels64.forward(p).opacity.max() < 0.01
+        loss, gradient = kernels64.train(p)
+        expected = oracle_minimised(p)
+        assert_close(loss, expected[0], 1e-9)
+        assert_close(gradient, expected[1], 1e-7)
+    for form in (kernels64, Kernels("float32", "cpu", packed=True)):
+        p = replace(problem_with(LOSSES["opacity"], 0), density_shift=-60.0)
+        loss, gradient = form.train(p)
+        assert np.isfinite(loss).all() and np.abs(gradient).max() < 1e-5
+
+
 @pytest.mark.parametrize("name", ["none", *LOSSES])
 def test_weights_are_no_constants_of_kernels(name: str) -> None:
     losses = LOSSES.get(name, LossConfig())
@@ -211,6 +228,7 @@ def test_a_loss_on_samples_wants_colours_of_samples() -> None:
     [
         ({"distortion": -0.1}, "loss.distortion must be a finite number of at least 0"),
         ({"entropy": float("nan")}, "loss.entropy must be a finite number of at least 0"),
+        ({"opacity": -1e-3}, "loss.opacity must be a finite number of at least 0"),
         ({"sample_colour": float("inf")}, "loss.sample_colour must be a finite number"),
         ({"near_clip": -1.0}, "loss.near_clip must be"),
         ({"near_clip": 1.0}, "loss.near_clip needs loss.near_clip_distance"),
@@ -223,6 +241,13 @@ def test_a_loss_on_samples_wants_colours_of_samples() -> None:
 def test_bad_weights_are_refused(given: dict[str, Any], said: str) -> None:
     with pytest.raises(InputError, match=said):
         LossConfig(**given)
+
+
+def test_photographs_with_alpha_need_not_be_opaque() -> None:
+    scene = ball()
+    assert scene.has_alpha
+    with pytest.raises(InputError, match=r"loss\.opacity is above 0, but photographs of .* alpha"):
+        Trainer(scene, config_of(LOSSES["opacity"]))
 
 
 def flat_scene() -> Scene:
@@ -254,6 +279,7 @@ def test_training(name: str, monkeypatch: pytest.MonkeyPatch, device: str) -> No
             photometric="huber",
             distortion=0.01,
             entropy=0.001,
+            opacity=0.001,
             sample_colour=0.1,
             near_clip=1e-4,
             near_clip_distance=1.0,

@@ -235,6 +235,10 @@ class OptimConfig:
 HUBER_DELTA = 0.1
 
 
+WEIGHTS_OF_LOSSES = ("distortion", "entropy", "opacity", "sample_colour", "near_clip")
+"""Fields of LossConfig that weigh a loss."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class LossConfig:
     """What training minimises: the mean over rays of the photometric loss, which is a sum over the
@@ -253,6 +257,9 @@ class LossConfig:
     t / (D + t), with D the content distance in use; with auto and per-camera, the scene's."""
     entropy: float = 0.0
     """Weight of the entropy of the remaining light: a ray ends in matter, or meets none."""
+    opacity: float = 0.0
+    """Weight of -log of the opacity of rays: each ends in matter. For photographs without alpha,
+    whose pixels all show something."""
     sample_colour: float = 0.0
     """Weight of the squared errors of the colours of single samples. For models that have such:
     all but deferred."""
@@ -267,7 +274,7 @@ class LossConfig:
         """Refuse what cannot be minimised."""
         require_one_of("loss.photometric", self.photometric, ("squared", "huber"))
         require_positive("loss.huber_delta", self.huber_delta)
-        for name in ("distortion", "entropy", "sample_colour", "near_clip", "near_clip_distance"):
+        for name in (*WEIGHTS_OF_LOSSES, "near_clip_distance"):
             require_at_least(f"loss.{name}", getattr(self, name), 0.0)
         if self.photometric != "huber" and self.huber_delta != HUBER_DELTA:
             raise InputError(
@@ -289,8 +296,7 @@ class LossConfig:
     def kinds(self) -> tuple[str, ...]:
         """Which losses there are besides the squared error; kernels are compiled for them."""
         huber = ("huber",) if self.photometric == "huber" else ()
-        weighed = ("distortion", "entropy", "sample_colour", "near_clip")
-        return huber + tuple(name for name in weighed if getattr(self, name) > 0.0)
+        return huber + tuple(name for name in WEIGHTS_OF_LOSSES if getattr(self, name) > 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,6 +5,7 @@ from mutant import Mutant
 _TESTS = "test_losses.py"
 _F64 = f"{_TESTS}::test_values_and_gradients_against_autograd"
 HUBER, DISTORTION, ENTROPY = f"{_F64}[huber]", f"{_F64}[distortion]", f"{_F64}[entropy]"
+OPACITY = f"{_F64}[opacity]"
 COLOUR, NEAR_CLIP, ALL = f"{_F64}[sample_colour]", f"{_F64}[near_clip]", f"{_F64}[all]"
 _PACKS = f"{_TESTS}::test_packs"
 P_DISTORTION, P_ENTROPY = f"{_PACKS}[distortion]", f"{_PACKS}[entropy]"
@@ -19,7 +20,10 @@ ALONE = f"{_TESTS}::test_distortion_where_colours_are_right"
 BOTH = "test_seams.py::test_gradient_against_central_differences[two losses]"
 SEAM = "test_seams.py::test_gradient_on_the_cpu[two losses]"
 
-D, E, N = (f"volume/losses/{name}.py" for name in ("distortion", "entropy", "near_clip"))
+END = f"{_TESTS}::test_a_ray_that_meets_hardly_anything_has_a_slope_that_ends"
+D, E, OP, N = (
+    f"volume/losses/{name}.py" for name in ("distortion", "entropy", "opacity", "near_clip")
+)
 
 MUTANTS = [
     # loss.py
@@ -76,6 +80,17 @@ MUTANTS = [
            "adj_end += real(0.0)", ENTROPY),
     Mutant("entropy, packs: of one ray's weight", "volume/walk_packs.py",
            "adj_end += adj_loss_value * adj_light(", "adj_end += adj_light(", P_ENTROPY),
+    # opacity.py
+    Mutant("opacity: sign of the slope", OP,
+           "return params.factor / wp.max(", "return -params.factor / wp.max(", OPACITY),
+    Mutant("opacity: slope without its weight", OP,
+           "return params.factor / wp.max(", "return real(1.0) / wp.max(", OPACITY),
+    Mutant("opacity: slope of the light", OP,
+           "/ wp.max(real(1.0) - transmittance", "/ wp.max(transmittance", OPACITY),
+    Mutant("opacity: no end of the slope", OP,
+           "/ wp.max(real(1.0) - transmittance, real(LEAST))", "/ (real(1.0) - transmittance)", END),
+    Mutant("opacity: value without the tangent", OP,
+           "(most - opacity) / most - wp.log(most)", "real(0.0) - wp.log(most)", END),
     # near_clip.py
     Mutant("near clip: beyond the distance", N,
            "    if t < params.distance:\n        return params.factor",

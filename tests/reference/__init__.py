@@ -39,6 +39,7 @@ from .losses import (
     entropy_loss,
     huber_loss,
     near_clip_loss,
+    opacity_loss,
     sample_colour_loss,
 )
 from .numeric import central_difference, relative_error
@@ -86,6 +87,7 @@ __all__ = [
     "near_clip_loss",
     "normalized_coordinates",
     "occupied",
+    "opacity_loss",
     "photometric_loss",
     "pinhole_rays",
     "random_network",

@@ -3,6 +3,7 @@
 Samples that do not count have weight 0; their distances may be anything finite.
 """
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -33,6 +34,13 @@ def entropy_loss(transmittance: Tensor) -> Tensor:
     """-(p log p + (1 - p) log(1 - p)), p = T_end [n_rays] clamped to [1e-6, 1 - 1e-6]."""
     p = transmittance.clamp(1e-6, 1.0 - 1e-6)
     return -(p * p.log() + (1.0 - p) * (1.0 - p).log())
+
+
+def opacity_loss(transmittance: Tensor) -> Tensor:
+    """Cross entropy of the opacity o = 1 - T_end [n_rays] against 1; a line where o < 0.01."""
+    opacity = 1.0 - transmittance
+    line = 1.0 - opacity / 0.01 - np.log(0.01)
+    return torch.where(opacity < 0.01, line, -opacity.clamp_min(1e-3).log())
 
 
 def huber_loss(rgb: Tensor, target: Tensor, delta: float) -> Tensor:

@@ -173,6 +173,7 @@ def with_losses(problem: RayProblem, sample_colour: float = 0.0) -> RayProblem:
         photometric="huber",
         distortion=0.3,
         entropy=0.2,
+        opacity=0.1,
         sample_colour=sample_colour,
         near_clip=0.1,
         near_clip_distance=0.6,

@@ -13,6 +13,7 @@ from warpnerf.model.interface import Model, loader, parts_of
 ON_RAY = {
     "distortion": "DISTORTION",
     "entropy": "ENTROPY",
+    "opacity": "OPACITY",
     "near_clip": "NEAR_CLIP",
 }
 """Fields of LossConfig that weigh a loss on the ray: modules in volume.losses, and what they call

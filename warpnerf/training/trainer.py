@@ -92,6 +92,11 @@ class Trainer:
                 )
         self.content_distances = distances
         """Of the training views, scene units."""
+        if scene.has_alpha and config.loss.opacity > 0.0:
+            raise InputError(
+                f"loss.opacity is above 0, but photographs of {scene.name} have alpha, and where "
+                "they show nothing, nothing should be; set it to 0."
+            )
         views = [scene.views[i] for i in scene.splits["train"]]
         behind = config.background
         if behind == "auto":

@@ -59,6 +59,28 @@ def no_adj_density(params: Any, t: real) -> real:
     return real(0.0)
 
 
+@wp.func
+def add_no_pack(params: Any, state: Nothing, packs: wp.array(dtype=Any), slot: int) -> Nothing:
+    """Of a loss without sums: samples do not count."""
+    return state
+
+
+@wp.func
+def adj_add_no_pack(
+    params: Any,
+    total: Nothing,
+    before: Nothing,
+    adj_value: wp.float32,
+    packs: wp.array(dtype=Any),
+    slot: int,
+) -> Nothing:
+    """Nor does anything flow back to their weights."""
+    return before
+
+
+OF_LIGHT_ONLY = RayLossVectors(add_no_pack, adj_add_no_pack)
+"""The vector form of losses that look at nothing but the light that passes all samples."""
+
 NONE = RayLoss(
     Params=Nothing,
     State=Nothing,

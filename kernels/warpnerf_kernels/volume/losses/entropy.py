@@ -6,13 +6,11 @@ Source: Sun, Sun & Chen 2022 (DVGO). p is the transmittance itself, not 1 less a
 which in float32 would be noise where little light is left.
 """
 
-from typing import Any
-
 import warp as wp
 
-from ...base.parts import RayLoss, RayLossVectors
+from ...base.parts import RayLoss
 from ...base.types import Nothing, real
-from ..ray_loss import add_nothing, no_adj_weight, no_bound, no_weighted
+from ..ray_loss import OF_LIGHT_ONLY, add_nothing, no_adj_weight, no_bound, no_weighted
 
 wp.set_module_options({"enable_backward": False})
 
@@ -41,25 +39,6 @@ def adj_entropy(params: EntropyParams, transmittance: real) -> real:
     return params.factor * (wp.log(real(1.0) - transmittance) - wp.log(transmittance))
 
 
-@wp.func
-def add_pack(params: Any, state: Nothing, packs: wp.array(dtype=Any), slot: int) -> Nothing:
-    """Samples do not count."""
-    return state
-
-
-@wp.func
-def adj_add_pack(
-    params: Any,
-    total: Nothing,
-    before: Nothing,
-    adj_value: wp.float32,
-    packs: wp.array(dtype=Any),
-    slot: int,
-) -> Nothing:
-    """Nor does anything flow back to their weights but by the light behind."""
-    return before
-
-
 ENTROPY = RayLoss(
     Params=EntropyParams,
     State=Nothing,
@@ -69,5 +48,5 @@ ENTROPY = RayLoss(
     adj_weight=no_adj_weight,
     bound=no_bound,
     adj_transmittance=adj_entropy,
-    vectors=RayLossVectors(add_pack, adj_add_pack),
+    vectors=OF_LIGHT_ONLY,
 )
