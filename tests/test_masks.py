@@ -291,7 +291,7 @@ def test_the_command_remembers_the_folder_of_masks(tmp_path: Path) -> None:
     assert gone.code == 2 and "its photographs, masks, cameras or split have changed" in gone.err
     (tmp_path / "masks").rename(tmp_path / "moved")
     gone = command("train", "--resume", done.run, folder=tmp_path)
-    assert gone.code == 2 and "masks: is no folder" in gone.err
+    assert gone.code == 2 and "masks: the masks that the run was trained with are gone" in gone.err
     moved = command("train", "--resume", done.run, "--masks", "moved", folder=tmp_path)
     assert moved.code == 0, moved.err
 
