@@ -1,12 +1,17 @@
-"""Where the kernels under test run, where compiled code is kept, and that Ctrl-C is heard."""
+"""Where the kernels under test run, where compiled code is kept, that Ctrl-C is heard, and what
+stands for COLMAP."""
 
 import os
 import signal
+from pathlib import Path
 
 import pytest
 import warp as wp
 from drive import Kernels
+from made_up_colmap import Colmap, photographs
 from watched_command import assert_trained, make_scene, train
+
+from warpnerf.sfm import pose as sfm_pose
 
 if "WARP_CACHE_PATH" in os.environ:
     wp.config.kernel_cache_dir = os.environ["WARP_CACHE_PATH"]
@@ -56,3 +61,16 @@ def compiled_kernels(tmp_path_factory: pytest.TempPathFactory) -> None:
     """What a run compiles is in the cache, so that commands under test take their usual time."""
     folder = tmp_path_factory.mktemp("compiled")
     assert_trained(train(make_scene(folder), folder=folder, limit=None))
+
+
+@pytest.fixture
+def colmap(monkeypatch: pytest.MonkeyPatch) -> Colmap:
+    made_up = Colmap()
+    monkeypatch.setattr(sfm_pose, "estimate", made_up)
+    monkeypatch.setattr(sfm_pose, "require_pycolmap", lambda: None)
+    return made_up
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    return photographs(tmp_path / "photos")

@@ -1,6 +1,6 @@
 """Runs of photographs without poses: their posed scene comes, stays and goes with the run.
 
-COLMAP's answer is made up, as in tests/test_pose.py.
+COLMAP's answer is made up, as in tests/made_up_colmap.py.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_pose import Colmap, listing, photographs
+from made_up_colmap import Colmap, listing, photographs
 
 from warpnerf.checks import InputError
 from warpnerf.cli import train as command
