@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -228,6 +229,26 @@ def test_a_pipe_is_written_to(tmp_path: Path) -> None:
     assert (tmp_path / "pipe").is_fifo()
     write_atomically(os.devnull, b"abc")
     assert not Path(os.devnull).is_file()
+
+
+@pytest.mark.skipif(not Path("/dev/fd").exists(), reason="open files have no names here")
+def test_what_is_open_is_written_to(tmp_path: Path) -> None:
+    with (tmp_path / "file").open("w+b") as file:
+        write_atomically(f"/dev/fd/{file.fileno()}", b"abc")
+        file.seek(0, os.SEEK_END)
+        file.write(b"def")
+    assert (tmp_path / "file").read_bytes() == b"abcdef"
+
+
+@pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="there is no such folder here")
+def test_files_in_memory_are_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    with tempfile.TemporaryDirectory(dir="/dev/shm") as folder:
+        path = Path(folder) / "file"
+        path.write_bytes(b"older")
+        with monkeypatch.context() as patch, pytest.raises(OSError):
+            patch.setattr(os, "fsync", lambda file: os.close(-1))
+            write_atomically(path, b"new")
+        assert path.read_bytes() == b"older"
 
 
 N_WEIGHTS = n_weights(Deferred())

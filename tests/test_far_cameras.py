@@ -9,6 +9,9 @@ import pytest
 from solid_fields import ball_field, camera_at
 
 from warpnerf.config import Contraction
+from warpnerf.rendering.field import Field, Rendering
+from warpnerf.rendering.rays import camera_rays
+from warpnerf.scenes.camera import Camera
 
 
 @pytest.mark.parametrize("contraction", ["linf", "l2", "none"])
@@ -28,10 +31,8 @@ def test_steps_through_the_box_are_short_from_afar(contraction: Contraction, awa
         assert found.depth[at] == pytest.approx(np.linalg.norm(centre) - 0.6, abs=0.06)
 
 
-def _along(field, camera):
+def _along(field: Field, camera: Camera) -> Rendering:
     """The same, by rays that are given."""
-    from warpnerf.rendering.rays import camera_rays
-
     origins, directions = (a.numpy() for a in camera_rays(camera, field.workers))
     found = field.render_rays(origins, directions)
     shape = (camera.height, camera.width)

@@ -48,7 +48,10 @@ def write_atomically(path: str | Path, *pieces: bytes | memoryview) -> None:
 
 
 def _takes_a_stream(path: Path) -> bool:
-    """Whether a path is that of a pipe or a device, or of this process's standard output."""
-    if path.parts[:2] in (("/", "dev"), ("/", "proc")):
-        return True
-    return path.exists() and not (path.is_file() or path.is_dir())
+    """Whether a path is that of a pipe, a device, or something that is open already.
+
+    What is open may be a file, as standard output often is, but to put another in its place would
+    lose what is written to it later.
+    """
+    is_open = path.match("/dev/std*") or path.match("/dev/fd/*") or path.match("/proc/*/fd/*")
+    return is_open or (path.exists() and not (path.is_file() or path.is_dir()))
