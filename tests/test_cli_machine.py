@@ -75,6 +75,9 @@ def test_one_failure_is_a_failure(
 
 
 def test_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for folder in ("/", str(tmp_path)):
+        assert main(["check", "--json", folder]) == 2
+        assert "is a folder; name a file." in capsys.readouterr().err
     assert main(["check", "--json", str(tmp_path / "none" / "c.json")]) == 2
     assert "its folder does not exist" in capsys.readouterr().err
     for command in ("check", "warmup"):

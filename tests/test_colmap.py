@@ -171,6 +171,16 @@ def test_reduced_photographs_have_whole_pixels(
     assert (lens.values["w"], lens.values["h"]) == reduced
 
 
+@pytest.mark.parametrize("stated", [None, 4, 9])
+def test_a_file_that_was_cut_is_noticed(tmp_path: Path, stated: int | None) -> None:
+    file = scene_with_model(tmp_path, text=True) / "images.txt"
+    comment = "" if stated is None else f"# Number of images: {stated}, mean observations: 3\n"
+    file.write_text(comment + file.read_text())
+    warnings = load_scene(tmp_path).warnings
+    said = [text for text in warnings if "says that it lists 9 images, but lists 4" in text]
+    assert len(said) == (stated == 9)
+
+
 def change(file: Path, before: str, after: str) -> None:
     text = file.read_text()
     assert before in text

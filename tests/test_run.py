@@ -260,6 +260,10 @@ def test_a_run_is_put_aside_until_the_next_has_saved_something(tmp_path: Path) -
     run = new_run(tmp_path)
     assert run.checkpoints == [] and list((tmp_path / "test").iterdir()) == []
     assert f"the run before is in {tmp_path / 'previous'}" in run.way_on()
+    with pytest.raises(InputError, match="no checkpoint to go on from; the run before is in"):
+        run.load_state()
+    with pytest.raises(InputError, match=r"nothing was saved; the run before is in .*previous"):
+        run.load_field("cpu", 1)
     require_old_or_new(tmp_path / "previous", 9, 9)
     new_run(tmp_path)  # once more, without having saved anything
     require_old_or_new(tmp_path / "previous", 9, 9)

@@ -86,7 +86,9 @@ def warmup_command(
 
 
 def require_writable(path: Path | None) -> None:
-    """Raise InputError where --json names a file in no folder."""
+    """Raise InputError where --json names a folder, or a file in none."""
+    if path is not None and path.is_dir():
+        raise InputError(f"--json {path}: is a folder; name a file.")
     if path is not None and not path.parent.is_dir():
         raise InputError(f"--json {path}: its folder does not exist; make it first.")
 

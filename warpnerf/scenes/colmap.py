@@ -9,6 +9,7 @@ as far as the file is long.
 from __future__ import annotations
 
 import math
+import re
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -185,6 +186,12 @@ def load_colmap(
             f"(first: {missing[0] if missing else 'none'}); put them there."
         )
     warnings = []
+    stated = 0 if kind == "bin" else _stated_images(image_file)
+    if stated > len(images):
+        warnings.append(
+            f"{image_file.name}: says that it lists {stated} images, but lists {len(images)}: if "
+            "it was not shortened on purpose, export it again"
+        )
     if missing:
         warnings.append(
             f"{image_file.name}: left out {len(missing)} of {len(images)} images for want of a "
@@ -413,6 +420,12 @@ def _cameras_of_text(file: Path) -> dict[int, _Camera]:
         key, camera = _parsed(file, number, "camera", parse)
         cameras[key] = camera
     return cameras
+
+
+def _stated_images(file: Path) -> int:
+    """How many images a comment of COLMAP's says there are; 0 where there is none."""
+    comment = re.search(r"^# Number of images: (\d{1,9})\b", file.read_text("utf-8"), re.MULTILINE)
+    return int(comment[1]) if comment else 0
 
 
 def _images_of_text(file: Path) -> list[_Image]:

@@ -188,8 +188,8 @@ class Run:
         config = self.read_config().train
         if not self.checkpoints:
             raise InputError(
-                f"{self.folder} holds no checkpoint to go on from; train anew with --output "
-                f"{self.folder} --overwrite."
+                f"{self.folder} holds no checkpoint to go on from{self._aside()}; train anew with "
+                f"--output {self.folder} --overwrite."
             )
         path, state, notes = _first_whole(self.checkpoints, load_checkpoint)
         for name, here, there in differences(config, state.config):
@@ -233,7 +233,9 @@ class Run:
             InputError: There is none, or the device is missing.
         """
         if not self.results:
-            raise InputError(f"{self.folder} holds no field: nothing was saved; train it first.")
+            raise InputError(
+                f"{self.folder} holds no field: nothing was saved{self._aside()}; train it first."
+            )
         _, loaded, notes = _first_whole(
             self.results[::-1], lambda p: load_field(p, device, threads)
         )
@@ -253,10 +255,13 @@ class Run:
     def way_on(self) -> str:
         """How to go on, or that there is nothing to go on from: half a sentence."""
         if self.last_step is None:
-            older = self.folder / run_files.PREVIOUS
-            aside = f"; the run before is in {older}" if older.exists() else ""
-            return f"nothing was saved yet{aside}"
+            return f"nothing was saved yet{self._aside()}"
         return f"go on after step {self.last_step} with: {self.resume_command}"
+
+    def _aside(self) -> str:
+        """Where the run is that this one replaces, as long as it has saved nothing."""
+        older = self.folder / run_files.PREVIOUS
+        return f"; the run before is in {older}" if older.exists() else ""
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
