@@ -67,3 +67,15 @@ def test_every_kernel_compiles_for_cuda(
         modules += [wp.get_module(precision.load(name, module).__name__) for module in SHARED]
     for number, module in enumerate(modules):
         assert ".entry" in compiled(module, tmp_path / str(number))
+
+
+def test_code_does_not_grow_with_layers(tmp_path: Path) -> None:
+    """Layers that the compiler writes out take it minutes."""
+    assembly = precision.load("float32", "launch.assembly")
+    sizes = []
+    for width in (32, 64):
+        model = Deferred(width=width)
+        variant = variant_of(model, "float32", "none", "none", "none", packed=False)
+        module = assembly.render_forward_kernel(variant).module
+        sizes.append(len(compiled(module, tmp_path / str(width))))
+    assert sizes[1] < 1.1 * sizes[0]

@@ -192,6 +192,7 @@ def scene_struct(
     if layout is not None:
         head = load("heads.mlp").Weights()
         head.values = weights
+        head.width = layout.width
         row = -(-layout.n_transposed // 16) * 16  # whole cache lines
         head.transposed = wp.zeros((workers.count, row), dtype=weights.dtype, device=workers.device)
         scene.head = head

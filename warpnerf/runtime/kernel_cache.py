@@ -27,6 +27,8 @@ from warpnerf.checks import InputError
 
 SUMS = "SHA256SUMS"
 COMPILED = (".o", ".cubin", ".ptx", ".meta")
+CUDA_BLOCK = 64
+"""Threads of a block on CUDA. A batch has few rays, and small blocks spread them over the GPU."""
 NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 """In the line that Warp prints where there is no GPU. Who asks for one is told in a sentence."""
 
@@ -102,7 +104,7 @@ def load(kernel: wp.Kernel, device: wp.Device) -> None:
 
 
 def _load(module: wp.Module, device: wp.Device) -> None:
-    block_dim = 256 if device.is_cuda else 1
+    block_dim = threads_of_a_block(device)
     folder = Path(wp.config.kernel_cache_dir) / module.get_module_identifier(block_dim)
     _verify(folder)
     if not _is_compiled(folder, device):
@@ -111,10 +113,14 @@ def _load(module: wp.Module, device: wp.Device) -> None:
     _seal(folder)
 
 
+def threads_of_a_block(device: wp.Device) -> int:
+    """What a module is compiled for, and its kernels are launched with."""
+    return CUDA_BLOCK if device.is_cuda else 1
+
+
 def is_compiled(kernel: wp.Kernel, device: wp.Device) -> bool:
     """Whether a kernel's module is in the cache for a device, as far as names of files tell."""
-    block_dim = 256 if device.is_cuda else 1
-    name = kernel.module.get_module_identifier(block_dim)
+    name = kernel.module.get_module_identifier(threads_of_a_block(device))
     return _is_compiled(Path(wp.config.kernel_cache_dir) / name, device)
 
 

@@ -207,7 +207,8 @@ class Workers:
             return
         self.load(kernel)
         if self.device.is_cuda:
-            wp.launch(kernel, n, inputs=[0, *arguments(0)], device=self.device)
+            block = kernel_cache.threads_of_a_block(self.device)
+            wp.launch(kernel, n, inputs=[0, *arguments(0)], device=self.device, block_dim=block)
             return
 
         def share(worker: int) -> None:

@@ -129,7 +129,7 @@ def deferred(n_channels: int, n_frequencies: int, width: int, n_hidden: int) -> 
         units = begin(weights, encoded, channels)
         adj_opacity = wp.dot(adj_rgb, outputs(weights, units))
         adj_units = adj_outputs(weights, units, opacity * adj_rgb, gradient)
-        adj_first(adj_units, gradient)
+        adj_first(weights, adj_units, gradient)
         adj_channels = adj_add_inputs(weights, 0, channels, adj_units, gradient)
         adj_add_inputs(weights, n_channels, encoded, adj_units, gradient)
         for c in range(3):

@@ -186,7 +186,7 @@ def features(
     @wp.func
     def adj_prepare(weights: Weights, direction: vec3, adj_view: Units, gradient: Any):
         adj_add_inputs(weights, n_own, encode(direction), adj_view, gradient)
-        adj_first(adj_view, gradient)
+        adj_first(weights, adj_view, gradient)
 
     @wp.func
     def own_inputs(raw: Any) -> Own:

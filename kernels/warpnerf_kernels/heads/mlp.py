@@ -31,6 +31,26 @@ class Weights:
 
     values: wp.array(dtype=real)  # [n_weights]
     transposed: wp.array2d(dtype=real)  # [n_workers, n_transposed] scratch of the vector form
+    width: int  # of hidden layers
+
+
+ADD_WEIGHT = r"""
+#ifdef __CUDA_ARCH__
+// All rays add to the same few thousand weights, and additions to one number wait for each other.
+// So a warp whose threads are all here, for the same weight, adds up among themselves first.
+const unsigned everyone = 0xffffffffu;
+int same = 0;
+if (__activemask() == everyone) __match_all_sync(everyone, i, &same);
+if (same) {
+    for (int apart = 16; apart > 0; apart /= 2) value += __shfl_xor_sync(everyone, value, apart);
+    if ((threadIdx.x & 31) == 0) atomicAdd(&to.data[i], value);
+} else {
+    atomicAdd(&to.data[i], value);
+}
+#else
+wp::atomic_add(to, 0, i, value);
+#endif
+"""
 
 
 class Layout(NamedTuple):
@@ -98,13 +118,18 @@ def relu(x: real) -> real:
     return wp.where(x < real(0.0), real(0.0), x)
 
 
+@wp.func_native(ADD_WEIGHT)
+def add_weight(to: wp.array2d(dtype=Any), i: int, value: Any):
+    """to[0, i] += value."""
+
+
 class Mlp(NamedTuple):
     """The scalar forms for one layout, each with its adjoint behind it, and the vector form."""
 
     first: Any
     """(weights) -> [width] the first layer's biases."""
     adj_first: Any
-    """(adj_first, gradient) transpose of first."""
+    """(weights, adj_first, gradient) transpose of first."""
     add_inputs: Any
     """(weights, begin, x, first) -> first + W_1[begin:] x, for any number of inputs."""
     adj_add_inputs: Any
@@ -132,26 +157,26 @@ def mlp(layout: Layout) -> Mlp:
     Units = vector(width)
     Activations = vector(units)
 
-    # Loops run to n_units, a variable: up to 16, constant bounds would have Warp write them out, as
-    # thousands of lines that take a quarter of a minute to compile.
+    # Loops run to a number that compilers do not know, else they write them out: Warp up to 16, and
+    # CUDA's compiler whole layers, as a megabyte of code that takes a minute to compile.
 
     @wp.func
     def first(weights: Weights) -> Units:
-        n_units = int(width)
+        n_units = weights.width
         out = Units()
         for j in range(n_units):
             out[j] = weights.values[biases + j]
         return out
 
     @wp.func
-    def adj_first(adj: Units, gradient: Any):
-        n_units = int(width)
+    def adj_first(weights: Weights, adj: Units, gradient: Any):
+        n_units = weights.width
         for j in range(n_units):
-            wp.atomic_add(gradient.weights, 0, biases + j, adj[j])
+            add_weight(gradient.weights, biases + j, adj[j])
 
     @wp.func
     def add_inputs(weights: Weights, begin: int, x: Any, out: Units) -> Units:
-        n_units = int(width)
+        n_units = weights.width
         for i in range(len(x)):
             for j in range(n_units):
                 out[j] += x[i] * weights.values[(begin + i) * width + j]
@@ -159,19 +184,19 @@ def mlp(layout: Layout) -> Mlp:
 
     @wp.func
     def adj_add_inputs(weights: Weights, begin: int, x: Any, adj: Units, gradient: Any):
-        n_units = int(width)
+        n_units = weights.width
         adj_x = x * real(0.0)
         for i in range(len(x)):
             for j in range(n_units):
                 n = (begin + i) * width + j
                 adj_x[i] += adj[j] * weights.values[n]
-                wp.atomic_add(gradient.weights, 0, n, x[i] * adj[j])
+                add_weight(gradient.weights, n, x[i] * adj[j])
         return adj_x
 
     @wp.func
     def activations(weights: Weights, before: Units) -> Activations:
         """All hidden layers' units, ReLU applied."""
-        n_units = int(width)
+        n_units = weights.width
         h = Activations()
         for j in range(n_units):
             h[j] = relu(before[j])
@@ -186,7 +211,7 @@ def mlp(layout: Layout) -> Mlp:
 
     @wp.func
     def outputs(weights: Weights, before: Units) -> vec3:
-        n_units = int(width)
+        n_units = weights.width
         h = activations(weights, before)
         at = output + 4 * width
         y = vec3(weights.values[at], weights.values[at + 1], weights.values[at + 2])
@@ -197,30 +222,30 @@ def mlp(layout: Layout) -> Mlp:
 
     @wp.func
     def adj_outputs(weights: Weights, before: Units, adj_y: vec3, gradient: Any) -> Units:
-        n_units = int(width)
+        n_units = weights.width
         h = activations(weights, before)
         adj = Units()
         for o in range(3):
-            wp.atomic_add(gradient.weights, 0, output + 4 * width + o, adj_y[o])
+            add_weight(gradient.weights, output + 4 * width + o, adj_y[o])
         for i in range(n_units):
             unit = h[(n_hidden - 1) * width + i]
             total = real(0.0)
             for o in range(3):
                 total += adj_y[o] * weights.values[output + 4 * i + o]
-                wp.atomic_add(gradient.weights, 0, output + 4 * i + o, unit * adj_y[o])
+                add_weight(gradient.weights, output + 4 * i + o, unit * adj_y[o])
             adj[i] = wp.where(unit > real(0.0), total, real(0.0))
         for back in range(1, n_hidden):
             layer = n_hidden - back
             at = hidden + (layer - 1) * layer_size
             below = Units()
             for j in range(n_units):
-                wp.atomic_add(gradient.weights, 0, at + width * width + j, adj[j])
+                add_weight(gradient.weights, at + width * width + j, adj[j])
             for i in range(n_units):
                 unit = h[(layer - 1) * width + i]
                 total = real(0.0)
                 for j in range(n_units):
                     total += adj[j] * weights.values[at + i * width + j]
-                    wp.atomic_add(gradient.weights, 0, at + i * width + j, unit * adj[j])
+                    add_weight(gradient.weights, at + i * width + j, unit * adj[j])
                 below[i] = wp.where(unit > real(0.0), total, real(0.0))
             adj = below
         return adj
