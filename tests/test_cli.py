@@ -179,6 +179,7 @@ def test_files_that_are_no_run_are_never_touched(tmp_path: Path) -> None:
         (("builtin:room", "--downscale", "0"), "downscale"),
         ((*TINY, "--scaling", "cubic"), "scaling"),
         ((*TINY, "--stesp", "3"), "--steps"),
+        (("",), "empty"),
     ],
 )
 def test_bad_input_gets_a_sentence(tmp_path: Path, arguments: tuple[str, ...], says: str) -> None:
@@ -187,6 +188,16 @@ def test_bad_input_gets_a_sentence(tmp_path: Path, arguments: tuple[str, ...], s
     assert says in out + err
     assert "Traceback" not in out + err
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("options", [("--device", "cuda:9"), ("--threads", "100000")])
+def test_a_machine_that_is_not_there_is_refused_before_photographs_are_read(
+    tmp_path: Path, options: tuple[str, str]
+) -> None:
+    code, out, err = run("train", *TINY, *options, "--output", tmp_path / "run")
+    assert code == 2
+    assert "reading" not in out
+    assert options[1] in err
 
 
 def test_a_bad_scene_leaves_nothing(tmp_path: Path) -> None:

@@ -118,10 +118,14 @@ def test_stills_are_those_of_the_split(run_folder: Path, tmp_path: Path) -> None
         ({"depths": (3.0, 1.0)}, "range of depths"),
         ({"distance": -1.0, "path": "back"}, "distance of the path"),
         ({"scene": "/no/such/place"}, "does not exist"),
-        ({"stills": "val", "fps": None, "seconds": None}, "no 'val' views"),
+        ({"output": "a", "stills": "val", "fps": None, "seconds": None}, "no 'val' views"),
         ({"stills": "test", "seconds": None}, "--fps and --seconds are of a video"),
         ({"stills": "test", "fps": None}, "--fps and --seconds are of a video"),
         ({"output": "film.avi"}, r"\.mp4 or \.gif"),
+        (
+            {"output": "a.mp4", "stills": "test", "fps": None, "seconds": None},
+            "stills go into a folder",
+        ),
         (
             {"output": "nowhere/stills", "stills": "test", "fps": None, "seconds": None},
             "folder above",

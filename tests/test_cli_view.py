@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import urllib.request
@@ -129,7 +130,9 @@ def test_what_cannot_be_shown_is_refused(
     assert main(["view", str(run_folder), str(tmp_path)]) == 2
     assert f"{tmp_path}" in capsys.readouterr().err
     assert main(["view", str(run_folder), "--port", "70000"]) == 2
-    assert "--port 70000" in capsys.readouterr().err
+    out, err = capsys.readouterr()
+    assert "--port 70000" in err
+    assert "reading" not in out
     assert main(["view", str(run_folder), "--device", "cuda:77"]) == 2
     assert "device" in capsys.readouterr().err
     with pytest.raises(InputError, match="not 3"):
@@ -189,3 +192,16 @@ def test_a_training_with_a_page_ends_by_itself(run_folder: Path, tmp_path: Path)
         assert done.returncode == 0, done.stderr
         fields.append((tmp_path / name / "field.safetensors").read_bytes())
     assert fields[0] == fields[1]
+
+
+def test_a_port_in_use_is_refused_before_photographs_are_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        train = ["train", "builtin:room", "--output", str(tmp_path / "run")]
+        assert main([*train, "--view", "--port", port]) == 2
+    out, err = capsys.readouterr()
+    assert f"--port {port}" in err
+    assert not out
+    assert not (tmp_path / "run").exists()

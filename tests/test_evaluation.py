@@ -184,3 +184,16 @@ def test_a_missing_split_is_named_with_those_that_exist() -> None:
     field = tiny_field()
     with pytest.raises(InputError, match=r"mirror.*'val'.*test, train"):
         evaluate(field, scene_of(field, depth=False), split="val")
+
+
+def test_progress_is_told_view_by_view() -> None:
+    field, told = tiny_field(), []
+    evaluate(
+        field,
+        scene_of(field, depth=False),
+        "all",
+        on_progress=lambda done, words: told.append((done, words)),
+    )
+    n = len(told)
+    assert n > 1
+    assert told == [(k / n, f"view {k} of {n}") for k in range(1, n + 1)]

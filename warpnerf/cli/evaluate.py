@@ -9,6 +9,7 @@ from typing import Literal
 import tyro
 
 from warpnerf.cli.machine import require_writable, write_json
+from warpnerf.cli.progress import ProgressBar
 
 
 def eval_command(
@@ -56,7 +57,8 @@ def eval_command(
     )
     views = config.as_trained(views)
     require_measurable(views, split)
-    result = evaluate(field, views, split, lpips=distance)
+    with ProgressBar("first view") as bar:
+        result = evaluate(field, views, split, lpips=distance, on_progress=bar.report)
     print(result)
     if json is not None:
         write_json(json, result.to_json())

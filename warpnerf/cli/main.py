@@ -42,8 +42,12 @@ def _meant(option: str, word: str) -> str:
     """A word of the command line as it is understood: counts such as 1e6 without their exponent.
 
     Raises:
-        InputError: It is None, by which Python's default would be meant.
+        InputError: It is empty, or None, by which Python's default would be meant.
     """
+    if not word:
+        raise InputError(
+            "one of the arguments is empty, which variables that are not set are; give a value."
+        )
     if option.startswith("--") and word == "None":
         raise InputError(f"{option} cannot be None; leave it out for what it is by default.")
     joined = re.fullmatch(r"(--[\w-]+)=(.*)", word)

@@ -175,6 +175,8 @@ def _still_cameras(scene: Scene, split: str, size: tuple[int, int] | None) -> di
 
 
 def _require_folder(folder: Path) -> None:
+    if folder.suffix in (".mp4", ".gif"):
+        raise InputError(f"--output {folder} is a video's name; stills go into a folder.")
     if folder.exists() and not folder.is_dir():
         raise InputError(f"--output {folder} is a file; stills go into a folder.")
     if not folder.parent.is_dir():

@@ -200,6 +200,7 @@ def _begin_alone(
     page: PageOptions | None,
 ) -> int:
     """Train from the first step on, as the only one that writes to the folder."""
+    _require_machine(config)
     photographs = source
     source = with_poses(photographs, output, masks, config.threads)
     if source != photographs:
@@ -265,6 +266,7 @@ def _go_on(
     state, notes = run.load_state()
     config = changed(state.config)
     state.require_same_config(config)
+    _require_machine(config)
     masks = masks or masks_of(begun, moved)
     scene = _read(moved or begun.scene, begun.downscale, masks, images, run.folder)
     trainer = Trainer(scene, config, state)
@@ -281,6 +283,18 @@ def _go_on(
         run.rewind_log(trainer.steps_done)
         del state  # the trainer has copies
         return _train(run, scene, trainer, session)
+
+
+def _require_machine(config: TrainConfig) -> None:
+    """Refuse a device or threads that this machine has not, before photographs are posed or read.
+
+    Raises:
+        InputError: It has not.
+    """
+    if config.device != "cpu" or config.threads is not None:  # else Warp need not be loaded yet
+        from warpnerf.runtime.parallel import Workers
+
+        Workers(config.device, config.threads)
 
 
 def _read(
@@ -334,7 +348,9 @@ def _train(run: Run, scene: Scene, trainer: Trainer, session: Session | None) ->
     split = _split_to_look_at(scene)
     print(f"rendering the {'test' if split == 'test' else 'training'} views", flush=True)
     try:
-        print(run.evaluate(trainer.field(), scene, split))
+        with ProgressBar("first view") as bar:
+            result = run.evaluate(trainer.field(), scene, split, bar.report)
+        print(result)
     except Stopped as stopped:
         print(f"stopped; the field is saved. Go on with: {run.resume_command}", flush=True)
         return stopped.exit_code

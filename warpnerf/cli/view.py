@@ -42,11 +42,13 @@ def view_command(
         threads: CPU threads; by default one per usable core.
     """
     from warpnerf.training.run import Run
+    from warpnerf.viewer.server import require_place
     from warpnerf.viewer.view import open_view
 
     folders = [folder] if other is None else [folder, other]
     for one in folders:
         Run(one).read_config()  # before any is loaded
+    require_place(host, port)
     with open_view(
         folders, scene=scene, host=host, port=port, device=device, threads=threads
     ) as session:
@@ -67,7 +69,8 @@ class PageOptions:
         """From the options of the command; None: no page.
 
         Raises:
-            InputError: A host or port for no page, or viser is missing.
+            InputError: A host or port for no page, or none that can be listened at, or viser is
+                missing.
         """
         if not view:
             for name, value in (("host", host), ("port", port)):
@@ -75,7 +78,11 @@ class PageOptions:
                     raise InputError(f"--{name} is where --view serves its page; give both.")
             return None
         require_extra("viser", "viewer", "--view")
-        return PageOptions(host=host or HOST, port=port)
+        from warpnerf.viewer.server import require_place
+
+        options = PageOptions(host=host or HOST, port=port)
+        require_place(options.host, options.port)
+        return options
 
 
 def training_page(

@@ -131,6 +131,7 @@ def evaluate(
     split: str = "test",
     on_image: Callable[[View, np.ndarray, Rendering], None] | None = None,
     lpips: Distance | None = None,
+    on_progress: Callable[[float, str], None] = lambda done, words: None,
 ) -> Evaluation:
     """Render a split's views and hold them against the photographs.
 
@@ -141,6 +142,7 @@ def evaluate(
         on_image: Called with each view, its truth [H, W, 3] in [0, 1] over the field's background,
             and its rendering.
         lpips: A ``warpnerf.evaluation.lpips.Lpips``, if LPIPS is wanted.
+        on_progress: Called with the share of the views that is done, in (0, 1], and in words.
 
     Returns:
         Figures of each image and their means, and what hangs in front of the training cameras.
@@ -150,8 +152,8 @@ def evaluate(
     """
     images = []
     within = NEAR_SHARE * scene.content_distance
-    for index in require_split(scene, split):
-        view = scene.views[index]
+    views = [scene.views[index] for index in require_split(scene, split)]
+    for number, view in enumerate(views, 1):
         rendering = field.render(view.camera)
         target = truth(view, field.background)
         rgb = np.clip(rendering.rgb, 0.0, 1.0)
@@ -175,6 +177,7 @@ def evaluate(
         )
         if on_image is not None:
             on_image(view, target, rendering)
+        on_progress(number / len(views), f"view {number} of {len(views)}")
     return Evaluation(images=tuple(images), near_field=measure_near_field(field, scene))
 
 

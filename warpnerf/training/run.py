@@ -241,16 +241,23 @@ class Run:
         )
         return loaded, notes
 
-    def evaluate(self, field: Field, scene: Scene, split: str) -> Evaluation:
+    def evaluate(
+        self,
+        field: Field,
+        scene: Scene,
+        split: str,
+        on_progress: Callable[[float, str], None] = lambda done, words: None,
+    ) -> Evaluation:
         """Measure a split, and write metrics.json, its pictures, and a sheet of a few of them.
 
         All show depths in the same colours, over the range of the true depths where they are known
-        for all views, else of what their cameras see.
+        for all views, else of what their cameras see. `on_progress` is called with the share of
+        the views that is done, in (0, 1], and in words.
 
         Raises:
             InputError: They cannot be written.
         """
-        return evaluate_into(self.folder, field, scene, split, self._writing)
+        return evaluate_into(self.folder, field, scene, split, self._writing, on_progress)
 
     def way_on(self) -> str:
         """How to go on, or that there is nothing to go on from: half a sentence."""

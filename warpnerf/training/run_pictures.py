@@ -24,6 +24,7 @@ def evaluate_into(
     scene: Scene,
     split: str,
     writing: Callable[[], AbstractContextManager[None]],
+    on_progress: Callable[[float, str], None],
 ) -> Evaluation:
     """Measure a split, and write metrics.json, its pictures, and a sheet of a few of them.
 
@@ -36,6 +37,7 @@ def evaluate_into(
         scene: Its photographs.
         split: Which of them.
         writing: Is entered whenever files are written, and says what to do where they cannot be.
+        on_progress: As of ``evaluate``.
     """
     views = [scene.views[index] for index in require_split(scene, split)]
     files = picture_files([view.name for view in views])
@@ -52,7 +54,7 @@ def evaluate_into(
 
     with writing():
         (folder / "test").mkdir(exist_ok=True)
-    result = evaluate(field, scene, split, picture)
+    result = evaluate(field, scene, split, picture, on_progress=on_progress)
     rows = [
         SheetRow(
             name=image.name,

@@ -40,7 +40,7 @@ def open_server(host: str, port: int | None) -> viser.ViserServer:
         InputError: viser is missing, or host and port cannot be listened at.
     """
     require_extra("viser", "viewer", "the viewer")
-    _require_free(host, 0 if port is None else port)
+    require_place(host, port)
     import viser
     import websockets.asyncio.server
 
@@ -140,8 +140,17 @@ def _is_address(name: str) -> bool:
     return True
 
 
-def _require_free(host: str, port: int) -> None:
-    """Raise InputError unless one could listen there; viser would try for ever."""
+def require_place(host: str, port: int | None) -> None:
+    """Refuse what cannot be listened at, where viser would try for ever.
+
+    Args:
+        host: As of ``open_server``.
+        port: Likewise.
+
+    Raises:
+        InputError: There is no such place here, or somebody else is there.
+    """
+    port = 0 if port is None else port
     if not 0 <= port <= 65535:
         raise InputError(f"--port {port} is none; choose one of 1 to 65535, or 0 for any.")
     try:
