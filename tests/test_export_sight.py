@@ -9,6 +9,7 @@ import pytest
 from solid_fields import ball_field, camera_at, cameras_around
 from tiny_fields import tiny_field
 
+from warpnerf.checks import InputError
 from warpnerf.exporting import sight
 from warpnerf.exporting.sight import look
 from warpnerf.model.nodes import nodes_of, points_of, values_at
@@ -115,3 +116,8 @@ def test_node_coordinates_are_those_that_kernels_read(contraction: str) -> None:
     background = np.array(field.background) * (1.0 - shown.opacity[:, None])
     rgb = (shown.rgb - background) / shown.opacity[:, None]
     np.testing.assert_allclose(rgb, 1.0 / (1.0 + np.exp(-raw)), atol=2e-3)
+
+
+def test_without_views_there_is_nothing_to_see() -> None:
+    with pytest.raises(InputError, match="at least one view"):
+        look(tiny_field(), [])

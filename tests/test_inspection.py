@@ -127,6 +127,27 @@ def test_a_camera_far_away_and_one_upside_down(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        ({"cx": 0.0}, "principal point far from the middle of the image: 9 of 9 cameras"),
+        ({"cx": 0.5, "cy": 0.5}, "principal point far from the middle"),  # shares
+        ({"fl_x": 0.9, "fl_y": 1.2}, "focal length below 0.15 of the image's width: 9 of 9"),
+        ({}, None),
+    ],
+)
+def test_lenses_in_other_units_are_said(
+    tmp_path: Path, given: dict[str, float], says: str | None
+) -> None:
+    scene_with(tmp_path, ring(9))
+    path = tmp_path / "transforms.json"
+    save(path, json.loads(path.read_text()) | given)
+    found = odd(inspect(tmp_path))
+    assert (says or "") in found
+    if says is None:
+        assert "principal" not in found and "focal" not in found
+
+
+@pytest.mark.parametrize(
     ("options", "says"),
     [
         ({}, None),

@@ -104,6 +104,22 @@ def test_compiling_is_announced_once_and_reading_is_not(
         assert said == ["compiling kernels (once; later runs start at once)"] * times
 
 
+def test_nothing_is_compiled_on_a_full_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kernel_cache.start()
+    cpu = wp.get_device("cpu")
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    full = SimpleNamespace(free=kernel_cache.ROOM - 1)
+    (tmp_path / "cached").mkdir()
+    (tmp_path / "cached" / "a.cpu0.o").write_text("compiled")
+    monkeypatch.setattr(kernel_cache.shutil, "disk_usage", lambda path: full)
+    kernel_cache._load(Module(tmp_path / "cached"), cpu)
+    with pytest.raises(OSError, match="No space left"):
+        kernel_cache._load(Module(tmp_path / "new"), cpu)
+    assert not (tmp_path / "new").exists()
+
+
 def test_one_thread_loads_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """Warp crashes where two load a module for the first time."""
     inside: list[int] = []

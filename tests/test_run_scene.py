@@ -12,6 +12,7 @@ from tiny_fields import tiny_field
 from tiny_scenes import write_transforms
 
 from warpnerf.checks import InputError
+from warpnerf.cli.evaluate import eval_command
 from warpnerf.cli.export import export_command
 from warpnerf.cli.render import render_command
 from warpnerf.cli.train import train_command
@@ -75,6 +76,18 @@ def test_a_training_of_a_scene_that_moved_goes_on_with_its_masks(tmp_path: Path)
     (tmp_path / "elsewhere/hide").rename(tmp_path / "hidden")
     with pytest.raises(InputError, match="scene/hide: the masks that the run was trained with"):
         train_command(str(tmp_path / "elsewhere"), resume=run)
+
+
+def test_commands_on_a_scene_that_moved_say_how_to_name_it(tmp_path: Path) -> None:
+    run = masked_run(tmp_path)
+    (tmp_path / "scene").rename(tmp_path / "elsewhere")
+    for command in (
+        lambda: eval_command(run),
+        lambda: export_command(run, tmp_path / "a.npz", threads=1),
+        lambda: render_command(run, output=tmp_path / "a.gif", threads=1),
+    ):
+        with pytest.raises(InputError, match=r"scene: the scene .* no longer there.*by --scene"):
+            command()
 
 
 def test_the_viewer_shows_no_photograph_that_is_masked_wholly(tmp_path: Path) -> None:

@@ -348,3 +348,8 @@ def test_what_is_not_finite_is_never_saved(where: str) -> None:
     with pytest.raises(FloatingPointError, match="not finite after step 5"):
         trainer.run(on_checkpoint=keep, stop=spoil)
     assert saved == [1, 2, 3, 4]
+
+
+def test_a_folder_is_no_scene() -> None:
+    with pytest.raises(InputError, match=r"wants a scene, not 'photos'.*load_scene"):
+        train("photos")  # type: ignore[arg-type]

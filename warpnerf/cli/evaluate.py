@@ -39,6 +39,7 @@ def eval_command(
     from warpnerf.evaluation.evaluate import evaluate, require_measurable
     from warpnerf.scenes.load import load_scene
     from warpnerf.training.run import Run
+    from warpnerf.training.run_scene import path_of
 
     require_writable(json)
     distance = None
@@ -53,7 +54,7 @@ def eval_command(
         print(f"warpnerf: note: {note}", file=sys.stderr)
     folder_of_masks = masks or (config.masks if scene is None else None)
     views = load_scene(
-        scene or config.scene, downscale=config.downscale, masks=folder_of_masks, images="files"
+        path_of(config, scene), downscale=config.downscale, masks=folder_of_masks, images="files"
     )
     views = config.as_trained(views)
     require_measurable(views, split)

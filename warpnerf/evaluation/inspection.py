@@ -34,6 +34,11 @@ MANY_TIMES = 20.0
 FAR_OFF = 10.0
 """A camera this many times the median distance away from the median place is likely a mistake."""
 
+OFF_CENTRE = 0.3
+"""Of the image's width or height, from the middle to the principal point: no lens is so far off."""
+SHORT = 0.15
+"""Focal length as a share of the image's width: 147 degrees, which no lens but a fisheye sees."""
+
 SECONDS_PER_RAY, SECONDS_PER_SAMPLE, SECONDS_PER_NODE = 1.2e-6, 22e-9, 16e-9
 """Of one core, in a step for what is visited and in an update for each node in use: measured on an
 AMD EPYC."""
@@ -279,7 +284,7 @@ def oddities(
     cameras = scene.training_cameras
     if not found.built_in:  # they look everywhere, and know their true distances
         odd += _odd_directions(cameras, scene, content_distance, looked)
-    odd += _odd_places(scene)
+    odd += _odd_places(scene) + _odd_lenses(scene)
     nearest = max(near, _distance_to_box(scene))
     if nearest >= content_distance:
         why = "the near plane" if nearest == near else "the box"
@@ -344,6 +349,31 @@ def _odd_places(scene: Scene) -> list[str]:
         odd.append(
             f"far away from all others: {len(lost)} of {len(places)} cameras (first: {lost[0]}), "
             "which may be wrongly posed"
+        )
+    return odd
+
+
+def _odd_lenses(scene: Scene) -> list[str]:
+    """Lenses as hardly any photograph has them: numbers in other units, perhaps."""
+    odd = []
+    aside, wide = [], []
+    for view in scene.views:
+        camera = view.camera
+        shares = np.array([camera.cx / camera.width, camera.cy / camera.height])
+        if np.abs(shares - 0.5).max() > OFF_CENTRE:
+            aside.append(view.name)
+        if not camera.fisheye and min(camera.fx, camera.fy) < SHORT * camera.width:
+            wide.append(view.name)
+    if aside:
+        odd.append(
+            f"principal point far from the middle of the image: {len(aside)} of "
+            f"{len(scene.views)} cameras (first: {aside[0]}); cx and cy are pixels from its left "
+            "and top edge"
+        )
+    if wide:
+        odd.append(
+            f"focal length below {SHORT:g} of the image's width: {len(wide)} of {len(scene.views)} "
+            f"cameras (first: {wide[0]}); it is given in pixels"
         )
     return odd
 

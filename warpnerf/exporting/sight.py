@@ -14,6 +14,7 @@ import numpy as np
 import warp as wp
 from warpnerf_kernels.base.types import real, vec3, vector
 
+from warpnerf.checks import InputError
 from warpnerf.model.models import Rgb
 from warpnerf.model.nodes import values_at
 from warpnerf.rendering.field import Field
@@ -80,7 +81,12 @@ def look(
 
     Returns:
         What they see.
+
+    Raises:
+        InputError: There are no views.
     """
+    if not views:
+        raise InputError("look wants at least one view or camera, such as scene.training_cameras.")
     cameras = [view.camera if isinstance(view, View) else view for view in views]
     workers, grid, rgb = field.workers, field.grid, Rgb()
     device = workers.device

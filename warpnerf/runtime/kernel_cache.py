@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import errno
 import hashlib
 import logging
 import os
@@ -29,6 +30,8 @@ SUMS = "SHA256SUMS"
 COMPILED = (".o", ".cubin", ".ptx", ".meta")
 CUDA_BLOCK = 64
 """Threads of a block on CUDA. A batch has few rays, and small blocks spread them over the GPU."""
+ROOM = 16 << 20
+"""Bytes that are free where a kernel is compiled: several times what the largest leaves there."""
 NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 """In the line that Warp prints where there is no GPU. Who asks for one is told in a sentence."""
 
@@ -108,9 +111,16 @@ def _load(module: wp.Module, device: wp.Device) -> None:
     folder = Path(wp.config.kernel_cache_dir) / module.get_module_identifier(block_dim)
     _verify(folder)
     if not _is_compiled(folder, device):
+        _require_room(folder.parent)
         _say_once()
     module.load(device, block_dim=block_dim)
     _seal(folder)
+
+
+def _require_room(cache: Path) -> None:
+    """Raise OSError on a full disk: the compiler would end the process."""
+    if cache.is_dir() and shutil.disk_usage(cache).free < ROOM:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(cache))
 
 
 def threads_of_a_block(device: wp.Device) -> int:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from warpnerf.checks import InputError
-from warpnerf.scenes.load import load_scene
+from warpnerf.scenes.files import exists
+from warpnerf.scenes.load import BUILTIN, load_scene
 from warpnerf.scenes.scene import Scene
 from warpnerf.training.run_config import RunConfig
 
@@ -21,11 +22,27 @@ def load_run_scene(config: RunConfig, moved: str | None = None) -> Scene:
     Raises:
         InputError: The scene cannot be read, or the run's masks are gone.
     """
-    masks = masks_of(config, moved)
-    scene = load_scene(
-        moved or config.scene, downscale=config.downscale, masks=masks, images="files"
-    )
+    path, masks = path_of(config, moved), masks_of(config, moved)
+    scene = load_scene(path, downscale=config.downscale, masks=masks, images="files")
     return config.as_trained(scene)
+
+
+def path_of(config: RunConfig, moved: str | None = None) -> str:
+    """Where the scene is that a run was trained on.
+
+    Args:
+        config: Of the run.
+        moved: Where it is now; None: where it was.
+
+    Raises:
+        InputError: It is not where it was.
+    """
+    if moved is None and not config.scene.startswith(BUILTIN) and not exists(Path(config.scene)):
+        raise InputError(
+            f"{config.scene}: the scene that the run was trained on is no longer there; put it "
+            "back, or name where it is now by --scene, for train as SCENE."
+        )
+    return moved or config.scene
 
 
 def masks_of(config: RunConfig, moved: str | None = None) -> Path | None:

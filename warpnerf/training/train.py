@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from warpnerf.checks import InputError
 from warpnerf.config import TrainConfig
 from warpnerf.presets import PRESETS
 from warpnerf.rendering.field import Field
@@ -54,11 +55,16 @@ def train(
         The field, and how training ended.
 
     Raises:
-        InputError: The device is missing, the grid would not fit the memory, a short training for
-            the content distance met nothing opaque, or scene or configuration are not those of the
-            training to be resumed.
+        InputError: The scene is none, the device is missing, the grid would not fit the memory, a
+            short training for the content distance met nothing opaque, or scene or configuration
+            are not those of the training to be resumed.
         FloatingPointError: The loss, or a value in the grid, is no longer a finite number.
     """
+    if not isinstance(scene, Scene):
+        raise InputError(
+            f"train wants a scene, not {scene!r}; load_scene gives that of a folder, as in "
+            "train(load_scene(folder))."
+        )
     if config is None:
         config = PRESETS["fast"] if resume is None else resume.config
     trainer = begin(scene, config, resume)

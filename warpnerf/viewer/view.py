@@ -107,5 +107,5 @@ def _scene_of(config: RunConfig, moved: str | None) -> Scene | None:
     except InputError as error:
         if moved is not None:
             raise
-        print(f"note: shown without its photographs: {error} Name them by --scene.", flush=True)
+        print(f"note: shown without its photographs: {error}", flush=True)
         return None
