@@ -21,6 +21,14 @@ def test_options_change_the_losses() -> None:
     assert chosen_losses(begun, given) == expected
 
 
+def test_a_weight_may_be_a_word_or_a_number() -> None:
+    begun = chosen_losses(LossConfig(), ["opacity=auto"])
+    assert begun == LossConfig(opacity="auto")
+    assert chosen_losses(begun, ["opacity=0.5"]) == LossConfig(opacity=0.5)
+    with pytest.raises(InputError, match="opacity must be auto or a number, not 'much'"):
+        chosen_losses(begun, ["opacity=much"])
+
+
 @pytest.mark.parametrize(
     ("option", "said"),
     [

@@ -250,6 +250,18 @@ def test_photographs_with_alpha_need_not_be_opaque() -> None:
         Trainer(scene, config_of(LOSSES["opacity"]))
 
 
+def test_opacity_by_auto_is_that_of_photographs_without_alpha() -> None:
+    auto = LossConfig(opacity="auto")
+    for scene, weight in ((ball(), 0.0), (flat_scene(), 1e-3)):
+        found, given = (
+            train(scene, config_of(losses)).field.grid.values.numpy()
+            for losses in (auto, LossConfig(opacity=weight))
+        )
+        assert np.array_equal(found, given)
+    with pytest.raises(InputError, match=r"loss\.opacity must be auto or a number, not 'much'"):
+        LossConfig(opacity="much")  # type: ignore[arg-type]
+
+
 def flat_scene() -> Scene:
     """Light grey, wherever one looks."""
     scene = tiny_scene(ring(5))

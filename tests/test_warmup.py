@@ -70,9 +70,10 @@ def test_warm_up_covers_the_presets_and_is_done_once(presets: tuple[str, ...], d
     names = [kernel.name for kernel in first]
     assert len(set(names)) == len(names)
     for scaling in ("none", "quadratic", "clamped"):
-        assert f"render train, scaling {scaling}, distortion, entropy" in names
-        assert f"render train, space folded in, scaling {scaling}, distortion, entropy" in names
-        assert f"render train, in NDC, scaling {scaling}, distortion, entropy" in names
+        assert f"render train, scaling {scaling}, distortion, entropy" in names  # with alpha
+        for space in ("", ", space folded in", ", in NDC"):
+            kinds = "distortion, entropy, opacity"
+            assert f"render train{space}, scaling {scaling}, {kinds}" in names
     assert {"render forward", "render forward, space folded in", "adam step"} < set(names)
     again = warm_up(device, configs=configs)
     assert [kernel.name for kernel in again] == names
@@ -93,5 +94,7 @@ def test_unless_told_the_presets_are_compiled(monkeypatch: pytest.MonkeyPatch) -
     warm_up("cpu")
     where = Workers("cpu", 1).device
     for config in (PRESETS[name] for name in EVERYDAY):
-        for kernel in training_kernels(config.model, "ndc", "clamped", "none", where, config.loss):
-            assert kernel.module in loaded
+        for space, has_alpha in (("ndc", False), ("none", False), ("none", True)):
+            losses = config.loss.decided(has_alpha)
+            for kernel in training_kernels(config.model, space, "clamped", "none", where, losses):
+                assert kernel.module in loaded

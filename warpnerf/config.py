@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal, get_args
 
 from warpnerf.checks import (
@@ -238,6 +238,9 @@ HUBER_DELTA = 0.1
 WEIGHTS_OF_LOSSES = ("distortion", "entropy", "opacity", "sample_colour", "near_clip")
 """Fields of LossConfig that weigh a loss."""
 
+OPACITY = 1e-3
+"""What ``LossConfig.opacity`` is by auto."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class LossConfig:
@@ -257,9 +260,9 @@ class LossConfig:
     t / (D + t), with D the content distance in use; with auto and per-camera, the scene's."""
     entropy: float = 0.0
     """Weight of the entropy of the remaining light: a ray ends in matter, or meets none."""
-    opacity: float = 0.0
+    opacity: float | Literal["auto"] = 0.0
     """Weight of -log of the opacity of rays: each ends in matter. For photographs without alpha,
-    whose pixels all show something."""
+    whose pixels all show something; auto: 0.001 for these, 0 where photographs have alpha."""
     sample_colour: float = 0.0
     """Weight of the squared errors of the colours of single samples. For models that have such:
     all but deferred."""
@@ -274,8 +277,11 @@ class LossConfig:
         """Refuse what cannot be minimised."""
         require_one_of("loss.photometric", self.photometric, ("squared", "huber"))
         require_positive("loss.huber_delta", self.huber_delta)
+        if isinstance(self.opacity, str) and self.opacity != "auto":
+            raise InputError(f"loss.opacity must be auto or a number, not {self.opacity!r}.")
         for name in (*WEIGHTS_OF_LOSSES, "near_clip_distance"):
-            require_at_least(f"loss.{name}", getattr(self, name), 0.0)
+            if getattr(self, name) != "auto":
+                require_at_least(f"loss.{name}", getattr(self, name), 0.0)
         if self.photometric != "huber" and self.huber_delta != HUBER_DELTA:
             raise InputError(
                 f"loss.huber_delta is {self.huber_delta:g}, but loss.photometric is squared; set "
@@ -292,11 +298,21 @@ class LossConfig:
                 "densities are pushed down; give both, or leave near_clip at 0."
             )
 
+    def decided(self, has_alpha: bool) -> LossConfig:
+        """These, with numbers for what is auto.
+
+        Args:
+            has_alpha: Whether the photographs have alpha.
+        """
+        if self.opacity != "auto":
+            return self
+        return replace(self, opacity=0.0 if has_alpha else OPACITY)
+
     @property
     def kinds(self) -> tuple[str, ...]:
         """Which losses there are besides the squared error; kernels are compiled for them."""
         huber = ("huber",) if self.photometric == "huber" else ()
-        return huber + tuple(name for name in WEIGHTS_OF_LOSSES if getattr(self, name) > 0.0)
+        return huber + tuple(name for name in WEIGHTS_OF_LOSSES if getattr(self, name) != 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -37,8 +37,9 @@ from warpnerf.model.models import Deferred, Features
 
 _FAST = TrainConfig(
     model=Deferred(specular=12, width=64),
-    # Without the entropy of remaining light, colours of the MLP make up for walls that stay soft.
-    loss=LossConfig(distortion=0.01, entropy=1e-3),
+    # Without the entropy of remaining light, colours of the MLP make up for walls that stay soft;
+    # without opacity, the background makes up for what is as dark as it.
+    loss=LossConfig(distortion=0.01, entropy=1e-3, opacity="auto"),
 )
 
 _DVGO = TrainConfig(

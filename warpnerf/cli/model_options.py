@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import fields, replace
-from typing import Any
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from warpnerf.checks import InputError, require_one_of
 from warpnerf.model.interface import Model
@@ -49,6 +50,7 @@ def values_of(flag: str, otherwise: str, begin: Any, options: Sequence[str]) -> 
         InputError: There is no such field, it is given twice, or a value does not fit.
     """
     known = {f.name: getattr(begin, f.name) for f in fields(begin)}
+    kinds = get_type_hints(type(begin))
     given: dict[str, Any] = {}
     for option in options:
         field, equals, text = option.partition("=")
@@ -57,14 +59,22 @@ def values_of(flag: str, otherwise: str, begin: Any, options: Sequence[str]) -> 
             raise InputError(f"{flag}: {option!r} is {otherwise} {listed}.")
         if field in given:
             raise InputError(f"{flag}: {field} is given twice; keep one of them.")
-        given[field] = _parsed(flag, field, text, type(known[field]))
+        given[field] = _parsed(flag, field, text, kinds[field])
     return given
 
 
-def _parsed(flag: str, field: str, text: str, kind: type) -> Any:
-    words = {"true": True, "false": False}
+def _parsed(flag: str, field: str, text: str, kind: Any) -> Any:
+    """A value of a type or of one of several; the configuration looks at words."""
+    parts = get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
+    words = [word for part in parts if get_origin(part) is Literal for word in get_args(part)]
+    numbers = [part for part in parts if get_origin(part) is not Literal]
+    if text in words or not numbers:
+        return text
+    (number,) = numbers
+    truth = {"true": True, "false": False}
     try:
-        return words[text.lower()] if kind is bool else kind(text)
+        return truth[text.lower()] if number is bool else number(text)
     except (ValueError, KeyError):
-        wanted = {bool: "true or false", int: "a whole number", float: "a number"}[kind]
-        raise InputError(f"{flag}: {field} must be {wanted}, not {text!r}.") from None
+        wanted = {bool: "true or false", int: "a whole number", float: "a number"}[number]
+        listed = " or ".join([*words, wanted])
+        raise InputError(f"{flag}: {field} must be {listed}, not {text!r}.") from None

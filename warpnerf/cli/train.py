@@ -79,7 +79,7 @@ def train_command(
         model_options: Of the model, such as specular=8 width=64 (deferred), features=12
             residual=false threshold=0.0001 (features), degree=2 (sh).
         loss: What is minimised besides, and how: photometric=huber huber_delta=0.1, and weights of
-            distortion=0.01, entropy=0.001, opacity=0.001 (not for photographs with alpha),
+            distortion=0.01, entropy=0.001, opacity=0.001 (auto: not for photographs with alpha),
             sample_colour=0.1 (not for deferred), near_clip=0.01 near_clip_distance=0.2.
         steps: Batches of rays to train on; by default as many as the preset says, or as the time
             limit allows.
@@ -259,7 +259,7 @@ def _go_on(
     changed: Callable[[TrainConfig], TrainConfig],
     page: PageOptions | None,
 ) -> int:
-    from warpnerf.training.run_scene import masks_of
+    from warpnerf.training.run_scene import masks_of, path_of
     from warpnerf.training.trainer import Trainer
 
     begun = run.read_config()
@@ -268,7 +268,7 @@ def _go_on(
     state.require_same_config(config)
     _require_machine(config)
     masks = masks or masks_of(begun, moved)
-    scene = _read(moved or begun.scene, begun.downscale, masks, images, run.folder)
+    scene = _read(path_of(begun, moved), begun.downscale, masks, images, run.folder)
     trainer = Trainer(scene, config, state)
     scene = begun.as_trained(scene)
     _describe(scene, trainer)

@@ -92,10 +92,11 @@ class Trainer:
                 )
         self.content_distances = distances
         """Of the training views, scene units."""
-        if scene.has_alpha and config.loss.opacity > 0.0:
+        self._losses = config.loss.decided(scene.has_alpha)
+        if scene.has_alpha and self._losses.opacity != 0.0:
             raise InputError(
                 f"loss.opacity is above 0, but photographs of {scene.name} have alpha, and where "
-                "they show nothing, nothing should be; set it to 0."
+                "they show nothing, nothing should be; set it to 0 or auto."
             )
         views = [scene.views[i] for i in scene.splits["train"]]
         behind = config.background
@@ -286,7 +287,7 @@ class Trainer:
         )
 
     def _not_finite(self, what: str) -> FloatingPointError:
-        smaller = "smaller weights of losses, " if self.config.loss.kinds else ""
+        smaller = "smaller weights of losses, " if self._losses.kinds else ""
         return FloatingPointError(
             f"{what} not finite after step {self.steps_done}; choose a content distance that fits "
             f"the scene, the clamped scaling, {smaller}or lower learning rates."
@@ -343,7 +344,7 @@ class Trainer:
             self.config.scaling,
             self.config.jacobian,
             self.workers,
-            Minimised(config=self.config.loss, content_distance=self.content_distance),
+            Minimised(config=self._losses, content_distance=self.content_distance),
         )
 
     def _kernels(self) -> list[wp.Kernel]:
@@ -353,7 +354,7 @@ class Trainer:
             self.config.scaling,
             self.config.jacobian,
             self.workers.device,
-            self.config.loss,
+            self._losses,
         )
 
     def _grow(self, fraction: float) -> None:

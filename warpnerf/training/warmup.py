@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, fields
+from itertools import product
 from typing import get_args
 
 import warp as wp
@@ -95,14 +96,14 @@ def warm_up(
     first = next(iter(configs), None)
     wanted: dict[wp.Module, tuple[str, wp.Kernel]] = {}
     for config in configs:
-        model, losses = config.model, config.loss
+        model = config.model
         # What is compiled for the first model as well needs no name of its own.
         of_model = "" if first is None or model == first.model else f", {_options_of(model)}"
         for contraction in _contractions(config):
             for kernel in rendering_kernels(model, contraction, workers.device):
                 words = _words(kernel, contraction) + of_model
                 wanted.setdefault(kernel.module, (words, kernel))
-            for scaling in get_args(Scaling):
+            for scaling, losses in product(get_args(Scaling), _losses(config, contraction)):
                 for kernel in training_kernels(
                     model, contraction, scaling, config.jacobian, workers.device, losses
                 ):
@@ -123,6 +124,13 @@ def _contractions(config: TrainConfig) -> tuple[Contraction, ...]:
     """Those of a configuration; "auto" is none for bounded scenes, and linf or ndc for others."""
     chosen = config.grid.contraction
     return ("none", "linf", "ndc") if chosen == "auto" else (chosen,)
+
+
+def _losses(config: TrainConfig, contraction: Contraction) -> list[LossConfig]:
+    """Those that there may be in such a space; "auto" folds none where photographs have alpha."""
+    folded = config.grid.contraction == "auto" and contraction != "none"
+    alphas = [False] if folded else [False, True]
+    return list(dict.fromkeys(config.loss.decided(has_alpha) for has_alpha in alphas))
 
 
 def _options_of(model: Model) -> str:
