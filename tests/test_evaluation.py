@@ -194,6 +194,7 @@ def test_progress_is_told_view_by_view() -> None:
         "all",
         on_progress=lambda done, words: told.append((done, words)),
     )
+    assert told.pop() == (1.0, "what is near the cameras")
     n = len(told)
     assert n > 1
-    assert told == [(k / n, f"view {k} of {n}") for k in range(1, n + 1)]
+    assert told == [(k / (n + 1), f"view {k} of {n}") for k in range(1, n + 1)]

@@ -102,6 +102,14 @@ def test_training_launch_against_autograd(model: Model, kernels64: Kernels) -> N
         assert_layers_close(model, weights, expected[2], 1e-9)
 
 
+@pytest.mark.parametrize("model", [DEFERRED_SMALL, FEATURES_SMALL], ids=name_of)
+def test_weights_get_the_gradient_of_many_rays(model: Model, kernels64: Kernels) -> None:
+    """More than a warp of CUDA, whose threads add up among themselves where all of them can."""
+    p = problem_of(model, 3, n_rays=80)
+    expected = oracle_train_both(p, "clamped")[2]
+    assert_layers_close(model, kernels64.both_train(p, "clamped")[2], expected, 1e-9)
+
+
 def test_the_threshold_leaves_samples_out(kernels64: Kernels) -> None:
     """Some, not all: then rays would have no colour."""
     p = problem_of(FEATURES, 2)

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import pytest
 import warp as wp
 
+from warpnerf.checks import InputError
 from warpnerf.runtime import kernel_cache
 from warpnerf.runtime.kernel_cache import SUMS, DamagedKernelError, _seal, _verify
 
@@ -87,6 +88,8 @@ class Module:
         self.folder.mkdir(exist_ok=True)
         (self.folder / "a.cpu0.o").write_text("compiled")
 
+    def unload(self) -> None: ...
+
 
 def test_compiling_is_announced_once_and_reading_is_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -110,7 +113,7 @@ def test_nothing_is_compiled_on_a_full_disk(
     kernel_cache.start()
     cpu = wp.get_device("cpu")
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
-    full = SimpleNamespace(free=kernel_cache.ROOM - 1)
+    full = SimpleNamespace(total=1 << 40, free=kernel_cache.ROOM - 1)
     (tmp_path / "cached").mkdir()
     (tmp_path / "cached" / "a.cpu0.o").write_text("compiled")
     monkeypatch.setattr(kernel_cache.shutil, "disk_usage", lambda path: full)
@@ -118,6 +121,12 @@ def test_nothing_is_compiled_on_a_full_disk(
     with pytest.raises(OSError, match="No space left"):
         kernel_cache._load(Module(tmp_path / "new"), cpu)
     assert not (tmp_path / "new").exists()
+    monkeypatch.setattr(kernel_cache, "_temporary", None)  # and afterwards what it was
+    with pytest.raises(InputError, match="set WARP_CACHE_PATH"), pytest.warns(RuntimeWarning):
+        kernel_cache.load(SimpleNamespace(module=Module(tmp_path / "new")), cpu)
+    unknown = SimpleNamespace(total=0, free=0)
+    monkeypatch.setattr(kernel_cache.shutil, "disk_usage", lambda path: unknown)
+    kernel_cache._load(Module(tmp_path / "new"), cpu)
 
 
 def test_one_thread_loads_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:

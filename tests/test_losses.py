@@ -248,18 +248,27 @@ def test_photographs_with_alpha_need_not_be_opaque() -> None:
     assert scene.has_alpha
     with pytest.raises(InputError, match=r"loss\.opacity is above 0, but photographs of .* alpha"):
         Trainer(scene, config_of(LOSSES["opacity"]))
+    mostly_opaque = replace(scene, unbounded=True)
+    for losses in (LOSSES["opacity"], LossConfig(opacity="auto")):
+        Trainer(mostly_opaque, config_of(losses, background="auto"))
 
 
-def test_opacity_by_auto_is_that_of_photographs_without_alpha() -> None:
-    auto = LossConfig(opacity="auto")
-    for scene, weight in ((ball(), 0.0), (flat_scene(), 1e-3)):
+def test_opacity_by_auto_is_that_of_photographs_that_show_something_everywhere() -> None:
+    auto, black = LossConfig(opacity="auto"), {"background": "black"}
+    for scene, changes, weight in (
+        (ball(), {"background": "auto"}, 0.0),
+        (flat_scene(), {"background": "auto"}, 1e-3),
+        (flat_scene(), black, 0.0),
+    ):
         found, given = (
-            train(scene, config_of(losses)).field.grid.values.numpy()
+            train(scene, config_of(losses, **changes)).field.grid.values.numpy()
             for losses in (auto, LossConfig(opacity=weight))
         )
         assert np.array_equal(found, given)
     with pytest.raises(InputError, match=r"loss\.opacity must be auto or a number, not 'much'"):
         LossConfig(opacity="much")  # type: ignore[arg-type]
+    with pytest.raises((InputError, TypeError)):
+        LossConfig(entropy="auto")  # type: ignore[arg-type]
 
 
 def flat_scene() -> Scene:

@@ -70,7 +70,7 @@ def test_warm_up_covers_the_presets_and_is_done_once(presets: tuple[str, ...], d
     names = [kernel.name for kernel in first]
     assert len(set(names)) == len(names)
     for scaling in ("none", "quadratic", "clamped"):
-        assert f"render train, scaling {scaling}, distortion, entropy" in names  # with alpha
+        assert f"render train, scaling {scaling}, distortion, entropy" in names  # objects
         for space in ("", ", space folded in", ", in NDC"):
             kinds = "distortion, entropy, opacity"
             assert f"render train{space}, scaling {scaling}, {kinds}" in names
@@ -94,7 +94,7 @@ def test_unless_told_the_presets_are_compiled(monkeypatch: pytest.MonkeyPatch) -
     warm_up("cpu")
     where = Workers("cpu", 1).device
     for config in (PRESETS[name] for name in EVERYDAY):
-        for space, has_alpha in (("ndc", False), ("none", False), ("none", True)):
-            losses = config.loss.decided(has_alpha)
+        for space, kind in (("ndc", "unbounded"), ("none", "bounded"), ("none", "object")):
+            losses = config.losses_for(kind)
             for kernel in training_kernels(config.model, space, "clamped", "none", where, losses):
                 assert kernel.module in loaded

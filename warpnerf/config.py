@@ -262,7 +262,8 @@ class LossConfig:
     """Weight of the entropy of the remaining light: a ray ends in matter, or meets none."""
     opacity: float | Literal["auto"] = 0.0
     """Weight of -log of the opacity of rays: each ends in matter. For photographs without alpha,
-    whose pixels all show something; auto: 0.001 for these, 0 where photographs have alpha."""
+    whose pixels all show something; auto: 0.001, but 0 for objects with alpha, and where a
+    background is given (``TrainConfig.losses_for``)."""
     sample_colour: float = 0.0
     """Weight of the squared errors of the colours of single samples. For models that have such:
     all but deferred."""
@@ -280,7 +281,7 @@ class LossConfig:
         if isinstance(self.opacity, str) and self.opacity != "auto":
             raise InputError(f"loss.opacity must be auto or a number, not {self.opacity!r}.")
         for name in (*WEIGHTS_OF_LOSSES, "near_clip_distance"):
-            if getattr(self, name) != "auto":
+            if name != "opacity" or self.opacity != "auto":
                 require_at_least(f"loss.{name}", getattr(self, name), 0.0)
         if self.photometric != "huber" and self.huber_delta != HUBER_DELTA:
             raise InputError(
@@ -297,16 +298,6 @@ class LossConfig:
                 "loss.near_clip needs loss.near_clip_distance, the distance up to which raw "
                 "densities are pushed down; give both, or leave near_clip at 0."
             )
-
-    def decided(self, has_alpha: bool) -> LossConfig:
-        """These, with numbers for what is auto.
-
-        Args:
-            has_alpha: Whether the photographs have alpha.
-        """
-        if self.opacity != "auto":
-            return self
-        return replace(self, opacity=0.0 if has_alpha else OPACITY)
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -372,6 +363,20 @@ class TrainConfig:
     """Adam, its schedule, and regularisation."""
     loss: LossConfig = field(default_factory=LossConfig)
     """What is minimised."""
+
+    def losses_for(self, kind: SceneKind) -> LossConfig:
+        """``loss``, decided for a kind of scene.
+
+        Args:
+            kind: object, bounded or unbounded.
+
+        Returns:
+            The same, with a number for what is auto.
+        """
+        if self.loss.opacity != "auto":
+            return self.loss
+        all_show_something = kind != "object" and self.background == "auto"
+        return replace(self.loss, opacity=OPACITY if all_show_something else 0.0)
 
     def __post_init__(self) -> None:
         """Refuse what cannot be trained with."""

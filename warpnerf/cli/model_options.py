@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import fields, replace
-from types import UnionType
+from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from warpnerf.checks import InputError, require_one_of
@@ -67,7 +67,7 @@ def _parsed(flag: str, field: str, text: str, kind: Any) -> Any:
     """A value of a type or of one of several; the configuration looks at words."""
     parts = get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
     words = [word for part in parts if get_origin(part) is Literal for word in get_args(part)]
-    numbers = [part for part in parts if get_origin(part) is not Literal]
+    numbers = [p for p in parts if get_origin(p) is not Literal and p is not NoneType]
     if text in words or not numbers:
         return text
     (number,) = numbers

@@ -19,6 +19,7 @@ from warpnerf.cli.progress import ProgressBar
 from warpnerf.cli.view import PageOptions, training_page
 from warpnerf.config import Scaling, TrainConfig
 from warpnerf.presets import PRESETS
+from warpnerf.runtime.memory import require_threads
 from warpnerf.runtime.signals import Stopped, StopRequest
 from warpnerf.training import lock
 
@@ -291,10 +292,12 @@ def _require_machine(config: TrainConfig) -> None:
     Raises:
         InputError: It has not.
     """
-    if config.device != "cpu" or config.threads is not None:  # else Warp need not be loaded yet
+    if config.threads is not None:
+        require_threads(config.threads)
+    if config.device != "cpu":  # else Warp need not be loaded yet
         from warpnerf.runtime.parallel import Workers
 
-        Workers(config.device, config.threads)
+        Workers(config.device)
 
 
 def _read(

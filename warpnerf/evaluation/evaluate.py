@@ -142,7 +142,7 @@ def evaluate(
         on_image: Called with each view, its truth [H, W, 3] in [0, 1] over the field's background,
             and its rendering.
         lpips: A ``warpnerf.evaluation.lpips.Lpips``, if LPIPS is wanted.
-        on_progress: Called with the share of the views that is done, in (0, 1], and in words.
+        on_progress: Called with the share that is done, in (0, 1], and what was last, in words.
 
     Returns:
         Figures of each image and their means, and what hangs in front of the training cameras.
@@ -177,8 +177,10 @@ def evaluate(
         )
         if on_image is not None:
             on_image(view, target, rendering)
-        on_progress(number / len(views), f"view {number} of {len(views)}")
-    return Evaluation(images=tuple(images), near_field=measure_near_field(field, scene))
+        on_progress(number / (len(views) + 1), f"view {number} of {len(views)}")
+    near_field = measure_near_field(field, scene)
+    on_progress(1.0, "what is near the cameras")
+    return Evaluation(images=tuple(images), near_field=near_field)
 
 
 def require_measurable(scene: Scene, split: str) -> None:

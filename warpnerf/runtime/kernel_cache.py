@@ -101,9 +101,13 @@ def load(kernel: wp.Kernel, device: wp.Device) -> None:
             mistaken = type(error).__name__.startswith("WarpCodegen")  # the kernel, not the cache
             if mistaken or _temporary is not None:
                 raise
+            cache = wp.config.kernel_cache_dir
             _leave_cache(error)
             kernel.module.unload()  # forgets that it failed
-            _load(kernel.module, device)
+            try:
+                _load(kernel.module, device)
+            except OSError as again:
+                raise _nowhere(cache, error, again) from None
 
 
 def _load(module: wp.Module, device: wp.Device) -> None:
@@ -119,7 +123,10 @@ def _load(module: wp.Module, device: wp.Device) -> None:
 
 def _require_room(cache: Path) -> None:
     """Raise OSError on a full disk: the compiler would end the process."""
-    if cache.is_dir() and shutil.disk_usage(cache).free < ROOM:
+    if not cache.is_dir():
+        return
+    disk = shutil.disk_usage(cache)
+    if disk.total and disk.free < ROOM:  # some network's disks know neither
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(cache))
 
 
@@ -154,10 +161,7 @@ def _leave_cache(error: Exception) -> None:
     try:
         _temporary = Path(tempfile.mkdtemp(prefix="warpnerf-kernels-"))
     except OSError as again:
-        raise InputError(
-            f"kernels cannot be compiled: the cache {cache} cannot be used ({error}), nor a "
-            f"temporary folder ({again}); set WARP_CACHE_PATH to a folder that can be written."
-        ) from None
+        raise _nowhere(cache, error, again) from None
     atexit.register(shutil.rmtree, _temporary, ignore_errors=True)
     wp.config.kernel_cache_dir = str(_temporary)
     warnings.warn(
@@ -166,6 +170,13 @@ def _leave_cache(error: Exception) -> None:
         "damaged in it, or set WARP_CACHE_PATH to another folder",
         RuntimeWarning,
         stacklevel=2,
+    )
+
+
+def _nowhere(cache: str, error: Exception, again: OSError) -> InputError:
+    return InputError(
+        f"kernels cannot be compiled: the cache {cache} cannot be used ({error}), nor a temporary "
+        f"folder ({again}); set WARP_CACHE_PATH to a folder that can be written."
     )
 
 

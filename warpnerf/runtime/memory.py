@@ -8,6 +8,10 @@ import mmap
 import os
 from pathlib import Path
 
+from warpnerf.checks import InputError, require_whole
+
+MOST_PER_CORE = 16
+"""Threads for each core. More than one gain nothing, but are there to try out another machine's."""
 CONTAINER_LIMITS = (
     Path("/sys/fs/cgroup/memory.max"),
     Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"),
@@ -123,6 +127,16 @@ def usable_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         cores = len(os.sched_getaffinity(0))
     return max(1, min([cores, *(share for share in map(_share, CORE_LIMITS) if share is not None)]))
+
+
+def require_threads(threads: int) -> None:
+    """Raise InputError unless so many threads can share this machine's cores."""
+    require_whole("threads", threads, 1)
+    if threads > MOST_PER_CORE * (cores := usable_cores()):
+        raise InputError(
+            f"threads must be at most {MOST_PER_CORE * cores} on {cores} usable cores, not "
+            f"{threads}: they wait for each other awake; use {cores}."
+        )
 
 
 def _share(files: tuple[Path, ...]) -> int | None:

@@ -17,18 +17,14 @@ from typing import Any
 import warp as wp
 from warpnerf_kernels.cpu import barrier
 
-from warpnerf.checks import InputError, require_whole
+from warpnerf.checks import InputError
 from warpnerf.runtime import kernel_cache
-from warpnerf.runtime.memory import usable_cores
+from warpnerf.runtime.memory import require_threads, usable_cores
 
 NODES = 1 << 20
 RAYS = 1 << 13
 """Items per launch on the CPU, of little and of much work each: a fraction of a second, because
 signals such as Ctrl-C wait for a launch to end."""
-
-
-MOST_PER_CORE = 16
-"""Threads for each core. More than one gain nothing, but are there to try out another machine's."""
 
 
 class LaunchCache:
@@ -119,12 +115,7 @@ class Workers:
             InputError: The device does not exist on this machine.
         """
         if threads is not None:
-            require_whole("threads", threads, 1)
-            if threads > MOST_PER_CORE * (cores := usable_cores()):
-                raise InputError(
-                    f"threads must be at most {MOST_PER_CORE * cores} on {cores} usable cores, not "
-                    f"{threads}: they wait for each other awake; use {cores}."
-                )
+            require_threads(threads)
         kernel_cache.start()
         try:
             if device.startswith("cuda") and not wp.is_cuda_available():

@@ -251,8 +251,8 @@ class Run:
         """Measure a split, and write metrics.json, its pictures, and a sheet of a few of them.
 
         All show depths in the same colours, over the range of the true depths where they are known
-        for all views, else of what their cameras see. `on_progress` is called with the share of
-        the views that is done, in (0, 1], and in words.
+        for all views, else of what their cameras see. `on_progress` is called with the share
+        that is done, in (0, 1], and what was last, in words.
 
         Raises:
             InputError: They cannot be written.

@@ -92,8 +92,8 @@ class Trainer:
                 )
         self.content_distances = distances
         """Of the training views, scene units."""
-        self._losses = config.loss.decided(scene.has_alpha)
-        if scene.has_alpha and self._losses.opacity != 0.0:
+        self._losses = config.losses_for(scene.kind)
+        if scene.kind == "object" and self._losses.opacity != 0.0:
             raise InputError(
                 f"loss.opacity is above 0, but photographs of {scene.name} have alpha, and where "
                 "they show nothing, nothing should be; set it to 0 or auto."

@@ -15,7 +15,14 @@ from warpnerf_kernels.optim import adam, total_variation
 from warpnerf_kernels.sampling import coverage, occupancy
 from warpnerf_kernels.space import camera
 
-from warpnerf.config import Contraction, Jacobian, LossConfig, Scaling, TrainConfig
+from warpnerf.config import (
+    Contraction,
+    Jacobian,
+    LossConfig,
+    Scaling,
+    SceneKind,
+    TrainConfig,
+)
 from warpnerf.model.interface import Model
 from warpnerf.presets import EVERYDAY, PRESETS
 from warpnerf.rendering.losses import PLAIN
@@ -127,10 +134,9 @@ def _contractions(config: TrainConfig) -> tuple[Contraction, ...]:
 
 
 def _losses(config: TrainConfig, contraction: Contraction) -> list[LossConfig]:
-    """Those that there may be in such a space; "auto" folds none where photographs have alpha."""
-    folded = config.grid.contraction == "auto" and contraction != "none"
-    alphas = [False] if folded else [False, True]
-    return list(dict.fromkeys(config.loss.decided(has_alpha) for has_alpha in alphas))
+    """Those of the kinds of scenes that there are in such a space."""
+    kinds: list[SceneKind] = ["object", "bounded"] if contraction == "none" else ["unbounded"]
+    return list(dict.fromkeys(config.losses_for(kind) for kind in kinds))
 
 
 def _options_of(model: Model) -> str:

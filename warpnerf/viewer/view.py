@@ -107,5 +107,6 @@ def _scene_of(config: RunConfig, moved: str | None) -> Scene | None:
     except InputError as error:
         if moved is not None:
             raise
-        print(f"note: shown without its photographs: {error}", flush=True)
+        hint = "" if "--scene" in str(error) else " Name them by --scene."
+        print(f"note: shown without its photographs: {error}{hint}", flush=True)
         return None

@@ -40,7 +40,9 @@ ADD_WEIGHT = r"""
 // So a warp whose threads are all here, for the same weight, adds up among themselves first.
 const unsigned everyone = 0xffffffffu;
 int same = 0;
+#if __CUDA_ARCH__ >= 700  // older ones cannot tell
 if (__activemask() == everyone) __match_all_sync(everyone, i, &same);
+#endif
 if (same) {
     for (int apart = 16; apart > 0; apart /= 2) value += __shfl_xor_sync(everyone, value, apart);
     if ((threadIdx.x & 31) == 0) atomicAdd(&to.data[i], value);
