@@ -267,8 +267,9 @@ def test_opacity_by_auto_is_that_of_photographs_that_show_something_everywhere()
         assert np.array_equal(found, given)
     with pytest.raises(InputError, match=r"loss\.opacity must be auto or a number, not 'much'"):
         LossConfig(opacity="much")  # type: ignore[arg-type]
-    with pytest.raises((InputError, TypeError)):
-        LossConfig(entropy="auto")  # type: ignore[arg-type]
+    for name in ("entropy", "near_clip"):
+        with pytest.raises(InputError, match=f"loss.{name} must be a finite number of at least 0"):
+            LossConfig(**{name: "auto"})  # type: ignore[arg-type]
 
 
 def flat_scene() -> Scene:

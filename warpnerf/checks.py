@@ -36,15 +36,22 @@ def way_out(error: OSError) -> str:
     return "check that it exists and may be used"
 
 
+def _is_finite(value: object) -> bool:
+    try:
+        return math.isfinite(value)  # type: ignore[arg-type]
+    except TypeError:  # no number
+        return False
+
+
 def require_positive(field: str, value: float) -> None:
     """Raise InputError unless value is a finite number above zero; NaN is refused as well."""
-    if not (value > 0 and math.isfinite(value)):
+    if not (_is_finite(value) and value > 0):
         raise InputError(f"{field} must be a finite number above 0, not {value}.")
 
 
 def require_at_least(field: str, value: float, least: float) -> None:
     """Raise InputError unless value is a finite number of at least `least`."""
-    if not (value >= least and math.isfinite(value)):
+    if not (_is_finite(value) and value >= least):
         raise InputError(f"{field} must be a finite number of at least {least:g}, not {value}.")
 
 

@@ -80,7 +80,7 @@ def train_command(
         model_options: Of the model, such as specular=8 width=64 (deferred), features=12
             residual=false threshold=0.0001 (features), degree=2 (sh).
         loss: What is minimised besides, and how: photometric=huber huber_delta=0.1, and weights of
-            distortion=0.01, entropy=0.001, opacity=0.001 (auto: not for photographs with alpha),
+            distortion=0.01, entropy=0.001, opacity=0.001 (auto: not for objects with alpha),
             sample_colour=0.1 (not for deferred), near_clip=0.01 near_clip_distance=0.2.
         steps: Batches of rays to train on; by default as many as the preset says, or as the time
             limit allows.

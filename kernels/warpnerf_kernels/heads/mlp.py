@@ -160,7 +160,7 @@ def mlp(layout: Layout) -> Mlp:
     Activations = vector(units)
 
     # Loops run to a number that compilers do not know, else they write them out: Warp up to 16, and
-    # CUDA's compiler whole layers, as a megabyte of code that takes a minute to compile.
+    # CUDA's compiler whole layers, which takes it many times as long and is slower as well.
 
     @wp.func
     def first(weights: Weights) -> Units:
