@@ -140,10 +140,7 @@ l = clamp(truncate(uz), grid.size.c[2] - 1);
 int node_ahead[LANES];  // in memory, as lanes are needed one by one
 *(ivec_at*)node_ahead = index(i, j, l);
 // Wide nodes are many cache lines, so only where the next pack begins right behind this one.
-if (FLOATS == 4 || bits(visited) >> (LANES - 1)) {
-    // Lanes share cells and cache lines with their neighbours: every other one does.
-    for (int n = 0; n < LANES; n += 2) fetch(grid.values.data + node_ahead[n], grid.size);
-}
+const bool goes_on = FLOATS == 4 || bits(visited) >> (LANES - 1);
 
 const float* values = (const float*)grid.values.data;
 const size_t stride_y = FLOATS * (size_t)grid.size.c[2], stride_x = stride_y * grid.size.c[1];
@@ -153,6 +150,8 @@ node_vec raw[LANES];
 #pragma clang loop unroll(full)
 for (int n = 0; n < LANES; ++n) {
     raw[n] = 0.0f;
+    // Lane by lane: all at once, requests would hold up what this pack has to read.
+    if (goes_on) fetch(grid.values.data + node_ahead[n], grid.size);
     if (!(wanted >> n & 1)) continue;
     // A column's two nodes lie side by side: one vector holds both.
     auto column = [&](const float* node) -> pair_vec { return *(const pair_at*)node; };
@@ -204,10 +203,12 @@ auto first_node = [&](int owner) -> int { return least(owner * n_planes, size.c[
 auto owned = [&](int owner, ivec node) -> unsigned {
     return bits((first_node(owner) <= node) & (node < first_node(owner + 1)));
 };
+// Asks for what add_own will add to for a lane of some samples.
 auto fetch_own = [&](const auto& samples, unsigned visited) {
-    each(owned(worker, load_int(samples.base)) & visited, [&](int n) {
-        fetch(values + samples.base.c[n], size);
-    });
+    const unsigned own = owned(worker, load_int(samples.base)) & visited;
+    return [&, own](int n) {
+        if (own >> n & 1) fetch(values + samples.base.c[n], size);
+    };
 };
 // Give a column's two nodes their shares of what a sample has for both.
 auto add_column = [&](int node, float share, pair_vec both) {
@@ -215,8 +216,10 @@ auto add_column = [&](int node, float share, pair_vec both) {
     *pair = fma(pair_vec(share), both, pair_vec(*pair));
     flags[(unsigned)node / TILE] = 1;  // on the border of two parts by either, with the same 1
 };
-// Add what samples have for the worker's own planes. Returns whether that is all of it.
-auto add_own = [&](const auto& samples, unsigned visited, const auto& shares) -> bool {
+// Add what samples have for the worker's own planes, and do something else for each lane before
+// it is added, which memory has time for. Returns whether that is all the samples have.
+auto add_own = [&](const auto& samples, unsigned visited, const auto& shares,
+                   auto&& meanwhile) -> bool {
     constexpr int BY_LANE = sizeof(samples.adj_raw) / sizeof(vec);
     quad four[BY_LANE / 4][LANES];
     #pragma clang loop unroll(full)
@@ -248,12 +251,14 @@ auto add_own = [&](const auto& samples, unsigned visited, const auto& shares) ->
     if ((lower & upper) == visited) {
         #pragma clang loop unroll(full)
         for (int n = 0; n < LANES; ++n) {
+            meanwhile(n);
             if (!(visited >> n & 1)) continue;
             add_lower(n);
             add_upper(n);
         }
         return true;
     }
+    for (int n = 0; n < LANES; ++n) meanwhile(n);
     each(lower, add_lower);
     each(upper, add_upper);
     return false;
@@ -267,9 +272,10 @@ auto add_own = [&](const auto& samples, unsigned visited, const auto& shares) ->
     ADD_OWN
     + r"""
 const auto& pack = packs.data[slot];
-fetch_own(packs.data[later], bits(load_int(packs.data[later].visited)));
+const auto& next = packs.data[later];
 const unsigned visited = bits(load_int(pack.visited));
-if (add_own(pack, visited, pack.shares.data)) return;
+const auto fetch_next = fetch_own(next, bits(load_int(next.visited)));
+if (add_own(pack, visited, pack.shares.data, fetch_next)) return;
 const int sent = sink.n_records.data[worker * row]++;
 auto& record = sink.records.data[(size_t)worker * n_packs + sent];
 const ivec base = load_int(pack.base);
@@ -295,7 +301,7 @@ def adj_read_pack(
     grid: Any,
     packs: wp.array(dtype=Any),
     slot: int,
-    later: int,  # slot of a pack that comes soon
+    later: int,  # slot of the pack that comes next
     worker: int,
     sink: Any,  # added to, and what is in it
 ):
@@ -303,7 +309,13 @@ def adj_read_pack(
     ...
 
 
-@wp.func_native(ADD_OWN + "fetch_own(packs.data[slot], bits(load_int(packs.data[slot].visited)));")
+@wp.func_native(
+    ADD_OWN
+    + r"""
+const auto fetch_lane = fetch_own(packs.data[slot], bits(load_int(packs.data[slot].visited)));
+for (int n = 0; n < LANES; ++n) fetch_lane(n);
+"""
+)
 def fetch_pack(grid: Any, packs: wp.array(dtype=Any), slot: int, worker: int, sink: Any):
     """Ask for the nodes that adj_read_pack will add to, where the worker owns them."""
     ...
@@ -321,11 +333,11 @@ const int* which = sink.addressed.data + ((size_t)sender * n_workers + worker) *
 const int n = sink.n_addressed.data[sender * row + worker];
 for (int k = 0; k < n; ++k) {
     if (k + SOON < n) fetch_whole(records[which[k + SOON]]);
-    if (k + 1 < n) fetch_own(records[which[k + 1]], records[which[k + 1]].visited);
     const auto& record = records[which[k]];
+    const auto& next = records[which[k + 1 < n ? k + 1 : k]];
     float shares[4][LANES];
     split(load(record.fraction_x), load(record.fraction_y), shares);
-    add_own(record, record.visited, shares);
+    add_own(record, record.visited, shares, fetch_own(next, next.visited));
 }
 """
 )

@@ -148,32 +148,34 @@ def adam_kernel(n_floats: int) -> wp.Kernel:
         end = start + wp.min(span, n_nodes - start)  # start + span might be beyond int
         last = tile_of(end - 1) + 1
         for group in range(tile_of(start), last, wp.static(GROUP)):
-            tiles = tiles_ahead(gradient.touched, group, last)
-            while tiles != wp.uint64(0):
-                node = (group + wp.static(AHEAD) + first_of(tiles)) * wp.static(TILE)
-                prefetch(gradient.values, node)
-                prefetch(values, node)
-                prefetch(moments, node)
-                tiles = but_first(tiles)
+            # In turns: requests for all tiles at once would hold up what the update has to read.
+            ahead = tiles_ahead(gradient.touched, group, last)
             tiles = touched_tiles(gradient.touched, group, last)
-            while tiles != wp.uint64(0):
-                node = (group + first_of(tiles)) * wp.static(TILE)
-                begin = wp.max(start, node)
-                update_nodes(
-                    begin,
-                    wp.min(end, node + wp.static(TILE)) - begin,
-                    update,
-                    learning_rate,
-                    beta1,
-                    beta2,
-                    epsilon,
-                    correction1,
-                    correction2,
-                    gradient,
-                    values,
-                    moments,
-                )
-                tiles = but_first(tiles)
+            while tiles != wp.uint64(0) or ahead != wp.uint64(0):
+                if ahead != wp.uint64(0):
+                    node = (group + wp.static(AHEAD) + first_of(ahead)) * wp.static(TILE)
+                    prefetch(gradient.values, node)
+                    prefetch(values, node)
+                    prefetch(moments, node)
+                    ahead = but_first(ahead)
+                if tiles != wp.uint64(0):
+                    node = (group + first_of(tiles)) * wp.static(TILE)
+                    begin = wp.max(start, node)
+                    update_nodes(
+                        begin,
+                        wp.min(end, node + wp.static(TILE)) - begin,
+                        update,
+                        learning_rate,
+                        beta1,
+                        beta2,
+                        epsilon,
+                        correction1,
+                        correction2,
+                        gradient,
+                        values,
+                        moments,
+                    )
+                    tiles = but_first(tiles)
 
     return adam_step
 

@@ -185,7 +185,7 @@ def walk_packs(sampler: Sampler, encoding: Encoding, head: Head, losses: Losses)
             rows[row].sample_slope = 2.0 * scene.loss.on_samples * adj_loss_value
         limit = behind_limit(adj_end, adj_channels, adj_depth * far_end, of_loss)
         before = State()
-        short = rows[row].n_samples < 4 * LANES  # else adj_read_pack asks for all but the first two
+        short = rows[row].n_samples < 4 * LANES  # else adj_read_pack asks for all but the first
         transmittance = float(1.0)
         step = int(ray.begin)
         n = int(0)
@@ -214,7 +214,7 @@ def walk_packs(sampler: Sampler, encoding: Encoding, head: Head, losses: Losses)
                     transmittance = packs[slot].passed
                 n_samples += packs[slot].n_samples
                 scale_pack(content_distance, scaling, jacobian, packs, slot)
-                if short and n + slot - first < wp.static(max(n_packs, 2)):
+                if short and n + slot - first < n_packs:
                     fetch_pack(scene.field, packs, slot, worker, sink)
                 if wp.static(has_loss):
                     if not kept:
@@ -232,7 +232,7 @@ def walk_packs(sampler: Sampler, encoding: Encoding, head: Head, losses: Losses)
                 scene.head, rows, row, packs, first, slot - first, worker, sink.gradient
             )
             for k in range(first, slot):
-                later = wp.min(k + 2, end - 1)
+                later = wp.min(k + 1, end - 1)
                 adj_read_pack(scene.field, packs, k, later, worker, sink)
             n += slot - first
         adj_prepare_row(scene.head, rows, row, worker, sink.gradient)
