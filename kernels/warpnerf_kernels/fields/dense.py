@@ -324,15 +324,10 @@ def fetch_pack(grid: Any, packs: wp.array(dtype=Any), slot: int, worker: int, si
 @wp.func_native(
     ADD_OWN
     + r"""
-constexpr int SOON = 4;  // records from the one that is added to the one that is asked for
-auto fetch_whole = [&](const auto& x) {
-    for (size_t at = 0; at < sizeof(x); at += 64) __builtin_prefetch((const char*)&x + at);
-};
 const auto* records = sink.records.data + (size_t)sender * n_packs;
 const int* which = sink.addressed.data + ((size_t)sender * n_workers + worker) * n_packs;
 const int n = sink.n_addressed.data[sender * row + worker];
 for (int k = 0; k < n; ++k) {
-    if (k + SOON < n) fetch_whole(records[which[k + SOON]]);
     const auto& record = records[which[k]];
     const auto& next = records[which[k + 1 < n ? k + 1 : k]];
     float shares[4][LANES];
