@@ -18,11 +18,11 @@ from warpnerf_kernels.launch import assembly
 from warpnerf.model.interface import Model, n_weights
 from warpnerf.runtime.parallel import LaunchCache, Workers
 
-SAMPLES = 1 << 21
+SAMPLES = 1 << 24
 """Steps, in whole packs, whose gradients may be in records at a time where nodes hold four numbers,
-of all workers together: room for 68 MB, and half a megabyte more for each worker, of which what is
-used takes memory. Where nodes hold more, so do records, and there are as many fewer. Rays that
-might have more take turns, so records grow with neither rays nor samples."""
+of all workers together: room for 540 MB, and 4 MB more for each worker, of which what is used takes
+memory; most samples leave no record. Where nodes hold more, so do records, and there are as many
+fewer. Rays that might have more take turns, at the end of which workers wait for each other."""
 
 ALONE = 1 << 24
 """Steps, in whole packs, that one worker makes at a time: signals wait for that, up to a second."""
