@@ -20,9 +20,10 @@ from warpnerf.runtime.parallel import LaunchCache, Workers
 
 SAMPLES = 1 << 24
 """Steps, in whole packs, whose gradients may be in records at a time where nodes hold four numbers,
-of all workers together: room for 540 MB, and 4 MB more for each worker, of which what is used takes
-memory; most samples leave no record. Where nodes hold more, so do records, and there are as many
-fewer. Rays that might have more take turns, at the end of which workers wait for each other."""
+of all workers together: room for 540 MB, or up to 720 where values lie sample by sample, and 4 MB
+more for each worker. Only what is used takes memory, and most samples leave no record. Where nodes
+hold more, so do records, and there are as many fewer. Rays that might have more take turns, at the
+end of which workers wait for each other; signals wait for a turn."""
 
 ALONE = 1 << 24
 """Steps, in whole packs, that one worker makes at a time: signals wait for that, up to a second."""
@@ -119,11 +120,13 @@ class AdjointLaunch:
             count = min(workers.count, max(1, samples // (2 * most_work)))
             if count < workers.count:
                 self._workers = Workers("cpu", count)
-            room = samples // count if count > 1 else 0
+            # A batch has no more than this, and each worker may get a ray more than its share.
+            all_work = -(-n_rays * most_work // count) + most_work
+            room = min(samples // count, all_work) if count > 1 else 0
             self.sink = _make_sink(variant, room // LANES, count)
             chunk = _make_chunk(n_rays, count)
             chunk.barrier = self._workers.barrier
-            # One worker leaves no records. Of several, each may get a ray more than its share.
+            # One worker leaves no records.
             chunk.most_work = count * (room - most_work) if count > 1 else ALONE
             self.sink.chunk = chunk
         elif not workers.device.is_cuda:
