@@ -231,19 +231,6 @@ def test_there_is_room_for_all_records(monkeypatch: pytest.MonkeyPatch) -> None:
     assert 0.9 * room < most <= room
 
 
-@pytest.mark.parametrize("threads", [2, 3])
-def test_a_small_batch_takes_little_room(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Not what the largest may take; all of it goes through at once."""
-    p = problem(1)
-    launches = launches_of(monkeypatch)
-    of(threads).backward(p)
-    made = launches[0].sink
-    assert made is not None
-    most = most_steps(p) + LANES + schedule.RAY
-    assert made.records.shape[1] * LANES <= p.n_rays * most / threads + most + 1
-    assert made.chunk.most_work >= p.n_rays * most
-
-
 def test_nothing_is_left_where_each_takes_its_own_rays(monkeypatch: pytest.MonkeyPatch) -> None:
     """Those of the second worker's part come first."""
     n = 20

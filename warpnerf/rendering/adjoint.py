@@ -120,13 +120,11 @@ class AdjointLaunch:
             count = min(workers.count, max(1, samples // (2 * most_work)))
             if count < workers.count:
                 self._workers = Workers("cpu", count)
-            # A batch has no more than this, and each worker may get a ray more than its share.
-            all_work = -(-n_rays * most_work // count) + most_work
-            room = min(samples // count, all_work) if count > 1 else 0
+            room = samples // count if count > 1 else 0
             self.sink = _make_sink(variant, room // LANES, count)
             chunk = _make_chunk(n_rays, count)
             chunk.barrier = self._workers.barrier
-            # One worker leaves no records.
+            # One worker leaves no records. Of several, each may get a ray more than its share.
             chunk.most_work = count * (room - most_work) if count > 1 else ALONE
             self.sink.chunk = chunk
         elif not workers.device.is_cuda:
