@@ -213,18 +213,21 @@ def total_variation_backward_kernel(n_floats: int) -> wp.Kernel:
         stride_y = size[2]
         stride_x = size[1] * size[2]
         for group in range(tile_of(start), last, wp.static(GROUP)):
-            tiles = tiles_ahead(gradient.touched, group, last)
-            while tiles != wp.uint64(0):
-                node = (group + wp.static(AHEAD) + first_of(tiles)) * wp.static(TILE)
-                prefetch(gradient.values, node)
-                prefetch(values, node)
-                prefetch(values, node - stride_y)
-                prefetch(values, node + stride_y)
-                prefetch(values, node - stride_x)
-                prefetch(values, node + stride_x)
-                tiles = but_first(tiles)
+            # In turns, as in adam_step.
+            ahead = tiles_ahead(gradient.touched, group, last)
             tiles = touched_tiles(gradient.touched, group, last)
-            while tiles != wp.uint64(0):
+            while tiles != wp.uint64(0) or ahead != wp.uint64(0):
+                if ahead != wp.uint64(0):
+                    node = (group + wp.static(AHEAD) + first_of(ahead)) * wp.static(TILE)
+                    prefetch(gradient.values, node)
+                    prefetch(values, node)
+                    prefetch(values, node - stride_y)
+                    prefetch(values, node + stride_y)
+                    prefetch(values, node - stride_x)
+                    prefetch(values, node + stride_x)
+                    ahead = but_first(ahead)
+                if tiles == wp.uint64(0):
+                    continue
                 node = (group + first_of(tiles)) * wp.static(TILE)
                 first_node = wp.max(start, node)
                 end_node = wp.min(end, node + wp.static(TILE))
