@@ -239,7 +239,7 @@ def empty_model(model: Path) -> None:
         (field_of_view, "camera 7: the lens FOV is not modelled; undistort"),
         (other_camera, "its camera 8 is not in cameras.txt"),
         (no_photographs, r"none of the model\'s 4 photographs is in .*images .first: 000.png"),
-        (no_folder, "the model's photographs are not there; put them into .*images"),
+        (no_folder, "photographs are not there; put them into (?!.*sparse).*images"),
         (other_size, "is for images of 9x6 pixels, but 000.png has 8x6"),
         (few_parameters, "a PINHOLE has 4 parameters, not 3"),
         (no_number, "line 2: is no camera as COLMAP writes it"),

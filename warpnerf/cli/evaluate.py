@@ -6,14 +6,13 @@ import sys
 from pathlib import Path
 from typing import Literal
 
-import tyro
-
+from warpnerf.cli.arguments import RunFolder
 from warpnerf.cli.machine import require_writable, write_json
 from warpnerf.cli.progress import ProgressBar
 
 
 def eval_command(
-    folder: tyro.conf.Positional[Path],
+    folder: RunFolder,
     /,
     scene: str | None = None,
     masks: Path | None = None,

@@ -9,13 +9,14 @@ from typing import Annotated
 import tyro
 
 from warpnerf.checks import InputError
+from warpnerf.cli.arguments import RunFolder
 from warpnerf.cli.progress import ProgressBar
 
 CORNERS = "X0 Y0 Z0 X1 Y1 Z1"
 
 
 def export_command(
-    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")],
+    folder: RunFolder,
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")],
     /,
     level: float | None = None,

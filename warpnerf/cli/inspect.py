@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import tyro
-
 from warpnerf.checks import InputError, cannot_write, require_at_least
+from warpnerf.cli.arguments import SceneName, Settings
 from warpnerf.cli.machine import require_writable, write_json
 from warpnerf.cli.model_options import chosen_model
 from warpnerf.presets import EVERYDAY, PRESETS
@@ -15,7 +14,7 @@ from warpnerf.runtime.memory import usable_cores
 
 
 def inspect_command(
-    scene: tyro.conf.Positional[str],
+    scene: SceneName,
     /,
     output: Path | None = None,
     json: Path | None = None,
@@ -24,7 +23,7 @@ def inspect_command(
     content_distance: float | None = None,
     near: float = 0.0,
     model: str | None = None,
-    model_options: tuple[str, ...] = (),
+    model_options: Settings = (),
     threads: int | None = None,
 ) -> int:
     """Say what was understood of a scene, what training will take, and what is odd.

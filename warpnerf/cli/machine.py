@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from warpnerf.checks import InputError, cannot_write
+from warpnerf.cli.arguments import Settings
 from warpnerf.cli.model_options import chosen_model
 from warpnerf.presets import EVERYDAY, PRESETS
 
@@ -58,7 +59,7 @@ def check_command(device: str = "cpu", threads: int | None = None, json: Path | 
 
 
 def warmup_command(
-    device: str = "cpu", model: str | None = None, model_options: tuple[str, ...] = ()
+    device: str = "cpu", model: str | None = None, model_options: Settings = ()
 ) -> int:
     """Compile all kernels that training and evaluation with fast and quality need.
 

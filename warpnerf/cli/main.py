@@ -7,12 +7,14 @@ import logging
 import re
 import sys
 import warnings
+from collections.abc import Callable
 from decimal import Decimal
 
 import tyro
 
 from warpnerf import __version__
 from warpnerf.checks import InputError, way_out
+from warpnerf.cli.arguments import registry, with_help
 from warpnerf.cli.demo import demo_command
 from warpnerf.cli.evaluate import eval_command
 from warpnerf.cli.export import export_command
@@ -26,6 +28,19 @@ from warpnerf.runtime.signals import Stopped, raise_when_asked
 from warpnerf.runtime.terminal import UntilClosed
 
 BAD_INPUT = 2
+
+COMMANDS: dict[str, Callable[..., int]] = {
+    "demo": demo_command,
+    "inspect": inspect_command,
+    "pose": pose_command,
+    "train": train_command,
+    "eval": eval_command,
+    "render": render_command,
+    "export": export_command,
+    "view": view_command,
+    "check": check_command,
+    "warmup": warmup_command,
+}
 
 OUT_OF_MEMORY = re.compile("failed to allocate|can't start new thread", re.IGNORECASE)
 """What Warp and the standard library say in a RuntimeError where a MemoryError is meant."""
@@ -90,23 +105,13 @@ def main(arguments: list[str] | None = None) -> int:
         sys.stdout = UntilClosed(sys.stdout)
     try:
         arguments = [_meant(arguments[at - 1], word) for at, word in enumerate(arguments)]
-        return tyro.extras.subcommand_cli_from_dict(
-            {
-                "demo": demo_command,
-                "inspect": inspect_command,
-                "pose": pose_command,
-                "train": train_command,
-                "eval": eval_command,
-                "render": render_command,
-                "export": export_command,
-                "view": view_command,
-                "check": check_command,
-                "warmup": warmup_command,
-            },
-            prog="warpnerf",
-            description="Voxel-grid radiance fields from posed photographs, without floaters.",
-            args=arguments,
-        )
+        with registry:
+            return tyro.extras.subcommand_cli_from_dict(
+                {name: with_help(command) for name, command in COMMANDS.items()},
+                prog="warpnerf",
+                description="Voxel-grid radiance fields from posed photographs, without floaters.",
+                args=arguments,
+            )
     except InputError as error:
         print(f"warpnerf: error: {error}", file=sys.stderr)
         return BAD_INPUT

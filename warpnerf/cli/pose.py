@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
@@ -12,7 +13,7 @@ from warpnerf.sfm.config import CameraModel, Lenses, Mapper, Matching, PoseConfi
 
 
 def pose_command(
-    source: tyro.conf.Positional[Path],
+    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")],
     /,
     output: Path,
     camera_model: CameraModel = "auto",

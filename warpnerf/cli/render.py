@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast, get_args
 import tyro
 
 from warpnerf.checks import InputError, cannot_write, require_positive
+from warpnerf.cli.arguments import RunFolder
 from warpnerf.cli.progress import ProgressBar
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ MAX_FRAMES = 100_000
 
 
 def render_command(
-    folder: tyro.conf.Positional[Path],
+    folder: RunFolder,
     /,
     path: Annotated[str, tyro.conf.arg(metavar="{auto,orbit,through,back}|FILE.json")] = "auto",
     stills: Literal["test", "train", "val", "all"] | None = None,

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from warpnerf.checks import InputError
+from warpnerf.cli.arguments import Settings
 from warpnerf.cli.loss_options import chosen_losses
 from warpnerf.cli.machine import FAILED
 from warpnerf.cli.model_options import chosen_model
@@ -42,8 +43,8 @@ def train_command(
     resume: Path | None = None,
     preset: Literal["fast", "quality", "dvgo", "dvgo-unbounded", "dvgo-llff"] | None = None,
     model: str | None = None,
-    model_options: tuple[str, ...] = (),
-    loss: tuple[str, ...] = (),
+    model_options: Settings = (),
+    loss: Settings = (),
     steps: int | None = None,
     time_limit: float | None = None,
     scaling: Scaling | None = None,

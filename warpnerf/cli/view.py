@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from warpnerf.checks import InputError, require_extra
+from warpnerf.cli.arguments import RunFolder
 
 if TYPE_CHECKING:
     from warpnerf.scenes.scene import Scene
@@ -20,7 +21,7 @@ HOST = "127.0.0.1"
 
 
 def view_command(
-    folder: tyro.conf.Positional[Path],
+    folder: RunFolder,
     other: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[OTHER]")] = None,
     /,
     scene: str | None = None,

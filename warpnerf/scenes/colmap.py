@@ -115,12 +115,17 @@ def model_kind(folder: Path) -> str | None:
 
 
 def scene_folder(model: Path) -> Path:
-    """The scene's folder that a model's folder belongs to: the one that holds the photographs."""
+    """The scene's folder that a model's folder belongs to: the one that holds the photographs.
+
+    Where there are none, the one that they should be in.
+    """
     model = model.resolve()
-    for folder in (model, *list(model.parents)[:3]):
+    folders = (model, *list(model.parents)[:3])
+    for folder in folders:
         if photograph_folder(folder) is not None:
             return folder
-    return model
+    names = ("colmap", "sparse", "0")  # of folders in a scene's that lead to its model
+    return next((folder for folder in folders if folder.name not in names), model)
 
 
 def load_colmap(

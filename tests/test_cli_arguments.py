@@ -1,0 +1,102 @@
+"""What the command line says of its options, and how it reads their words."""
+
+import inspect
+from typing import Annotated, Any, Literal
+
+import pytest
+import tyro
+
+from warpnerf.cli.arguments import registry, with_help
+from warpnerf.cli.main import COMMANDS, main
+
+
+def command(
+    steps: int | None = None,
+    far: float | None = None,
+    distance: float | Literal["auto"] | None = None,
+    how: Literal["fast", "slow"] | None = None,
+    size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="WIDTH HEIGHT")] = None,
+    name: str = "fox",
+    plain: bool = False,
+) -> Any:
+    """Do something.
+
+    Args:
+        steps: As many as there are, or
+            as time allows.
+        far: How far: in metres.
+        distance: Of something.
+        how: One way or the other.
+        size: Pixels.
+        name: Of it.
+        plain: Whether.
+
+    Returns:
+        All of it.
+    """
+    return steps, far, distance, how, size, name, plain
+
+
+def run(*words: str) -> Any:
+    with registry:
+        return tyro.cli(with_help(command), args=list(words))
+
+
+def refused(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    with pytest.raises(SystemExit) as stop:
+        run(*words)
+    assert stop.value.code == 2
+    return " ".join(capsys.readouterr().err.split())
+
+
+WORDS = "--steps=3 --far=1e3 --distance=2 --how=slow --size 4 5"
+
+
+def test_words_become_values() -> None:
+    assert run() == (None, None, None, None, None, "fox", False)
+    given = run(
+        *["--steps", "3", "--far", "1e3", "--distance", "2", "--how", "slow", "--size", "4", "5"]
+    )
+    assert given == (3, 1000.0, 2.0, "slow", (4, 5), "fox", False)
+    given = run("--distance", "auto", "--name", "None", "--plain")
+    assert given == (None, None, "auto", None, None, "None", True)
+
+
+@pytest.mark.parametrize(
+    "words, sentence",
+    [
+        (("--steps", "many"), "--steps: must be a whole number, not 'many'."),
+        (("--steps", "1.5"), "--steps: must be a whole number, not '1.5'."),
+        (("--far", "near"), "--far: must be a number, not 'near'."),
+        (("--distance", "none"), "--distance: must be FLOAT|{auto}, not 'none'."),
+        (("--how", "None"), "invalid choice 'None' for argument '--how'"),
+    ],
+)
+def test_a_word_that_is_no_value(
+    words: tuple[str, ...], sentence: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert sentence in refused(capsys, *words)
+
+
+def test_help_is_what_the_docstring_says(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        run("--help")
+    text = " ".join(capsys.readouterr().out.split())
+    assert "--steps INT As many as there are, or as time allows. --far" in text
+    assert "--far FLOAT How far: in metres. --distance FLOAT|{auto} Of something." in text
+    assert "--how {fast,slow} One way or the other. --size WIDTH HEIGHT Pixels." in text
+    assert "--name STR Of it. (default: fox)" in text
+    assert text.endswith("--plain, --no-plain Whether.")
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_all_options_have_help(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main([name, "--help"])
+    assert stop.value.code == 0
+    text = capsys.readouterr().out
+    assert "None" not in text
+    shown = inspect.signature(with_help(COMMANDS[name])).parameters
+    for parameter in shown.values():
+        told = [how for how in parameter.annotation.__metadata__ if getattr(how, "help", None)]
+        assert told, parameter.name
