@@ -102,16 +102,20 @@ def test_crop_and_size_drop_what_they_say() -> None:
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ({"level": 1e9}, "its density there is .* to 400 per scene unit"),
-        ({"level": 1e300}, "its density there is .* to 400 per scene unit"),
-        ({"level": 1e-310}, "its density there is .* to 400 per scene unit"),
+        ({"level": 1e9}, "no surface of this density in its box, where it is .* to 400 per"),
+        ({"level": 1e300}, "no surface of this density in its box, where it is .* to 400 per"),
+        ({"level": 1e-310}, "no surface of this density in its box, where it is .* to 400 per"),
         ({"level": 0.0}, "level must be a finite number above 0"),
         ({"level": float("nan")}, "level must be a finite number above 0"),
         ({"min_size": -1.0}, "min_size must be"),
         ({"crop": ((0, 0, 0), (1, 1, 0))}, "the first below the second"),
         ({"crop": ((0, 0, 0), (1, 1, float("inf")))}, "the first below the second"),
         ({"crop": ((2, 2, 2), (3, 3, 3))}, "lies outside of the field, which reaches from -1"),
-        ({"crop": ((0.1, 0, 0), (0.101, 0.1, 0.1))}, "no node|no surface"),
+        ({"crop": ((0.11, 0, 0), (0.12, 0.1, 0.1))}, "lies between two nodes of the grid"),
+        (
+            {"crop": ((-1, -1, -1), (-0.8, -0.8, -0.8))},
+            "no surface of this density inside the crop, where it is .*e-17",
+        ),
     ],
 )
 def test_what_cannot_be_is_refused(options: dict, says: str) -> None:

@@ -41,8 +41,10 @@ def test_unseen_nodes_are_empty_and_a_crop_is_a_block() -> None:
     assert (volume.density[~volume.seen] == 0.0).all()
     assert volume.density[2, -2, 27] == 0.0  # the middle of the ball
     assert 0.01 < volume.seen.mean() < 0.5
-    with pytest.raises(InputError, match="fewer than two nodes"):
+    with pytest.raises(InputError, match="between two nodes"):
         volume_of(field, crop=((0.01, 0, 0), (0.04, 1, 1)))
+    with pytest.raises(InputError, match="fewer than two nodes"):
+        volume_of(field, crop=((-0.01, 0, 0), (0.04, 1, 1)))
 
 
 def test_of_folded_space_the_box_is_stored() -> None:

@@ -78,11 +78,14 @@ def export(
             raise InputError(
                 f"{path}: {name} is of surfaces, and this file holds none; leave it out."
             )
-    surface.check_options(field, level, crop, min_size)  # before what takes long
+    # Before what takes long:
+    surface.check_options(field, level, crop, min_size)
+    if ending in SURFACES:
+        surface.require_crossed(field, level, crop)
     if scene is None and ending in ("", ".html"):
         raise InputError(f"{path}: a {FORMATS[ending]} needs the scene of the training; give it.")
     if ending in VOLUMES:
-        volume.require_boxes(field)
+        volume.checked_block(field, crop)
     views = [] if scene is None else [scene.views[index] for index in scene.splits["train"]]
     sight = look(field, views, on_camera) if views else None
     if ending in SPLATS:

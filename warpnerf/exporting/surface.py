@@ -75,7 +75,8 @@ def extract_surface(
     grid = field.grid
     edge = float(grid.voxel_size.mean())
     check_options(field, level, crop, min_size)
-    level = -math.log1p(-LEVEL_OPACITY) / edge if level is None else level
+    require_crossed(field, level, crop)
+    level = default_level(field) if level is None else level
     box = checked_crop(field, crop)
     raw = raw_density(field)
     nodes, faces = _marching_cubes(raw, _raw_of(field, level), field)
@@ -83,9 +84,8 @@ def extract_surface(
     kept = inside(points, box)
     if not kept.any():
         raise InputError(
-            f"level {level:g}: the field has no surface of this density inside the crop; its "
-            f"density there is {_density_range(field, raw, box)} per scene unit; choose a level "
-            "in between."
+            f"level {level:g}: the surface of this density does not reach into the crop; enlarge "
+            "the crop, or choose another level."
         )
     if sight is not None and not unseen:
         kept &= values_at(sight.light, nodes) > SEEN
@@ -123,11 +123,38 @@ def check_options(
     checked_crop(field, crop)
 
 
+def default_level(field: Field) -> float:
+    """The density of which a voxel edge is 20 % opaque, 1 / scene unit."""
+    return -math.log1p(-LEVEL_OPACITY) / float(field.grid.voxel_size.mean())
+
+
+def require_crossed(field: Field, level: float | None, crop: Crop | None) -> None:
+    """Raise InputError where no node has at least the level, or all have, as far as a crop reaches.
+
+    Of fields in which a box holds no block of nodes, all nodes are looked at.
+    """
+    grid = field.grid
+    level = default_level(field) if level is None else level
+    box = checked_crop(field, crop)
+    raw = raw_density(field)
+    where = " inside the crop" if crop is not None else " in its box"
+    if grid.frustum is None and (box >= grid.box_min).all() and (box <= grid.box_max).all():
+        low, high = nodes_of(grid, box)
+        first, last = np.floor(low).astype(int), np.ceil(high).astype(int)
+        raw = raw[tuple(slice(max(a, 0), b + 1) for a, b in zip(first, last, strict=True))]
+    if not raw.min() < _raw_of(field, level) <= raw.max():
+        low_sigma, high_sigma = density(field, np.array([raw.min(), raw.max()]))
+        raise InputError(
+            f"level {level:g}: the field has no surface of this density{where}, where it is "
+            f"{low_sigma:.3g} to {high_sigma:.3g} per scene unit; choose a level in between."
+        )
+
+
 def checked_crop(field: Field, crop: Crop | None) -> np.ndarray:
     """The box of what is exported, [2, 3]: lower and upper corner, scene units.
 
     Raises:
-        InputError: It is no box, or outside of a field that ends at its own.
+        InputError: It is no box, holds no node, or is outside of a field that ends at its own.
     """
     own = np.stack([field.grid.box_min, field.grid.box_max])
     if field.grid.frustum is not None:  # which is no box in the scene
@@ -144,6 +171,14 @@ def checked_crop(field: Field, crop: Crop | None) -> np.ndarray:
         raise InputError(
             f"crop from {_corner(box[0])} to {_corner(box[1])} lies outside of the field, which "
             f"reaches from {_corner(own[0])} to {_corner(own[1])}; choose a box that meets it."
+        )
+    with np.errstate(invalid="ignore"):  # behind the cameras of a frustum
+        low, high = np.sort(nodes_of(field.grid, box), axis=0)
+    if (np.floor(high + 1e-6) < np.ceil(low - 1e-6)).any():
+        raise InputError(
+            f"crop from {_corner(box[0])} to {_corner(box[1])} lies between two nodes of the grid, "
+            f"whose voxels have edges of {field.grid.voxel_size.max():.3g} scene units; choose a "
+            "larger box."
         )
     return box
 
@@ -227,16 +262,6 @@ def _large_components(points: np.ndarray, faces: np.ndarray, min_size: float) ->
     np.maximum.at(high, labels[used], points[used])
     roots = labels[faces[:, 0]]
     return np.linalg.norm(high[roots] - low[roots], axis=1) >= min_size
-
-
-def _density_range(field: Field, raw: np.ndarray, box: np.ndarray) -> str:
-    """The least and the greatest density of nodes in a box, in words."""
-    nodes = np.stack(np.meshgrid(*map(np.arange, raw.shape), indexing="ij"), -1).reshape(-1, 3)
-    found = raw.reshape(-1)[inside(points_of(field.grid, nodes), box)]
-    if not found.size:
-        return "that of no node: it is smaller than a voxel"
-    low, high = density(field, np.array([found.min(), found.max()]))
-    return f"{low:.3g} to {high:.3g}"
 
 
 def _corner(corner: np.ndarray) -> str:

@@ -57,16 +57,7 @@ def volume_of(
             normalised device coordinates.
     """
     grid = field.grid
-    require_boxes(field)
-    box = checked_crop(field, crop)
-    box = np.clip(box, grid.box_min, grid.box_max)
-    low, high = nodes_of(grid, box)
-    first, last = np.ceil(low - 1e-6).astype(int), np.floor(high + 1e-6).astype(int)
-    if (first >= last).any():
-        raise InputError(
-            "crop holds fewer than two nodes of the grid along an axis, whose voxels have edges of "
-            f"{grid.voxel_size.max():.3g} scene units; choose a larger box inside the field's."
-        )
+    first, last = checked_block(field, crop)
     block = tuple(slice(a, b + 1) for a, b in zip(first, last, strict=True))
     corners = points_of(grid, np.stack([first, last]))
     raw = raw_density(field)
@@ -85,13 +76,27 @@ def volume_of(
     )
 
 
-def require_boxes(field: Field) -> None:
-    """Raise InputError where voxels are no boxes in the scene."""
-    if field.grid.frustum is not None:
+def checked_block(field: Field, crop: Crop | None) -> tuple[np.ndarray, np.ndarray]:
+    """The first and the last node of a volume along each axis, [3] int.
+
+    Raises:
+        InputError: As ``volume_of``.
+    """
+    grid = field.grid
+    if grid.frustum is not None:
         raise InputError(
             "a volume has voxels of one size, but this field's are those of normalised device "
             "coordinates, which grow with the distance; export a mesh, points or splats."
         )
+    box = np.clip(checked_crop(field, crop), grid.box_min, grid.box_max)
+    low, high = nodes_of(grid, box)
+    first, last = np.ceil(low - 1e-6).astype(int), np.floor(high + 1e-6).astype(int)
+    if (first >= last).any():
+        raise InputError(
+            "crop holds fewer than two nodes of the grid along an axis, whose voxels have edges of "
+            f"{grid.voxel_size.max():.3g} scene units; choose a larger box inside the field's."
+        )
+    return first, last
 
 
 def volume_npz(volume: Volume) -> list[bytes]:
