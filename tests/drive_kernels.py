@@ -74,7 +74,7 @@ def _of(name: str) -> SimpleNamespace:
         other = activation.adj_sigmoid(y, vec3(real(0.0), real(0.0), adj[n]))
         out_sigmoid[n] = real(0.5) * (y[0] + real(1.0) - y[2])
         out_adj_sigmoid[n] = real(0.5) * (adj_x[0] + adj_x[1] + adj_x[2] + other[2])
-        out_opacity[n] = activation.opacity_of(tau, wp.exp(-tau))
+        out_opacity[n] = activation.alpha_of(tau, wp.exp(-tau))
 
     @wp.kernel(module="unique", enable_backward=False)
     def contract_points(

@@ -172,6 +172,11 @@ def test_clip_distances_that_leave_no_sample(march: dict[str, float], message: s
         wn.train(scene_by_hand(), replace(config, grid=folded, march=wn.MarchConfig(**march)))
 
 
+def test_an_opacity_that_makes_all_space_free() -> None:
+    with pytest.raises(InputError, match=r"alpha_min must be an opacity in \[0, 1\), not 5\.0"):
+        wn.TrainConfig(alpha_min=5.0)
+
+
 # --- 62: NaN in a grid --------------------------------------------------------------------------
 
 

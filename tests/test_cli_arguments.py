@@ -78,6 +78,19 @@ def test_a_word_that_is_no_value(
     assert sentence in refused(capsys, *words)
 
 
+@pytest.mark.parametrize(
+    "words",
+    [("train", "builtin:room", "--output", "-x"), ("train", "--resume", "--steps", "5")],
+    ids=["a name that begins with -", "forgotten"],
+)
+def test_a_path_that_looks_like_an_option(
+    words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(list(words)) == 2
+    option, word = words[-2:] if words[-1] == "-x" else words[1:3]
+    assert f"{option} has no value, as {word} may be an option" in capsys.readouterr().err
+
+
 def test_help_is_what_the_docstring_says(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         run("--help")

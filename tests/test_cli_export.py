@@ -47,7 +47,9 @@ def test_every_ending_becomes_a_file(
     assert len(target.read_bytes()) > 1000
     assert [path.name for path in tmp_path.iterdir()] == [target.name]
     said = capsys.readouterr().out
-    assert f"as a {FORMATS[ending]}" in said and f"wrote {target}" in said
+    kind = FORMATS[ending]
+    assert f"nodes as {kind if kind.endswith('s') else 'a ' + kind}\n" in said
+    assert f"wrote {target}" in said
     assert "10 of 10 training cameras" in said
 
 
@@ -104,10 +106,8 @@ def test_what_is_no_run_ends_with_a_sentence(tmp_path: Path) -> None:
     assert done.stderr.strip().endswith("config.json does not exist; name the folder of a run.")
 
 
-def test_another_scene_is_one_in_the_same_place(run_folder: Path, tmp_path: Path) -> None:
-    """Cameras that look away see nothing of the ball, and that is said."""
+def test_cameras_that_look_away_see_nothing_and_that_is_said(tmp_path: Path) -> None:
     write_transforms(tmp_path / "scene", 6)
+    away = load_scene(tmp_path / "scene")
     with pytest.raises(InputError, match="keep what is unseen"):
-        export_command(
-            run_folder, tmp_path / "a.ply", level=LEVEL, scene=str(tmp_path / "scene"), min_size=2.5
-        )
+        export(ball_field(), tmp_path / "a.ply", level=LEVEL, scene=away, min_size=2.5)

@@ -30,6 +30,13 @@ def empty_file(name: str) -> Callable[[Path], None]:
     return make
 
 
+def half_a_model(folder: Path) -> None:
+    """That poses are taken from, or nothing: others are not estimated unasked."""
+    photographs(folder / "images")
+    empty_file("sparse/0/cameras.bin")(folder)
+    assert not is_unposed(folder)
+
+
 def two_scenes(folder: Path) -> None:
     write_transforms(folder / "a")
     write_transforms(folder / "b")
@@ -48,6 +55,7 @@ def two_scenes(folder: Path) -> None:
         (lambda f: write_transforms(f / "room"), "its folder room holds one; use .*s/room"),
         (two_scenes, r"2 of its folders hold one each \(first: a\); use .*s/a"),
         (empty_file("sparse/0/cameras.bin"), "its COLMAP model lacks sparse/0/images.bin"),
+        (half_a_model, r"lacks sparse/0/images\.bin; .* again, or .* `warpnerf pose .*s --output"),
         (empty_file("images.txt"), r"its COLMAP model lacks cameras\.txt"),
         (empty_file("database.db"), "a database of COLMAP but no model"),
         (empty_file("notes.odt"), "neither poses nor photographs nor a video"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -112,7 +113,7 @@ def test_the_near_plane_lies_before_the_nearest_content() -> None:
     ("scene", "says"),
     [
         (facing(turned=60.0), "2.png looks (4[6-9]|5[0-5]) degrees away from the mean"),
-        (facing((9.0, 2.5)), "bounds of 0.png must be two depths above 0, the nearer first"),
+        (facing((9.0, 2.5)), "bounds of 0.png, .* must be two depths above 0, the nearer first"),
         (facing((0.0, 2.5)), "not 0 and 2.5"),
         (facing((-1.0, 2.5)), "not -1 and 2.5"),
         (facing((1.0, math.inf)), "not 1 and inf"),
@@ -156,7 +157,7 @@ def test_captures_with_bounds_that_face_forward_are_trained_in_a_frustum(
 
 def test_bounds_that_make_no_sense_are_refused_before_anything_is_decided() -> None:
     auto = config(grid=wn.GridConfig())
-    with pytest.raises(InputError, match=r"bounds of 0\.png must be two depths"):
+    with pytest.raises(InputError, match=r"bounds of 0\.png, .* must be two depths"):
         contraction_of(facing((9.0, 2.5)), auto)
     assert contraction_of(facing((9.0, 2.5), turned=50.0), auto) == "linf"
 
@@ -170,6 +171,20 @@ def test_clip_distances_that_leave_nothing_are_refused(march: dict[str, float], 
 def test_no_term_of_the_jacobian() -> None:
     with pytest.raises(InputError, match=r"jacobian must be none with grid\.contraction ndc"):
         config(jacobian="density")
+
+
+@pytest.mark.parametrize(
+    ("changes", "here"),
+    [
+        ({"grid": wn.GridConfig(contraction="none")}, "clamped and grid.contraction none"),
+        ({"grid": wn.GridConfig(contraction="linf"), "scaling": "none"}, "none and .* linf"),
+    ],
+)
+def test_a_term_of_the_jacobian_that_does_nothing_is_refused(
+    changes: dict[str, Any], here: str
+) -> None:
+    with pytest.raises(InputError, match=f"jacobian paper does nothing .*{here}"):
+        Trainer(facing(), config(jacobian="paper", **changes))
 
 
 def test_training_and_going_on(tmp_path: Path) -> None:

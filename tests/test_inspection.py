@@ -22,7 +22,7 @@ from warpnerf.scenes.load import load_scene
 
 
 def scene_with(folder: Path, poses: list[np.ndarray]) -> Path:
-    content = write_transforms(folder, len(poses))
+    content = write_transforms(folder, len(poses), scale=2)
     for frame, pose in zip(content["frames"], poses, strict=True):
         frame["transform_matrix"] = pose.tolist()
     save(folder / "transforms.json", content)
@@ -39,8 +39,8 @@ def test_an_ordinary_scene(tmp_path: Path) -> None:
     assert found.oddities == ()
     assert facts["name"] == "ring"
     assert facts["splits"] == {"test": 2, "train": 7}
-    assert facts["sizes"] == [[8, 6, 9]]
-    assert facts["focal_length"] == [10.0, 11.0]
+    assert facts["sizes"] == [[16, 12, 9]]
+    assert facts["focal_length"] == [20.0, 22.0]
     assert facts["field_of_view"][0] == pytest.approx(2 * [2 * np.degrees(np.arctan(0.4))])
     assert facts["distortion"] == {}
     np.testing.assert_allclose(facts["focus"], 0.0, atol=1e-9)
@@ -48,7 +48,7 @@ def test_an_ordinary_scene(tmp_path: Path) -> None:
     assert facts["content_distance"] == pytest.approx(np.sqrt(10.0))
     assert any("median depth" in line for line in facts["how"])
     text = str(found)
-    for words in ("instant-ngp", "9: 2 test, 7 train", "8 x 6", "3.162 scene units", "nothing"):
+    for words in ("instant-ngp", "9: 2 test, 7 train", "16 x 12", "3.162 scene units", "nothing"):
         assert words in text
 
 
@@ -62,6 +62,17 @@ def test_what_loading_warns_of_is_odd(tmp_path: Path) -> None:
     found = odd(inspect(folder))
     for words in ("gone.png", "naming an image again", "not read: exposure"):
         assert words in found
+
+
+def test_photographs_that_show_nothing_or_too_little_are_odd(tmp_path: Path) -> None:
+    folder = scene_with(tmp_path / "dark", ring(9))
+    for number in (1, 4):
+        Image.new("RGB", (16, 12)).save(folder / f"images/{number:03}.png")
+    (oddity,) = inspect(folder).oddities
+    assert oddity.startswith("of one colour throughout: 2 of 9 images (first: images/001.png)")
+    write_transforms(tmp_path / "tiny", 9)
+    found = odd(inspect(tmp_path / "tiny"))
+    assert "images/000.png is 8 x 6 pixels, but SSIM needs 11 x 11" in found
 
 
 def test_alpha_in_only_some_images_is_said(tmp_path: Path) -> None:

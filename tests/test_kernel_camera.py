@@ -233,7 +233,7 @@ def draw(
     mode: int,
     jitter: int,
     rays_before: int = 0,
-    chunk: int = NODES,
+    at_once: int = NODES,
 ) -> dict[str, Any]:
     """Pixels of three views; the red and green of each pixel say which one it is.
 
@@ -274,7 +274,7 @@ def draw(
         mode,
         jitter,
         *out.values(),
-        chunk=chunk,
+        at_once=at_once,
     )
     return {name: value.numpy() for name, value in out.items()}
 
@@ -364,7 +364,7 @@ def test_a_batch_is_a_function_of_its_seed(kernels32: Kernels) -> None:
 
 def test_rays_are_counted_through_the_training(kernels32: Kernels) -> None:
     options = (5, (0.0, 0.0, 0.0), 1, 1)
-    whole = draw(kernels32, 300, *options, rays_before=2**32 - 100, chunk=7)
+    whole = draw(kernels32, 300, *options, rays_before=2**32 - 100, at_once=7)
     parts = [
         draw(kernels32, n, *options, rays_before=before)
         for n, before in ((60, 2**32 - 100), (40, 2**32 - 40), (200, 0))

@@ -34,6 +34,7 @@ def test_a_weight_may_be_a_word_or_a_number() -> None:
     [
         ("l1=1", "--loss: 'l1=1' is no option of the loss; it has photometric=squared, "),
         ("distortion", "--loss: 'distortion' is no option of the loss; it has "),
+        ("path/to/it", "--loss: 'path/to/it' is no NAME=VALUE; --loss takes all words up to"),
         ("distortion=much", "--loss: distortion must be a number, not 'much'."),
         ("distortion=-1", "loss.distortion must be a finite number of at least 0, not -1.0."),
         ("entropy=nan", "loss.entropy must be a finite number of at least 0, not nan."),
@@ -47,6 +48,12 @@ def test_what_does_not_fit_is_refused(option: str, said: str) -> None:
     assert said in str(error.value)
     with pytest.raises(InputError, match="entropy is given twice"):
         chosen_losses(LossConfig(), ["entropy=1", "entropy=2"])
+
+
+def test_a_scene_that_an_option_has_taken_is_named(tmp_path: Path) -> None:
+    for flag in ("--loss", "--model-options"):
+        code, _, err = run("train", "--output", tmp_path / "run", flag, "builtin:room")
+        assert code == 2 and f"{flag}: 'builtin:room' is no NAME=VALUE" in err
 
 
 def test_the_command_refuses_in_a_sentence_and_writes_nothing(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from tiny_trainings import ball
 import warpnerf as wn
 from warpnerf.checks import InputError
 from warpnerf.config import GridConfig, LossConfig, OptimConfig, TrainConfig
-from warpnerf.model.interface import Model
+from warpnerf.model.interface import Model, parts_of
 from warpnerf.model.models import Deferred, Rgb
 from warpnerf.rendering.losses import PLAIN, Minimised, parts_with
 from warpnerf.rendering.render import variant_of
@@ -214,6 +214,16 @@ def test_weights_are_no_constants_of_kernels(name: str) -> None:
     assert variants[0] == variants[1] and variants[0] is not None
     assert (variants[0] == variants[2]) == (name == "none")
     assert variants[0].packed
+
+
+def test_a_head_whose_packs_do_not_know_of_a_loss_on_samples() -> None:
+    """A vector form with other functions than rgb's does not inherit that one."""
+    parts = parts_with(Rgb(), "float32", LOSSES["sample_colour"])
+    assert parts.have_packs
+    own = parts.head.vectors.but(decode_pack=parts.head.vectors.decode_pack)
+    other = parts._replace(head=parts.head._replace(vectors=own))
+    assert not other.have_packs
+    assert other._replace(losses=parts_of(Rgb(), "float32").losses).have_packs
 
 
 def test_a_loss_on_samples_wants_colours_of_samples() -> None:

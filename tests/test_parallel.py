@@ -44,9 +44,9 @@ def draw_line(first: int, line: Line, factor: float, out: wp.array(dtype=float))
 def test_every_item_once(threads: int, n: int, device: str) -> None:
     workers = Workers(device, threads)
     visits = wp.zeros(n + 1, dtype=wp.int32, device=workers.device)
-    for chunk in (NODES, RAYS):
+    for at_once in (NODES, RAYS):
         visits.zero_()
-        workers.launch(count_visits, n, visits, chunk=chunk)
+        workers.launch(count_visits, n, visits, at_once=at_once)
         assert (visits.numpy()[:n] == 1).all() and visits.numpy()[n] == 0
 
 
@@ -78,7 +78,7 @@ def test_what_is_kept_follows_what_changes(threads: int, device: str) -> None:
     ):
         line.slope, line.start = slope, start
         to.fill_(-100.0)
-        workers.launch(draw_line, n, line, factor, to, chunk=6, cache=cache)
+        workers.launch(draw_line, n, line, factor, to, at_once=6, cache=cache)
         expected = factor * (start.numpy()[0] + slope * np.arange(n))
         np.testing.assert_array_equal(to.numpy(), [*expected, *[-100.0] * (50 - n)])
 

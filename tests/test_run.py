@@ -275,6 +275,9 @@ def test_a_run_is_put_aside_until_the_next_has_saved_something(tmp_path: Path) -
 def test_the_last_two_are_kept(tmp_path: Path) -> None:
     run = run_with(tmp_path, 1, 20, 300, 4000)
     assert steps_in(run) == ["checkpoint-00004000.safetensors", "checkpoint-00000300.safetensors"]
+    run = run_with(tmp_path, 99_999_999, 100_000_000)
+    assert steps_in(run) == ["checkpoint-100000000.safetensors", "checkpoint-99999999.safetensors"]
+    assert run.last_step == 10**8
 
 
 def test_a_damaged_checkpoint_is_passed_over_with_a_note(tmp_path: Path) -> None:

@@ -90,6 +90,18 @@ def test_commands_on_a_scene_that_moved_say_how_to_name_it(tmp_path: Path) -> No
             command()
 
 
+def test_another_scene_is_not_taken_for_one_that_moved(tmp_path: Path) -> None:
+    run = masked_run(tmp_path)
+    write_transforms(tmp_path / "other", 4)
+    other = {"scene": str(tmp_path / "other"), "threads": 1}
+    for command in (
+        lambda: export_command(run, tmp_path / "a.npz", **other),
+        lambda: render_command(run, output=tmp_path / "a.gif", **other),
+    ):
+        with pytest.raises(InputError, match=r"other: is not what the run .* has 3 .* has 5"):
+            command()
+
+
 def test_the_viewer_shows_no_photograph_that_is_masked_wholly(tmp_path: Path) -> None:
     pytest.importorskip("viser")
     from warpnerf.viewer.view import open_view

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -85,3 +86,21 @@ def test_other_errors_of_finalisers_are_reported(capsys: pytest.CaptureFixture[s
     raise_when_asked()
     Failing()
     assert "ValueError: of no signal" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["warpnerf.cli.main", "tyro", "numpy"])
+def test_ctrl_c_while_the_command_is_imported(name: str) -> None:
+    """Whatever is imported at that moment, there is no traceback."""
+    program = f"""
+import os, signal, sys
+from warpnerf.cli.start import start
+class Interrupt:
+    def find_spec(self, name, path=None, target=None):
+        if name == {name!r}:
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Interrupt())
+sys.argv = ["warpnerf", "inspect", "builtin:room"]
+sys.exit(start())
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "stopped\n")

@@ -235,6 +235,15 @@ def test_bad_settings(name: str, device: str) -> None:
         call(p, tensor(p.raw, device), **changes)
 
 
+def test_steps_that_float32_does_not_count(device: str) -> None:
+    p = problem(11)
+    raw = tensor(p.raw, device)
+    far_away = {"step": 1e-7, "near": 50.0, "far": 50.0 + 1e-6}
+    call(p, raw, **far_away)  # in float64
+    with pytest.raises(InputError, match="more than 16777216 steps; use a longer step"):
+        call(p, raw.float(), **far_away)
+
+
 def test_bad_tensors(device: str) -> None:
     p = problem(12)
     raw = tensor(p.raw, device)

@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from solid_fields import ball_field
 from tiny_fields import assert_same_state
+from tiny_scenes import ring, tiny_scene
 from tiny_trainings import (
     GROWING,
     STEPS,
@@ -21,6 +23,7 @@ from tiny_trainings import (
 )
 from tiny_trainings import early_growth as early_growth
 
+import warpnerf as wn
 from warpnerf.checks import InputError
 from warpnerf.config import GridConfig, OptimConfig, TrainConfig
 from warpnerf.model.models import Deferred
@@ -350,6 +353,17 @@ def test_what_is_not_finite_is_never_saved(where: str) -> None:
     assert saved == [1, 2, 3, 4]
 
 
-def test_a_folder_is_no_scene() -> None:
-    with pytest.raises(InputError, match=r"wants a scene, not 'photos'.*load_scene"):
-        train("photos")  # type: ignore[arg-type]
+def test_what_is_given_in_place_of_a_scene_a_field_or_a_configuration_is_refused() -> None:
+    what: Any = wn
+    with pytest.raises(InputError, match=r"train wants a scene, not 'photos'.*load_scene"):
+        what.train("photos")
+    with pytest.raises(InputError, match=r"train wants a configuration, not 'fast'; PRESETS"):
+        what.train(tiny_scene(ring(4)), "fast")
+    for part in ("grid", "march", "optim", "loss"):
+        with pytest.raises(InputError, match=rf"{part} must be a \w+Config, not \{{"):
+            wn.TrainConfig(**{part: {}})  # type: ignore[arg-type]
+    for function in (what.evaluate, what.export):
+        with pytest.raises(InputError, match=r"wants a field, not 'runs/a'; load_field"):
+            function("runs/a", tiny_scene(ring(4)))
+    with pytest.raises(InputError, match=r"evaluate wants a scene, not 'photos'"):
+        what.evaluate(ball_field(), "photos")

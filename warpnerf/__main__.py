@@ -2,7 +2,7 @@
 
 import sys
 
-from warpnerf.cli.main import main
+from warpnerf.cli.start import start
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(start())

@@ -56,7 +56,8 @@ class GridConfig:
     """The voxel grid over the scene's box."""
 
     voxels: int = 160**3
-    """Nodes of the final grid, in all."""
+    """Nodes of the final grid, in all. It grows from step 200 on: a shorter training keeps the grid
+    that it begins with, of 1/16 as many after four growths."""
     grow_at: Literal["auto"] | tuple[float, ...] = "auto"
     """Shares of the training at which the number of nodes doubles. auto: those of ``GROW_AT``."""
     shift_at_growth: float = 0.0
@@ -330,7 +331,7 @@ class TrainConfig:
     box as well where cameras look at no common point. 0: none, and the extent stays what the
     scene says."""
     jacobian: Jacobian = "none"
-    """Whether the scaling takes the contraction's change of volume into account."""
+    """Whether the scaling takes into account how folding changes volumes; in folded space only."""
     rays_per_step: int = 4096
     """Rays in a batch: what one step draws, those counted that ``skip_empty_rays`` leaves out."""
     background: Background | tuple[float, float, float] = "auto"
@@ -384,6 +385,10 @@ class TrainConfig:
             object.__setattr__(self, "model", model_of(self.model))
         if not isinstance(self.model, Model):
             raise InputError(f"model must be a name or a model, not {self.model!r}.")
+        parts = {"grid": GridConfig, "march": MarchConfig, "optim": OptimConfig, "loss": LossConfig}
+        for name, kind in parts.items():
+            if not isinstance(part := getattr(self, name), kind):
+                raise InputError(f"{name} must be a {kind.__name__}, not {part!r}.")
         require_whole("steps", self.steps, 1)
         require_whole("coarse_steps", self.coarse_steps, 0)
         if 0 < self.coarse_steps < MIN_COARSE_STEPS:
@@ -394,6 +399,11 @@ class TrainConfig:
         require_whole("rays_per_step", self.rays_per_step, 1)
         require_whole("occupancy_every", self.occupancy_every, 1)
         require_at_least("alpha_min", self.alpha_min, 0.0)
+        if self.alpha_min >= 1.0:
+            raise InputError(
+                f"alpha_min must be an opacity in [0, 1), not {self.alpha_min}: from 1 on all "
+                "space is free, and nothing is seen."
+            )
         require_whole("seed", self.seed, 0)
         if self.seed >= 2**63:
             raise InputError(f"seed must be at least 0 and below 2^63, not {self.seed}.")

@@ -63,7 +63,8 @@ def export_command(
     views = load_run_scene(config, scene)
     n_cameras = len(views.training_cameras)
     grid = " x ".join(map(str, field.grid.size))
-    print(f"exporting a grid of {grid} nodes as a {kind}", flush=True)
+    what = kind if kind.endswith("s") else f"a {kind}"
+    print(f"exporting a grid of {grid} nodes as {what}", flush=True)
     with ProgressBar("first training camera") as bar:
 
         def on_camera(done: int) -> None:

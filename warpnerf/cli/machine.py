@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -87,11 +88,15 @@ def warmup_command(
 
 
 def require_writable(path: Path | None) -> None:
-    """Raise InputError where --json names a folder, or a file in none."""
-    if path is not None and path.is_dir():
+    """Raise InputError where --json names a folder, or a file in none or in one of others'."""
+    if path is None:
+        return
+    if path.is_dir():
         raise InputError(f"--json {path}: is a folder; name a file.")
-    if path is not None and not path.parent.is_dir():
+    if not path.parent.is_dir():
         raise InputError(f"--json {path}: its folder does not exist; make it first.")
+    if not os.access(path.parent if path.is_file() or not path.exists() else path, os.W_OK):
+        raise InputError(f"--json {path}: its folder cannot be written to; choose another one.")
 
 
 def write_json(path: Path, text: str) -> None:

@@ -42,6 +42,9 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "warmup": warmup_command,
 }
 
+PATHS = ("--output", "--resume", "--scene", "--masks", "--json")
+"""Options whose value may be any name."""
+
 OUT_OF_MEMORY = re.compile("failed to allocate|can't start new thread", re.IGNORECASE)
 """What Warp and the standard library say in a RuntimeError where a MemoryError is meant."""
 
@@ -65,6 +68,11 @@ def _meant(option: str, word: str) -> str:
         )
     if option.startswith("--") and word == "None":
         raise InputError(f"{option} cannot be None; leave it out for what it is by default.")
+    if option in PATHS and word.startswith("-") and word != "-":
+        raise InputError(
+            f"{option} has no value, as {word} may be an option: give a path, and one that begins "
+            f"with - as {option}=./{word}."
+        )
     joined = re.fullmatch(r"(--[\w-]+)=(.*)", word)
     if joined:
         return f"{joined[1]}={_meant(joined[1], joined[2])}"

@@ -54,6 +54,11 @@ def values_of(flag: str, otherwise: str, begin: Any, options: Sequence[str]) -> 
     given: dict[str, Any] = {}
     for option in options:
         field, equals, text = option.partition("=")
+        if not equals and field not in known:
+            raise InputError(
+                f"{flag}: {option!r} is no NAME=VALUE; {flag} takes all words up to the next "
+                "option, so what does not belong to it goes before it."
+            )
         if not equals or field not in known:
             listed = ", ".join(f"{key}={value}" for key, value in known.items()) or "none"
             raise InputError(f"{flag}: {option!r} is {otherwise} {listed}.")

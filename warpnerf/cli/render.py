@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, cast, get_args
@@ -182,3 +183,5 @@ def _require_folder(folder: Path) -> None:
         raise InputError(f"--output {folder} is a file; stills go into a folder.")
     if not folder.parent.is_dir():
         raise InputError(f"--output {folder}: the folder above does not exist; make it first.")
+    if not os.access(folder if folder.is_dir() else folder.parent, os.W_OK):
+        raise InputError(f"--output {folder} cannot be written to; choose another one.")

@@ -146,11 +146,11 @@ def train_command(
                     "begun; leave it out."
                 )
         return _resume(resume, scene, masks, images, changed, page)
+    config = changed(PRESETS[preset or "fast"])
     if scene is None or output is None:
         raise InputError(
             "train wants a SCENE and --output DIR for a new run, or --resume DIR to go on with one."
         )
-    config = changed(PRESETS[preset or "fast"])
     if time_limit is not None and steps is None:
         config = dataclasses.replace(config, steps=STEPS_OF_TIMED)
     if steps is not None and time_limit is None:

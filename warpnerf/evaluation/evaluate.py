@@ -26,7 +26,7 @@ from warpnerf.evaluation.near_field import (
     measure_near_field,
 )
 from warpnerf.runtime.terminal import table_text
-from warpnerf.scenes.scene import Scene, View, require_split
+from warpnerf.scenes.scene import Scene, View, require_scene, require_split
 
 if TYPE_CHECKING:
     from warpnerf.rendering.field import Field, Rendering
@@ -148,8 +148,12 @@ def evaluate(
         Figures of each image and their means, and what hangs in front of the training cameras.
 
     Raises:
-        InputError: The scene has no such split.
+        InputError: The scene has no such split; or it is no scene, or what renders no field.
     """
+    from warpnerf.rendering.field import require_field
+
+    require_field(field, "evaluate")
+    require_scene(scene, "evaluate")
     images = []
     within = NEAR_SHARE * scene.content_distance
     views = [scene.views[index] for index in require_split(scene, split)]
@@ -194,7 +198,7 @@ def require_measurable(scene: Scene, split: str) -> None:
         if min(camera.width, camera.height) < SSIM_WINDOW:
             raise InputError(
                 f"{scene.views[index].name} is {camera.width} x {camera.height} pixels, but SSIM "
-                f"needs {SSIM_WINDOW} x {SSIM_WINDOW}; use larger images, or a smaller --downscale."
+                f"needs {SSIM_WINDOW} x {SSIM_WINDOW}; use larger images, or no --downscale."
             )
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from warpnerf.checks import InputError, require_at_least, require_positive
 from warpnerf.config import TRAINING_BYTES, Contraction, SceneKind, TrainConfig
+from warpnerf.evaluation.evaluate import require_measurable
 from warpnerf.model.interface import Model
 from warpnerf.model.models import to_json
 from warpnerf.presets import EVERYDAY, PRESETS
@@ -24,7 +25,7 @@ from warpnerf.scenes.fisheye import angle_of
 from warpnerf.scenes.focus import find_focus, share_aimed_at, up_direction
 from warpnerf.scenes.frustum import HELD, contraction_of
 from warpnerf.scenes.load import load_scene
-from warpnerf.scenes.scene import Scene
+from warpnerf.scenes.scene import Scene, View
 from warpnerf.scenes.survey import Survey, survey
 from warpnerf.scenes.undistort import COEFFICIENTS
 
@@ -226,14 +227,14 @@ def inspect(
     found = survey(path)
     try:
         scene = load_scene(path, downscale=downscale, masks=masks, images="files")
-        _read_once(scene)
+        distance = scene.content_distance if content_distance is None else content_distance
+        odd = oddities(scene, found, distance, near, looked=False)
     except InputError as error:
         others = [place for place in found.refused if place not in str(error)]
         if not others:
             raise
         named = ", ".join(others[:5]) + (", ..." if len(others) > 5 else "")
         raise InputError(f"{error} Poses refused likewise: {len(others)} more ({named}).") from None
-    distance = scene.content_distance if content_distance is None else content_distance
     return Inspection(
         scene=scene,
         format=found.format,
@@ -241,16 +242,9 @@ def inspect(
         up=up_direction(scene.training_cameras),
         focus=_focus(scene.training_cameras),
         contraction=contraction_of(scene, next(iter(configs.values()))),
-        oddities=(*scene.warnings, *oddities(scene, found, distance, near, looked=False)),
+        oddities=(*scene.warnings, *odd),
         costs={name: _cost(scene, config, threads) for name, config in configs.items()},
     )
-
-
-def _read_once(scene: Scene) -> None:
-    """Raise InputError if an image is damaged; none of them stays in memory."""
-    with ThreadPoolExecutor(usable_cores()) as pool:
-        for _ in pool.map(lambda view: view.image is None, scene.views):
-            pass
 
 
 LOOKS_FIRST = "training of 500 steps or more looks for better ones first, but with DVGO's presets"
@@ -272,8 +266,11 @@ def oddities(
 
     Returns:
         A sentence each.
+
+    Raises:
+        InputError: An image is damaged.
     """
-    odd = list(found.oddities)
+    odd = list(found.oddities) + _odd_images(scene)
     times = content_distance / scene.content_distance
     if not 1.0 / MANY_TIMES <= times <= MANY_TIMES:
         odd.append(
@@ -294,6 +291,31 @@ def oddities(
             f"{content_distance:.4g}"
         )
     return odd
+
+
+def _odd_images(scene: Scene) -> list[str]:
+    """Photographs that show nothing, or too little to be measured; each is looked at once."""
+    odd = []
+    with ThreadPoolExecutor(usable_cores()) as pool:
+        shows_nothing = pool.map(_is_of_one_colour, scene.views)
+        empty = [v.name for v, so in zip(scene.views, shows_nothing, strict=True) if so]
+    if empty:
+        odd.append(
+            f"of one colour throughout: {len(empty)} of {len(scene.views)} images (first: "
+            f"{empty[0]}), which show nothing that could be trained on"
+        )
+    if scene.splits.get("test"):
+        try:
+            require_measurable(scene, "test")
+        except InputError as error:
+            odd.append(str(error).removesuffix("."))
+    return odd
+
+
+def _is_of_one_colour(view: View) -> bool:
+    image = view.image
+    sample = image[:: max(1, len(image) // 32), :: max(1, image.shape[1] // 32)]
+    return bool((sample == image[0, 0]).all() and (image == image[0, 0]).all())
 
 
 def _focus(cameras: Sequence[Camera]) -> np.ndarray | None:

@@ -10,9 +10,9 @@ from warpnerf.checks import InputError
 from warpnerf.exporting import cameras as scenes
 from warpnerf.exporting import mesh, page, splats, surface, volume
 from warpnerf.exporting.sight import look
-from warpnerf.rendering.field import Field
+from warpnerf.rendering.field import Field, require_field
 from warpnerf.scenes.focus import up_direction
-from warpnerf.scenes.scene import Scene
+from warpnerf.scenes.scene import Scene, require_scene
 from warpnerf.writing import write_atomically
 
 SURFACES = (".glb", ".obj", ".ply", ".points.ply", "")
@@ -67,10 +67,13 @@ def export(
         Where it went.
 
     Raises:
-        InputError: Another ending, a place that cannot be written to, options of another format, a
-            missing scene or package, or nothing to write.
+        InputError: No field, another ending, a place that cannot be written to, options of another
+            format, a missing scene or package, or nothing to write.
         OSError: It cannot be written; what was there before is left as it was.
     """
+    require_field(field, "export")
+    if scene is not None:
+        require_scene(scene, "export")
     path = Path(path)
     ending = checked_ending(path)
     for name, value in (("level", level), ("min_size", min_size)):

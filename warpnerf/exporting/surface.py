@@ -175,10 +175,12 @@ def checked_crop(field: Field, crop: Crop | None) -> np.ndarray:
     with np.errstate(invalid="ignore"):  # behind the cameras of a frustum
         low, high = np.sort(nodes_of(field.grid, box), axis=0)
     if (np.floor(high + 1e-6) < np.ceil(low - 1e-6)).any():
+        edge, outside = f"{field.grid.voxel_size.max():.3g} scene units", ""
+        if field.grid.folded:
+            outside = f" in the box from {_corner(own[0])} to {_corner(own[1])} and longer outside"
         raise InputError(
             f"crop from {_corner(box[0])} to {_corner(box[1])} lies between two nodes of the grid, "
-            f"whose voxels have edges of {field.grid.voxel_size.max():.3g} scene units; choose a "
-            "larger box."
+            f"whose voxels have edges of {edge}{outside}; choose a larger box."
         )
     return box
 

@@ -342,7 +342,7 @@ class FreeCells:
         span = 1 if device.is_cuda else size[2]  # a core takes a row
 
         def launch(kernel: wp.Kernel, n: int, *arguments: Any) -> None:
-            workers.launch(kernel, n // span, span, *arguments, chunk=max(1, NODES // span))
+            workers.launch(kernel, n // span, span, *arguments, at_once=max(1, NODES // span))
 
         shape = [*grid.size[:2], size[2]]
         highest = wp.empty(math.prod(shape), dtype=real, device=device)
@@ -394,7 +394,7 @@ class FreeCells:
                 occupancy.spread_distance,
                 n // span,
                 *(span, wp.vec3i(*size), axis, distance, spread),
-                chunk=max(1, NODES // span),
+                at_once=max(1, NODES // span),
             )
             distance, spread = spread, distance
         return FreeCells(distance=distance, size=size, border=border)

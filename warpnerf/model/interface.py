@@ -126,7 +126,8 @@ class Model(ABC):
 
         Args:
             steps: What is configured, ``warpnerf.rendering.render.Steps``.
-            length: Of the ray's way through the box, scene units; infinite where space is folded.
+            length: Of the ray's way through the box, in its coordinates; infinite where space is
+                folded.
 
         Returns:
             That, or more.

@@ -201,7 +201,7 @@ class PixelSampler:
                 coverage.cover_blocks,
                 count,
                 *(struct, edge, int(before), grid.box, free.struct, covered),
-                chunk=RAYS,
+                at_once=RAYS,
             )
         n_pixels = np.concatenate(
             [

@@ -341,7 +341,19 @@ class TrainingPass:
         workers: Workers,
         minimised: Minimised = PLAIN,
     ) -> None:
-        """Allocate what up to n_rays at a time through a grid need, by such steps."""
+        """Allocate what a batch needs.
+
+        Args:
+            n_rays: Of a batch, at most.
+            model: What the grid holds, and how that becomes colour.
+            grid: What rays go through; its values are read at each run.
+            weights: [n_weights] of the model's head, likewise; none without an MLP.
+            steps: Where samples lie.
+            scaling: Of each sample's gradient, by its distance.
+            jacobian: Whether folding enters the scale.
+            workers: Where to work.
+            minimised: Losses besides the squared error.
+        """
         device = workers.device
         variant = variant_of(
             model,

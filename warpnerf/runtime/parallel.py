@@ -143,7 +143,7 @@ class Workers:
         kernel: wp.Kernel,
         n: int,
         *arguments: Any,
-        chunk: int = NODES,
+        at_once: int = NODES,
         cache: LaunchCache | None = None,
     ) -> None:
         """Run kernel(first, *arguments) over items 0..n-1, shared out over the workers.
@@ -152,10 +152,10 @@ class Workers:
             kernel: Its thread index counts from the `first` that it is given.
             n: Number of items.
             arguments: The rest of the kernel's arguments.
-            chunk: Items per launch: NODES, RAYS, or as many fewer as an item has nodes.
+            at_once: Items of a launch: NODES, RAYS, or as many fewer as an item has nodes.
             cache: What launches before have left, and those to come will find, on the CPU.
         """
-        self._launch(kernel, n, lambda worker: arguments, chunk, cache)
+        self._launch(kernel, n, lambda worker: arguments, at_once, cache)
 
     def launch_owned(
         self,
@@ -177,8 +177,8 @@ class Workers:
             rays: That an item works on.
             cache: As for ``launch``.
         """
-        chunk = max(1, RAYS // rays)
-        self._launch(kernel, n, lambda worker: (worker, *arguments), chunk, cache)
+        at_once = max(1, RAYS // rays)
+        self._launch(kernel, n, lambda worker: (worker, *arguments), at_once, cache)
 
     def load(self, kernel: wp.Kernel) -> None:
         """Compile a kernel, or fetch it from the cache, once: else every thread would."""
@@ -191,7 +191,7 @@ class Workers:
         kernel: wp.Kernel,
         n: int,
         arguments: Callable[[int], tuple[Any, ...]],
-        chunk: int,
+        at_once: int,
         cache: LaunchCache | None,
     ) -> None:
         if n == 0:
@@ -205,10 +205,10 @@ class Workers:
         def share(worker: int) -> None:
             begin, end = (n * w // self.count for w in (worker, worker + 1))
             try:
-                for first in range(begin, end, chunk):
+                for first in range(begin, end, at_once):
                     if self._attendance[barrier.CALLED_OFF]:
                         return
-                    size, inputs = min(chunk, end - first), [first, *arguments(worker)]
+                    size, inputs = min(at_once, end - first), [first, *arguments(worker)]
                     if cache is not None:
                         cache.launch(worker, kernel, size, inputs, self.device)
                     else:

@@ -165,7 +165,8 @@ def assemble(
     try:
         extent = estimate_extent([view.camera for view in training], unbounded=unbounded)
     except InputError as error:
-        raise InputError(f"{file}: $.frames[].transform_matrix: {error}") from None
+        place = _field(file, "$.frames[].transform_matrix")
+        raise InputError(f"{file}:{place} {error}") from None
     sight = None
     if points is not None:
         extent, sight = extent_by_points(extent, points, views, indices["train"], unbounded)
@@ -223,7 +224,10 @@ def complete_splits(
         train = train - test
         notes.append(f"the file has no test split: every {HOLD_OUT}th image is for testing")
     if not train:
-        raise InputError(f"{file}: $.frames: no image is left to train on; add photographs.")
+        raise InputError(
+            f"{file}:{_field(file, '$.frames')} no image is left to train on, as {len(test)} of "
+            f"{len(names)} is for testing; add photographs."
+        )
     complete = {"train": train, "test": test}
     if "val" in given:
         complete["val"] = given["val"]
@@ -233,6 +237,11 @@ def complete_splits(
             f"in no split and not used: {len(unused)} of {len(names)} images (first: {min(unused)})"
         )
     return complete, notes
+
+
+def _field(file: Path, field: str) -> str:
+    """A field for messages, where the file is one that has fields."""
+    return f" {field}:" if file.suffix == ".json" else ""
 
 
 def _without_masked(

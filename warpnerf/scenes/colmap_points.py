@@ -77,8 +77,10 @@ def _tracked(
 def _of_bytes(file: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Positions [n, 3], image numbers of all tracks in a row, lengths of the tracks [n]."""
     data = file.read_bytes()
-    count = struct.unpack_from("<Q", data)[0] if len(data) >= 8 else 0
-    if len(data) < 8 or 8 + count * (HEAD_BYTES + 8) > len(data):
+    if len(data) < 8:
+        raise _damaged(file, f"ends after {len(data)} bytes")
+    (count,) = struct.unpack_from("<Q", data)
+    if 8 + count * (HEAD_BYTES + 8) > len(data):
         raise _damaged(file, f"counts {count} points, but ends before")
     positions = bytearray()
     tracks = bytearray()

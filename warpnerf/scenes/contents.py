@@ -61,7 +61,8 @@ def unread_photographs(folder: Path) -> list[Path]:
 def is_unposed(path: Path) -> bool:
     """Whether a path leads to what poses can be estimated of: photographs without any, a video."""
     if path.is_dir():
-        return not holds_scene(path) and len(photographs_in(path)) >= NEEDED
+        begun = holds_scene(path) or _lacking(path, ("sparse/0", "sparse")) is not None
+        return not begun and len(photographs_in(path)) >= NEEDED
     return path.suffix.lower() in VIDEOS and exists(path)
 
 
@@ -85,6 +86,12 @@ def _what_is_there(folder: Path) -> str:
     photographs = photographs_in(folder)
     if photographs:
         n = len(photographs)
+        lacking = _lacking(folder, ("sparse/0", "sparse"))
+        if lacking is not None:
+            return (
+                f"its COLMAP model lacks {lacking}; copy or export the model again, or estimate "
+                f"other poses by {pose_command(named)}"
+            )
         if n < NEEDED:
             return (
                 f"it holds {n} photograph{'s' if n > 1 else ''}, and poses need at least {NEEDED}"
@@ -123,15 +130,22 @@ def pose_command(source: str) -> str:
 
 def _half_a_model(folder: Path) -> str | None:
     """What to say of a COLMAP project that is not finished."""
-    for place in ("sparse/0", "sparse", "."):
+    lacking = _lacking(folder, ("sparse/0", "sparse", "."))
+    if lacking is not None:
+        return f"its COLMAP model lacks {lacking}; copy or export the model again"
+    if exists(folder / "database.db"):
+        return "it holds a database of COLMAP but no model (sparse/0) and no photographs; copy both"
+    return None
+
+
+def _lacking(folder: Path, places: tuple[str, ...]) -> str | None:
+    """The file that is missing where one of a model's two is there; None: no such half."""
+    for place in places:
         for ending in ("bin", "txt"):
             files = ("cameras", "images")
             absent = [name for name in files if not exists(folder / place / f"{name}.{ending}")]
             if len(absent) == 1:
-                lacks = f"{Path(place) / absent[0]}.{ending}"
-                return f"its COLMAP model lacks {lacks}; copy or export the model again"
-    if exists(folder / "database.db"):
-        return "it holds a database of COLMAP but no model (sparse/0) and no photographs; copy both"
+                return f"{Path(place) / absent[0]}.{ending}"
     return None
 
 

@@ -83,8 +83,8 @@ def find_focus(cameras: Sequence[Camera]) -> Focus:
     """
     if len(cameras) < 2:
         raise InputError(
-            f"the content distance needs at least 2 training cameras, not {len(cameras)}; add "
-            "photographs taken from other places."
+            f"the content distance needs at least 2 training cameras, not {len(cameras)} besides "
+            "those for testing; add photographs taken from other places."
         )
     centres = np.array([camera.position for camera in cameras])
     axes = np.array([camera.forward for camera in cameras])

@@ -117,9 +117,10 @@ def _require_bounds(scene: Scene) -> None:
         near, far = scene.bounds[index]
         if not 0.0 < near < far < math.inf:
             raise InputError(
-                f"{scene.name}: the bounds of {scene.views[index].name} must be two depths above "
-                f"0, the nearer first, not {near:g} and {far:g}; correct them, or train "
-                "with --contraction linf, which does not need them."
+                f"{scene.name}: the bounds of {scene.views[index].name}, the last two numbers of "
+                "its row in poses_bounds.npy, must be two depths above 0, the nearer first, not "
+                f"{near:g} and {far:g}; correct them, or train with --contraction linf, which does "
+                "not need them."
             )
 
 

@@ -13,7 +13,7 @@ from warpnerf.checks import InputError, require_at_least, require_one_of, requir
 from warpnerf.config import Scaling
 from warpnerf.model.interface import Model
 from warpnerf.model.models import model_of
-from warpnerf.rendering.render import Steps
+from warpnerf.rendering.render import MOST_LINEAR, Steps
 from warpnerf.torch.launches import Call, Render
 from warpnerf.torch.tensors import (
     corner_of,
@@ -23,8 +23,8 @@ from warpnerf.torch.tensors import (
     require_grid,
 )
 
-MAX_STEPS = 1e9
-"""Steps that a ray can count, from its origin on."""
+MAX_STEPS = {torch.float32: MOST_LINEAR, torch.float64: 10**9}
+"""Steps that a ray can count, from its origin on: those whose distances are told apart."""
 
 
 class RenderedRays(NamedTuple):
@@ -127,10 +127,10 @@ def render_rays(
         else 0.0
     )
     reach += float(np.linalg.norm(corners[1] - corners[0]))
-    if reach / step > MAX_STEPS:
+    if reach / step > (most := MAX_STEPS[raw.dtype]):
         raise InputError(
             f"step {step:g} is too short for rays that reach {reach:g} scene units: more than "
-            f"{MAX_STEPS:g} steps; use a longer step, or scale the scene."
+            f"{most} steps; use a longer step, or an origin nearer to the box."
         )
     for field, value in (("background", background), ("content_distance", content_distance)):
         require_dense(field, value)

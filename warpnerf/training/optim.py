@@ -69,7 +69,7 @@ class NodesRule:
             gradients.struct,
             parameter.values,
             state["moments"],
-            chunk=NODES // tiles.STRETCH,
+            at_once=NODES // tiles.STRETCH,
             cache=gradients.launches,
         )
         gradients.touched.zero_()
@@ -192,7 +192,7 @@ def add_total_variation(
             vector(n_floats)(*(factor * parameter.variation)),
             strength,
             gradients.struct,
-            chunk=NODES // tiles.STRETCH,
+            at_once=NODES // tiles.STRETCH,
             cache=gradients.launches,
         )
 

@@ -8,8 +8,8 @@ metrics.json                 figures of the test views
 test.png                     a few test views, to look at first: truth, rendering, depth, PSNR
 test/                        truth, rendering and depth of each test view, side by side
 scene/                       photographs with the poses that were estimated, where they had none
-.lock                        while a training writes here
 next/scene/                  the same, until the run that it is made for begins
+.lock                        while a training writes here
 previous/                    a run that was replaced, until this one has saved something
 """
 
@@ -170,7 +170,8 @@ class Run:
             run_files.sweep(self.folder)
             save_checkpoint(path, state)
             # One of a later step is there only if it was damaged, and training resumed before it.
-            kept = [p for p in self.checkpoints if p.name <= path.name][:KEPT]
+            step = run_files.step_of(path)
+            kept = [p for p in self.checkpoints if run_files.step_of(p) <= step][:KEPT]
             for old in self.checkpoints:
                 if old not in kept:
                     old.unlink()

@@ -55,6 +55,11 @@ class RunConfig(msgspec.Struct, frozen=True):
         )
 
 
+def pictures_of(scene: Scene) -> list[str]:
+    """``RunConfig.pictures`` of a scene."""
+    return sorted(picture_files([view.name for view in scene.views]).values())
+
+
 def describe(
     scene: Scene,
     stored: str,
@@ -83,7 +88,7 @@ def describe(
         "content_distance": content_distance,
         **extent,
         "notes": [*scene.warnings, *scene.notes],
-        "pictures": sorted(picture_files([view.name for view in scene.views]).values()),
+        "pictures": pictures_of(scene),
         "train": config_to_json(config),
     }
     if found:

@@ -37,8 +37,9 @@ def checkpoint_path(folder: Path, step: int) -> Path:
 
 def checkpoints(folder: Path) -> list[Path]:
     """The checkpoints, the newest first."""
-    found = folder.glob("checkpoint-????????.safetensors")
-    return sorted((path for path in found if _digits(path).isdigit()), reverse=True)
+    found = folder.glob("checkpoint-*.safetensors")
+    named = (path for path in found if len(_digits(path)) >= 8 and _digits(path).isdecimal())
+    return sorted(named, key=step_of, reverse=True)
 
 
 def step_of(checkpoint: Path) -> int:

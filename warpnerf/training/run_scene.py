@@ -8,7 +8,7 @@ from warpnerf.checks import InputError
 from warpnerf.scenes.files import exists
 from warpnerf.scenes.load import BUILTIN, load_scene
 from warpnerf.scenes.scene import Scene
-from warpnerf.training.run_config import RunConfig
+from warpnerf.training.run_config import RunConfig, pictures_of
 
 
 def load_run_scene(config: RunConfig, moved: str | None = None) -> Scene:
@@ -20,10 +20,19 @@ def load_run_scene(config: RunConfig, moved: str | None = None) -> Scene:
             there first.
 
     Raises:
-        InputError: The scene cannot be read, or the run's masks are gone.
+        InputError: The scene cannot be read, the run's masks are gone, or what it is said to have
+            moved to is another one.
     """
     path, masks = path_of(config, moved), masks_of(config, moved)
     scene = load_scene(path, downscale=config.downscale, masks=masks, images="files")
+    pictures = pictures_of(scene)
+    if moved is not None and config.pictures is not None and pictures != config.pictures:
+        other = sorted({*pictures} ^ {*config.pictures})
+        raise InputError(
+            f"--scene {moved}: is not what the run was trained on: it has {len(pictures)} "
+            f"photographs where the run has {len(config.pictures)}, and {other[0]} is in one of "
+            "them only; name where the run's photographs are now."
+        )
     return config.as_trained(scene)
 
 

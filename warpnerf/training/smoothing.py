@@ -68,7 +68,17 @@ def strengths(
 def root_mean_square_scale(
     points: np.ndarray, cameras: Sequence[Camera], distances: Sequence[float], near: float = 0.0
 ) -> np.ndarray:
-    """The root of the mean square of the scales of rays at points [n, 3], scene units; [n]."""
+    """The root of the mean square of the scales of the rays that come by.
+
+    Args:
+        points: [n, 3] scene units.
+        cameras: Whose rays.
+        distances: Content distance of each camera, scene units.
+        near: Rays begin at this distance, scene units.
+
+    Returns:
+        [n] in [0, 1]; 1 where no ray comes by.
+    """
     positions = np.array([camera.position for camera in cameras])
     forward = np.array([camera.forward for camera in cameras])
     edge = np.array([_cosine(camera) for camera in cameras], np.float32)

@@ -9,7 +9,7 @@ from warpnerf.checks import InputError
 from warpnerf.config import TrainConfig
 from warpnerf.presets import PRESETS
 from warpnerf.rendering.field import Field
-from warpnerf.scenes.scene import Scene
+from warpnerf.scenes.scene import Scene, require_scene
 from warpnerf.training.coarse import begin
 from warpnerf.training.state import Progress, TrainingState
 
@@ -55,15 +55,16 @@ def train(
         The field, and how training ended.
 
     Raises:
-        InputError: The scene is none, the device is missing, the grid would not fit the memory, a
-            short training for the content distance met nothing opaque, or scene or configuration
-            are not those of the training to be resumed.
+        InputError: Scene or configuration is none, the device is missing, the grid would not fit
+            the memory, a short training for the content distance met nothing opaque, or scene or
+            configuration are not those of the training to be resumed.
         FloatingPointError: The loss, or a value in the grid, is no longer a finite number.
     """
-    if not isinstance(scene, Scene):
+    require_scene(scene, "train")
+    if isinstance(config, str) or not isinstance(config, TrainConfig | None):
         raise InputError(
-            f"train wants a scene, not {scene!r}; load_scene gives that of a folder, as in "
-            "train(load_scene(folder))."
+            f"train wants a configuration, not {config!r}; PRESETS has those of names, as in "
+            'train(scene, PRESETS["fast"]).'
         )
     if config is None:
         config = PRESETS["fast"] if resume is None else resume.config

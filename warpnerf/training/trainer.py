@@ -125,6 +125,13 @@ class Trainer:
             self.workers.device,
             None if resume is None else resume.field.grid,
         )
+        idle = config.scaling == "none" or not self.grid.folded
+        if resume is None and idle and config.jacobian != "none":
+            raise InputError(
+                f"jacobian {config.jacobian} does nothing where gradients are not scaled or space "
+                f"is not folded: here scaling is {config.scaling} and grid.contraction "
+                f"{self.grid.contraction}; set it to none."
+            )
         self.weights = first_weights(self.model, config.seed, self.workers)
         self.optimiser = first_states(self.parameters(), self.workers)
         self.free = FreeCells.none(self.workers)

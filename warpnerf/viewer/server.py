@@ -160,10 +160,10 @@ def require_place(host: str, port: int | None) -> None:
                 pass
     except (OSError, UnicodeError) as error:
         reason = getattr(error, "strerror", None) or str(error)
-        raise InputError(
-            f"--host {host} --port {port} cannot be listened at: {reason}; choose another port, 0 "
-            "for any, or 127.0.0.1."
-        ) from None
+        where, else_ = f"--host {host}", "leave it out for 127.0.0.1"
+        if port:
+            where, else_ = f"{where} --port {port}", "choose another port, 0 for any, or 127.0.0.1"
+        raise InputError(f"{where} cannot be listened at: {reason}; {else_}.") from None
 
 
 @contextmanager

@@ -23,7 +23,7 @@ def log1p_small(x: real) -> real:
 
 
 @wp.func
-def opacity_of(tau: real, attenuation: real) -> real:
+def alpha_of(tau: real, attenuation: real) -> real:
     """1 - exp(-tau) for tau >= 0, given attenuation = exp(-tau); precise for small tau too."""
     if tau < real(0.01):
         return tau * (

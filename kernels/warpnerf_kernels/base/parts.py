@@ -121,7 +121,13 @@ class HeadVectors(NamedTuple):
     adj_decode_pack_with_colours: Any = None
     """adj_decode_pack where the loss is on samples as well: what flows back to a sample's colour is
     the row's adj_channels, and its sample_slope times the colour's difference from target_rgb. For
-    heads of samples."""
+    heads of samples; with such a loss, one without it runs in the scalar form."""
+
+    def but(self, **changes: Any) -> "HeadVectors":
+        """The same with other functions. ``adj_decode_pack_with_colours`` has to be given, too:
+        that of the other would not do the same.
+        """
+        return self._replace(**{"adj_decode_pack_with_colours": None, **changes})
 
 
 class Head(NamedTuple):

@@ -162,12 +162,11 @@ def deferred(n_channels: int, n_frequencies: int, width: int, n_hidden: int) -> 
         adj_decode=adj_decode,
         shade=shade,
         adj_shade=adj_shade,
-        vectors=head.vectors._replace(
+        vectors=head.vectors.but(
             begin_rows=network.begin_rows,
             prepare_row=prepare_row,
             shade_rows=shade_rows,
             adj_shade_rows=adj_shade_rows,
-            adj_decode_pack_with_colours=None,
             row_fields=(
                 ("inputs", padded),
                 ("adj_inputs", padded),

@@ -285,7 +285,7 @@ def features(
         decode=decode,
         adj_decode=adj_decode,
         weight_min=weight_min,
-        vectors=head.vectors._replace(
+        vectors=head.vectors.but(
             begin_rows=network.begin_rows,
             prepare_row=prepare_row,
             adj_prepare_row=adj_prepare_row,

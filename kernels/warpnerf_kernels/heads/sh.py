@@ -175,7 +175,7 @@ def sh(degree: int) -> Head:
         prepare=harmonics,
         decode=decode,
         adj_decode=adj_decode,
-        vectors=head.vectors._replace(
+        vectors=head.vectors.but(
             prepare_row=prepare_row,
             decode_pack=decode_pack,
             adj_decode_pack=adj_decode_pack,

@@ -31,11 +31,12 @@ class Parts(NamedTuple):
     @property
     def have_packs(self) -> bool:
         """Whether all parts have a vector form; else the CPU runs the scalar one, on a thread."""
-        return (
-            self.sampler.place_pack is not None
-            and self.encoding.vectors is not None
-            and self.head.vectors is not None
-        )
+        if self.sampler.place_pack is None or self.encoding.vectors is None:
+            return False
+        of_head = self.head.vectors
+        if of_head is None:
+            return False
+        return not self.losses.on_samples or of_head.adj_decode_pack_with_colours is not None
 
     @property
     def have_colours_of_samples(self) -> bool:

@@ -169,7 +169,7 @@ def tile_variation(n_floats: int) -> wp.Function:
 
 @cache
 def total_variation_forward_kernel(n_floats: int) -> wp.Kernel:
-    """Each node's share of TV(x); their sum is TV(x)."""
+    """Each node's share of TV(x). Training does not ask for it; the adjoint is held against it."""
     Node = vector(n_floats)
 
     @wp.kernel(module="unique", enable_backward=False)

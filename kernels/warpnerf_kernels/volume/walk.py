@@ -13,7 +13,7 @@ from typing import Any
 
 import warp as wp
 
-from ..base.activation import adj_softplus, opacity_of
+from ..base.activation import adj_softplus, alpha_of
 from ..base.parts import Encoding, Head, Losses, Sampler
 from ..base.types import Ray, gradient_type, real, vec3, vector
 from ..sampling.traversal import distance_of, length_of, traversal
@@ -82,8 +82,8 @@ def walk(sampler: Sampler, encoding: Encoding, head: Head, losses: Losses) -> Si
             if sample.step < ray.end:
                 raw = read(scene.field, sample.position)
                 matter = matter_of(scene.density, raw[0], sample.dt)
-                opacity = opacity_of(matter.sigma * sample.dt, matter.attenuation)
-                weight = total.transmittance * opacity
+                alpha = alpha_of(matter.sigma * sample.dt, matter.attenuation)
+                weight = total.transmittance * alpha
                 if weight > real(weight_min):
                     channels = decode(scene.head, view, raw)
                     total.channels += weight * channels
@@ -151,7 +151,7 @@ def walk(sampler: Sampler, encoding: Encoding, head: Head, losses: Losses) -> Si
             step = sample.step + 1
             raw = read(scene.field, sample.position)
             matter = matter_of(scene.density, raw[0], sample.dt)
-            weight = transmittance * opacity_of(matter.sigma * sample.dt, matter.attenuation)
+            weight = transmittance * alpha_of(matter.sigma * sample.dt, matter.attenuation)
             transmittance *= matter.attenuation
             scale = distance_scale(
                 sample.t, content_distance, sample.det_jacobian, scaling, jacobian

@@ -3,7 +3,7 @@
     L = sum of raw densities over samples with t < distance
 
 so each of them has the slope 1, whatever it weighs. The distance scaling applies to it as to all
-that reaches a sample, and takes most of it back near the camera.
+that reaches a sample.
 """
 
 from typing import Any
