@@ -148,7 +148,7 @@ def evaluate(
         Figures of each image and their means, and what hangs in front of the training cameras.
 
     Raises:
-        InputError: The scene has no such split; or it is no scene, or what renders no field.
+        InputError: Field or scene is none, or the scene has no such split.
     """
     from warpnerf.rendering.field import require_field
 

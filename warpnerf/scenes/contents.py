@@ -18,6 +18,9 @@ UNREAD_PHOTOGRAPHS = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef",
 
 VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
 
+BESIDE_PHOTOGRAPHS = ("sparse/0", "sparse")
+"""Where a model is looked for of which a file is missing."""
+
 NEEDED = 3
 """Photographs, at least, whose poses can be estimated."""
 
@@ -61,8 +64,8 @@ def unread_photographs(folder: Path) -> list[Path]:
 def is_unposed(path: Path) -> bool:
     """Whether a path leads to what poses can be estimated of: photographs without any, a video."""
     if path.is_dir():
-        begun = holds_scene(path) or _lacking(path, ("sparse/0", "sparse")) is not None
-        return not begun and len(photographs_in(path)) >= NEEDED
+        posed = holds_scene(path) or _lacking(path, BESIDE_PHOTOGRAPHS) is not None
+        return not posed and len(photographs_in(path)) >= NEEDED
     return path.suffix.lower() in VIDEOS and exists(path)
 
 
@@ -86,7 +89,7 @@ def _what_is_there(folder: Path) -> str:
     photographs = photographs_in(folder)
     if photographs:
         n = len(photographs)
-        lacking = _lacking(folder, ("sparse/0", "sparse"))
+        lacking = _lacking(folder, BESIDE_PHOTOGRAPHS)
         if lacking is not None:
             return (
                 f"its COLMAP model lacks {lacking}; copy or export the model again, or estimate "
@@ -130,7 +133,7 @@ def pose_command(source: str) -> str:
 
 def _half_a_model(folder: Path) -> str | None:
     """What to say of a COLMAP project that is not finished."""
-    lacking = _lacking(folder, ("sparse/0", "sparse", "."))
+    lacking = _lacking(folder, (*BESIDE_PHOTOGRAPHS, "."))
     if lacking is not None:
         return f"its COLMAP model lacks {lacking}; copy or export the model again"
     if exists(folder / "database.db"):

@@ -92,7 +92,10 @@ def read_tensors(
         with path.open("rb") as file:
             _strict_json(file.read(int.from_bytes(file.read(8), "little")))
     except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
-        refuse(path, f"it is not readable as safetensors ({error})")
+        raise DamagedFileError(
+            f"{path} is damaged, or nothing that warpnerf wrote: it is not readable as safetensors "
+            f"({error}); name another file, or train again."
+        ) from None
     try:
         header = _strict_json(metadata.get("header", "{}"))
         kind = header.get("format")

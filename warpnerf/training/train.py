@@ -61,7 +61,7 @@ def train(
         FloatingPointError: The loss, or a value in the grid, is no longer a finite number.
     """
     require_scene(scene, "train")
-    if isinstance(config, str) or not isinstance(config, TrainConfig | None):
+    if config is not None and not isinstance(config, TrainConfig):
         raise InputError(
             f"train wants a configuration, not {config!r}; PRESETS has those of names, as in "
             'train(scene, PRESETS["fast"]).'

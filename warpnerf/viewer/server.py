@@ -160,10 +160,11 @@ def require_place(host: str, port: int | None) -> None:
                 pass
     except (OSError, UnicodeError) as error:
         reason = getattr(error, "strerror", None) or str(error)
-        where, else_ = f"--host {host}", "leave it out for 127.0.0.1"
+        named, way_out = f"--host {host}", "leave it out for 127.0.0.1"
         if port:
-            where, else_ = f"{where} --port {port}", "choose another port, 0 for any, or 127.0.0.1"
-        raise InputError(f"{where} cannot be listened at: {reason}; {else_}.") from None
+            named += f" --port {port}"
+            way_out = "choose another port, 0 for any, or 127.0.0.1"
+        raise InputError(f"{named} cannot be listened at: {reason}; {way_out}.") from None
 
 
 @contextmanager
