@@ -98,7 +98,7 @@ def test_another_scene_is_not_taken_for_one_that_moved(tmp_path: Path) -> None:
         lambda: export_command(run, tmp_path / "a.npz", **other),
         lambda: render_command(run, output=tmp_path / "a.gif", **other),
     ):
-        with pytest.raises(InputError, match=r"other: is not what the run .* has 3 .* has 5"):
+        with pytest.raises(InputError, match=r"other: is not what .* 3 photographs, not 5"):
             command()
 
 

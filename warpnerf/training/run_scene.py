@@ -27,11 +27,13 @@ def load_run_scene(config: RunConfig, moved: str | None = None) -> Scene:
     scene = load_scene(path, downscale=config.downscale, masks=masks, images="files")
     pictures = pictures_of(scene)
     if moved is not None and config.pictures is not None and pictures != config.pictures:
-        other = sorted({*pictures} ^ {*config.pictures})
+        n, trained = len(pictures), len(config.pictures)
+        how = f"it has {n} photographs, not {trained}"
+        if n == trained:
+            how = "its photographs have other names"
         raise InputError(
-            f"--scene {moved}: is not what the run was trained on: it has {len(pictures)} "
-            f"photographs where the run has {len(config.pictures)}, and {other[0]} is in one of "
-            "them only; name where the run's photographs are now."
+            f"--scene {moved}: is not what the run was trained on: {how}; name where the run's "
+            "photographs are now."
         )
     return config.as_trained(scene)
 
