@@ -67,6 +67,19 @@ def require_one_of(field: str, value: str, choices: Iterable[str]) -> None:
         raise InputError(f"{field} must be one of {', '.join(choices)}, not {value!r}.")
 
 
+def require_kind(value: object, kind: type, what: str, way_out: str) -> None:
+    """Raise InputError unless a value is of a class, such as where the name of a file is given.
+
+    Args:
+        value: What was given.
+        kind: The class.
+        what: The first words of the sentence, such as "train wants a scene".
+        way_out: The last ones.
+    """
+    if not isinstance(value, kind):
+        raise InputError(f"{what}, not {value!r}; {way_out}.")
+
+
 def require_shares(field: str, shares: tuple[float, ...]) -> None:
     """Raise InputError unless these are shares of the training, one after another."""
     if list(shares) != sorted(shares) or not all(0 < share < 1 for share in shares):

@@ -9,6 +9,7 @@ from typing import Any, Literal, get_args
 from warpnerf.checks import (
     InputError,
     require_at_least,
+    require_kind,
     require_one_of,
     require_positive,
     require_shares,
@@ -387,8 +388,8 @@ class TrainConfig:
             raise InputError(f"model must be a name or a model, not {self.model!r}.")
         parts = {"grid": GridConfig, "march": MarchConfig, "optim": OptimConfig, "loss": LossConfig}
         for name, kind in parts.items():
-            if not isinstance(part := getattr(self, name), kind):
-                raise InputError(f"{name} must be a {kind.__name__}, not {part!r}.")
+            what = f"{name} must be a {kind.__name__}"
+            require_kind(getattr(self, name), kind, what, "make one, or leave it out")
         require_whole("steps", self.steps, 1)
         require_whole("coarse_steps", self.coarse_steps, 0)
         if 0 < self.coarse_steps < MIN_COARSE_STEPS:

@@ -210,7 +210,7 @@ def _begin_alone(
     scene = _read(source, downscale, masks, images, output)
 
     # Not before: these load Warp, and bad input is refused at once.
-    from warpnerf.evaluation.inspection import oddities
+    from warpnerf.evaluation.oddities import oddities
     from warpnerf.scenes.survey import survey
     from warpnerf.training.coarse import begin, is_needed
     from warpnerf.training.run import Run

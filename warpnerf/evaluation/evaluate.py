@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from warpnerf.checks import InputError
+from warpnerf.checks import InputError, require_kind
 from warpnerf.evaluation.metrics import (
     SSIM_WINDOW,
     alike_where_masked,
@@ -26,7 +26,7 @@ from warpnerf.evaluation.near_field import (
     measure_near_field,
 )
 from warpnerf.runtime.terminal import table_text
-from warpnerf.scenes.scene import Scene, View, require_scene, require_split
+from warpnerf.scenes.scene import Scene, View, require_split
 
 if TYPE_CHECKING:
     from warpnerf.rendering.field import Field, Rendering
@@ -150,10 +150,10 @@ def evaluate(
     Raises:
         InputError: Field or scene is none, or the scene has no such split.
     """
-    from warpnerf.rendering.field import require_field
+    from warpnerf.rendering.field import Field
 
-    require_field(field, "evaluate")
-    require_scene(scene, "evaluate")
+    require_kind(field, Field, "evaluate wants a field", "load_field reads that of a run")
+    require_kind(scene, Scene, "evaluate wants a scene", "load_scene gives that of a folder")
     images = []
     within = NEAR_SHARE * scene.content_distance
     views = [scene.views[index] for index in require_split(scene, split)]

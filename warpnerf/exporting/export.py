@@ -6,13 +6,13 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from warpnerf.checks import InputError
+from warpnerf.checks import InputError, require_kind
 from warpnerf.exporting import cameras as scenes
 from warpnerf.exporting import mesh, page, splats, surface, volume
 from warpnerf.exporting.sight import look
-from warpnerf.rendering.field import Field, require_field
+from warpnerf.rendering.field import Field
 from warpnerf.scenes.focus import up_direction
-from warpnerf.scenes.scene import Scene, require_scene
+from warpnerf.scenes.scene import Scene
 from warpnerf.writing import write_atomically
 
 SURFACES = (".glb", ".obj", ".ply", ".points.ply", "")
@@ -71,9 +71,9 @@ def export(
             format, a missing scene or package, or nothing to write.
         OSError: It cannot be written; what was there before is left as it was.
     """
-    require_field(field, "export")
+    require_kind(field, Field, "export wants a field", "load_field reads that of a run")
     if scene is not None:
-        require_scene(scene, "export")
+        require_kind(scene, Scene, "export wants a scene", "load_scene gives that of a folder")
     path = Path(path)
     ending = checked_ending(path)
     for name, value in (("level", level), ("min_size", min_size)):

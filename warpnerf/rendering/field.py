@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 from warpnerf_kernels.base.types import real, vec3
 
-from warpnerf.checks import InputError, require_rays
+from warpnerf.checks import require_rays
 from warpnerf.model.grid import FreeCells, VoxelGrid, reach_of_places
 from warpnerf.model.interface import Model
 from warpnerf.rendering.rays import camera_rays
@@ -108,18 +108,4 @@ class Field:
             rgb=rays.rgb.numpy().reshape(*shape, 3).clip(0.0, 1.0),  # an MLP may add too much
             depth=rays.depth.numpy().reshape(shape),
             opacity=1.0 - rays.transmittance.numpy().reshape(shape),
-        )
-
-
-def require_field(field: object, what: str) -> None:
-    """Raise InputError unless something is a field, such as where the folder of a run is given.
-
-    Args:
-        field: What was given.
-        what: To what.
-    """
-    if not isinstance(field, Field):
-        raise InputError(
-            f"{what} wants a field, not {field!r}; load_field reads that of a run, from its "
-            "field.safetensors."
         )

@@ -233,17 +233,3 @@ def require_split(scene: Scene, split: str) -> tuple[int, ...]:
             f"{scene.name} has no {split!r} views; it has {', '.join(sorted(scene.splits))} or all."
         )
     return scene.splits[split]
-
-
-def require_scene(scene: object, what: str) -> None:
-    """Raise InputError unless something is a scene, such as where its folder is given.
-
-    Args:
-        scene: What was given.
-        what: To what.
-    """
-    if not isinstance(scene, Scene):
-        raise InputError(
-            f"{what} wants a scene, not {scene!r}; load_scene gives that of a folder, as in "
-            f"{what}(..., load_scene(folder))."
-        )

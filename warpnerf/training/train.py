@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from warpnerf.checks import InputError
+from warpnerf.checks import require_kind
 from warpnerf.config import TrainConfig
 from warpnerf.presets import PRESETS
 from warpnerf.rendering.field import Field
-from warpnerf.scenes.scene import Scene, require_scene
+from warpnerf.scenes.scene import Scene
 from warpnerf.training.coarse import begin
 from warpnerf.training.state import Progress, TrainingState
 
@@ -60,12 +60,10 @@ def train(
             configuration are not those of the training to be resumed.
         FloatingPointError: The loss, or a value in the grid, is no longer a finite number.
     """
-    require_scene(scene, "train")
-    if config is not None and not isinstance(config, TrainConfig):
-        raise InputError(
-            f"train wants a configuration, not {config!r}; PRESETS has those of names, as in "
-            'train(scene, PRESETS["fast"]).'
-        )
+    require_kind(scene, Scene, "train wants a scene", "load_scene gives that of a folder")
+    if config is not None:
+        way_out = 'those of names are in PRESETS, as in train(scene, PRESETS["fast"])'
+        require_kind(config, TrainConfig, "train wants a configuration", way_out)
     if config is None:
         config = PRESETS["fast"] if resume is None else resume.config
     trainer = begin(scene, config, resume)
