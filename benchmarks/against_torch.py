@@ -41,6 +41,7 @@ from measuring import (
     default_threads,
     machine,
     median_interval,
+    named,
     options,
     show,
     write_record,
@@ -51,8 +52,8 @@ from training import path_of
 from workload import CAMERA_DISTANCE, MODELS, ModelName, Workload, make_workload, split_network
 
 import warpnerf as wn
-from warpnerf.config import OptimConfig
-from warpnerf.model.parameters import parameters_of
+from warpnerf.fields.parameters import head_parameters
+from warpnerf.optim_config import OptimConfig
 from warpnerf.rendering.render import TrainingPass
 from warpnerf.runtime.parallel import Workers
 from warpnerf.training.optim import adam_step, first_states
@@ -76,7 +77,7 @@ class WarpStep:
         self._free, self._batch = work.free_cells(workers), work.batch(workers)
         model, grid, weights = work.warp_model(), work.voxel_grid(workers), work.weights(workers)
         self._config = OptimConfig()
-        self._parameters = parameters_of(model, grid, weights, self._config)
+        self._parameters = grid.parameters(model, self._config) + head_parameters(model, weights)
         self._states = first_states(self._parameters, workers)
         self._update = 0
         scaling = "clamped" if work.scaled else "none"
@@ -169,16 +170,18 @@ def late_workload(scene: wn.Scene, model: ModelName, steps: int, voxels: int) ->
         raise SystemExit(f"against_torch: {scene.name} is unbounded, which torch is not here.")
     config = wn.PRESETS["dvgo" if model == "dvgo" else "fast"]
     if model != "dvgo":
-        config = replace(config, model=model)
+        config = replace(config, model=named(model))
     config = replace(config, steps=steps, grid=replace(config.grid, voxels=voxels))
     state = train_until_late(scene, config)
     trainer = Trainer(scene, state.config, state)
-    grid, march, batch = trainer.grid, trainer.march_steps(), trainer._sampler.draw(steps)
+    grid, march, batch = trainer.storage, trainer.march_steps(), trainer._sampler.draw(steps)
     origins = batch.origins.numpy()
-    corners = np.array(list(itertools.product(*zip(grid.box_min, grid.box_max, strict=True))))
+    corners = np.array(
+        list(itertools.product(*zip(grid.lattice.box_min, grid.lattice.box_max, strict=True)))
+    )
     reach = np.linalg.norm(origins[:, None] - corners, axis=2).max()
     return Workload(
-        values=grid.values.numpy().reshape(*grid.size, -1),
+        values=grid.values.numpy().reshape(*grid.lattice.size, -1),
         free=trainer.free.distance.numpy().reshape(trainer.free.size),
         origins=origins,
         directions=batch.directions.numpy(),
@@ -186,8 +189,8 @@ def late_workload(scene: wn.Scene, model: ModelName, steps: int, voxels: int) ->
         n_steps=math.ceil(reach / march.step),
         step=march.step,
         background=tuple(batch.background.numpy()[0].tolist()),
-        content_distance=trainer.content_distance,
-        box=(grid.box_min, grid.box_max),
+        content_distance=trainer.plan.content_distance,
+        box=(grid.lattice.box_min, grid.lattice.box_max),
         density_shift=grid.density_shift,
         density_scale=grid.density_scale,
         transmittance_min=march.transmittance_min,

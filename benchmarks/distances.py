@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Any
 
 from extents import load, variants
-from measuring import add_model, machine, options, write_record
+from measuring import add_model, machine, options, plain_training, write_record
 from room_scan import SCANS
 
-import warpnerf as wn
 from warpnerf.runtime.parallel import Workers
-from warpnerf.training.coarse import find_sight
+from warpnerf.training.coarse import extent_by_training
+from warpnerf.training.plan import resolve
 
 
 def main() -> None:
@@ -40,23 +40,23 @@ def main() -> None:
             scene, truth = load(name, Path(temporary) / name, arguments.views)
             alone, _ = variants(scene)["cameras"]
             for seed in arguments.seeds:
-                config = wn.TrainConfig(
+                config = plain_training(
                     model=arguments.model,
                     seed=seed,
                     device=arguments.device,
                     threads=arguments.threads,
                 )
-                sight, seconds = find_sight(alone, config)
-                assert sight is not None, f"{name}: nothing opaque has grown"
+                observed, seconds = extent_by_training(alone, resolve(alone, config))
+                assert observed is not None, f"{name}: nothing opaque has grown"
                 row = {
                     "scene": name,
                     "seed": seed,
                     "cameras": alone.content_distance,
-                    "found": sight.content_distance,
+                    "found": observed.content_distance,
                     "points": None if scene.content_distances is None else scene.content_distance,
                     "true": truth,
                     "box_found": alone.guessed,
-                    "longest_edge": float((sight.box_max - sight.box_min).max()),
+                    "longest_edge": float((observed.box_max - observed.box_min).max()),
                     "seconds": seconds,
                 }
                 rows.append(row)

@@ -18,15 +18,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from measuring import machine, options, write_record
+from measuring import machine, options, plain_training, write_record
 from room_scan import SCANS, write_scan
 from training import path_of
 
 import warpnerf as wn
 from warpnerf.model.models import MODELS
 from warpnerf.runtime.parallel import Workers
-from warpnerf.scenes.focus import estimate_extent
-from warpnerf.training.coarse import begin
+from warpnerf.scenes.cameras.focus import estimate_extent
+from warpnerf.training.coarse import prepare_trainer
 
 
 def main() -> None:
@@ -40,7 +40,7 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=125, help="photographs of a scan")
     parser.add_argument("--model", default="rgb", choices=list(MODELS))
     arguments = parser.parse_args()
-    config = wn.TrainConfig(
+    config = plain_training(
         model=arguments.model,
         steps=arguments.steps,
         grid=wn.GridConfig(voxels=arguments.voxels),
@@ -99,6 +99,7 @@ def variants(scene: wn.Scene) -> dict[str, tuple[wn.Scene, dict[str, Any]]]:
         box_max=alone.box_max,
         content_distance=alone.content_distance,
         content_distances=None,
+        observations=None,
         guessed=alone.guessed,
     )
     each = {"content_distance": "per-camera"}
@@ -114,11 +115,11 @@ def variants(scene: wn.Scene) -> dict[str, tuple[wn.Scene, dict[str, Any]]]:
 
 def measure(scene: wn.Scene, trained: wn.Scene, config: wn.TrainConfig) -> dict[str, float]:
     """Train, and look at the test views and at the space before the training cameras."""
-    trainer = begin(trained, config)
+    trainer = prepare_trainer(trained, config)
     progress = trainer.run()
     found = wn.evaluate(trainer.field(), scene)
     return {
-        "content_distance": trainer.content_distance,
+        "content_distance": trainer.plan.content_distance,
         "longest_edge": float((trainer.scene.box_max - trainer.scene.box_min).max()),
         "psnr": found.mean["psnr"],
         "ssim": found.mean["ssim"],

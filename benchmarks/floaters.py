@@ -20,7 +20,7 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from measuring import RESULTS, machine, write_record
+from measuring import RESULTS, machine, plain_training, write_record
 
 import warpnerf as wn
 from warpnerf.evaluation.floater_metrics import near_density
@@ -47,7 +47,7 @@ def main() -> None:
         for scaling in ("none", "clamped"):
             found = []
             for seed in args.seeds:
-                config = wn.TrainConfig(
+                config = plain_training(
                     model="rgb", steps=steps, scaling=scaling, device=args.device, seed=seed
                 )
                 field = wn.train(scene, config).field

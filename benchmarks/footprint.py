@@ -23,7 +23,15 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from measuring import add_model, machine, median_interval, options, show, write_record
+from measuring import (
+    add_model,
+    machine,
+    median_interval,
+    options,
+    plain_training,
+    show,
+    write_record,
+)
 from training import path_of
 
 import warpnerf as wn
@@ -132,7 +140,7 @@ def train(path: str, model: str, downscale: int, steps: int, time_limit: float) 
     watching = threading.Thread(target=watch)
     watching.start()
     try:
-        config = wn.TrainConfig(model=model, steps=steps, time_limit=time_limit)
+        config = plain_training(model=model, steps=steps, time_limit=time_limit)
         result = wn.train(scene, config)
     finally:
         done.set()
@@ -140,8 +148,11 @@ def train(path: str, model: str, downscale: int, steps: int, time_limit: float) 
     found: dict[str, Any] = {
         "peak_bytes": peak,
         "before_bytes": before,
-        "arrays_bytes": 4 * 4 * math.prod(result.field.grid.size) * result.field.grid.n_floats,
-        "grid": result.field.grid.size,
+        "arrays_bytes": 4
+        * 4
+        * math.prod(result.field.lattice.size)
+        * result.field.storage.n_floats,
+        "grid": result.field.lattice.size,
         "steps": result.progress.step,
     }
     print(f"\n{json.dumps(found)}")

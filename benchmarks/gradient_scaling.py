@@ -11,8 +11,8 @@
     torch backward     the same rendering in torch, with the paper's operation against without
     operation alone    the backward of the paper's operation on 300 000 samples
 
-Of rgb all five, of the other models the first three; each model's launches are held against torch's
-gradient before. What one model takes turns with is its own.
+Of rgb all five, of the other models the first three; each model's launches are compared with
+torch's gradient before. What one model takes turns with is its own.
 
 The two of a pair take turns (ABBA), each counts its fastest; the figure is the median over pairs
 of their difference, with a 95 % interval from order statistics. Shares are of the unscaled backward
@@ -40,13 +40,15 @@ from warpnerf_kernels.launch import assembly
 from workload import DEFAULT_MODELS, Workload, make_workload
 
 from warpnerf.config import Scaling
-from warpnerf.model.grid import FreeCells
-from warpnerf.rendering.adjoint import AdjointLaunch, Gradients
-from warpnerf.rendering.render import (
-    TrainingPass,
-    scene_struct,
+from warpnerf.fields.gradients import Gradients
+from warpnerf.fields.occupancy import FreeCells
+from warpnerf.rendering.adjoint import AdjointLaunch
+from warpnerf.rendering.render import TrainingPass
+from warpnerf.rendering.structs import (
+    FieldStructs,
+    render_outputs_struct,
+    render_params_struct,
     scratch_struct,
-    seen_struct,
     variant_of,
 )
 from warpnerf.runtime.memory import usable_cores
@@ -72,16 +74,12 @@ class WarpAdjoint:
         self._free = FreeCells.none(workers)
         self._steps = work.steps()
         self._batch = work.batch(workers)
-        self._scene = scene_struct(
+        self._scene = render_params_struct(
             self._model,
             "float32",
-            box=self._grid.box,
-            free=self._free.struct,
-            steps=self._steps,
-            grid=self._grid.struct,
-            density=self._grid.density,
-            weights=self._weights,
-            workers=workers,
+            FieldStructs.of(self._grid, self._weights, self._free, self._steps, self._workers),
+            self._steps,
+            workers,
         )
         self._seen = self._render()
         n = int(self._seen.n_samples.numpy().sum())
@@ -101,7 +99,7 @@ class WarpAdjoint:
 
     def _render(self) -> Any:
         variant, n = self._variant("none"), self._batch.count
-        seen = seen_struct(variant, n, self._workers, assembly)
+        seen = render_outputs_struct(variant, n, self._workers, assembly)
         self._workers.launch_owned(
             assembly.render_forward_kernel(variant),
             -(-n // variant.batch),
@@ -141,7 +139,7 @@ class WarpAdjoint:
         launch = AdjointLaunch(
             assembly.render_backward_kernel(variant),
             variant,
-            self._model.most_steps(self._steps, self._grid.diagonal),
+            self._model.most_steps(self._steps, self._grid.lattice.diagonal),
             self._batch.count,
             self._workers,
         )
@@ -162,7 +160,7 @@ class WarpAdjoint:
         """What a launch adds, [X, Y, Z, n_values]."""
         self.gradients.values.zero_()
         launch()
-        return self.gradients.values.numpy().reshape(*self._grid.size, self._grid.n_floats)
+        return self.gradients.values.numpy().reshape(*self._grid.lattice.size, self._grid.n_floats)
 
 
 def share_memory(of: TrainingPass, to: TrainingPass) -> None:
@@ -170,7 +168,7 @@ def share_memory(of: TrainingPass, to: TrainingPass) -> None:
     for name, value in vars(of).items():
         if isinstance(value, wp.array | Gradients):
             vars(to)[name] = value
-    to._scene = of._scene
+    to._scene, to._outputs = of._scene, of._outputs
     if of.launch.sink is not None:
         to._scratch.packs, to._scratch.rows = of._scratch.packs, of._scratch.rows
     share_sink(of.launch, to.launch)
@@ -371,7 +369,7 @@ def main() -> None:
                     )
                     for s in SCALED
                 },
-                AT_KINKS if model in ("deferred", "features") else 0.0,
+                AT_KINKS if model in ("deferred", "per_sample") else 0.0,
             )
         plain = ours.backward("none")
         backward = Pairs(model, "render_backward", plain, ours.backward("clamped"), stopwatch)

@@ -3,7 +3,7 @@
     python benchmarks/growth.py builtin:room path/to/scene --steps 2000 --seeds 0 1 2
 
 Scenes are as for training.py. Trainings differ in nothing but what happens at each growth: moments
-of Adam that are carried over to the new nodes, as by default; an optimiser that begins anew, rates
+of Adam that are carried over to the new nodes, as by default; an optimiser that restarts, rates
 and all (``OptimConfig.restart_at_growth``); densities that are lowered by 1
 (``GridConfig.shift_at_growth``); both, as in DVGO. Prints PSNR and SSIM on the test views; writes
 benchmarks/results/growth_<device>.json.
@@ -14,7 +14,7 @@ from __future__ import annotations
 from dataclasses import replace
 from statistics import mean
 
-from measuring import add_model, machine, options, write_record
+from measuring import add_model, machine, options, plain_training, write_record
 from training import path_of
 
 import warpnerf as wn
@@ -22,11 +22,11 @@ from warpnerf.runtime.parallel import Workers
 
 WAYS = {
     "carried over": (0.0, False),
-    "begun anew": (0.0, True),
+    "restarted": (0.0, True),
     "shifted": (1.0, False),
     "both": (1.0, True),
 }
-"""Shift of densities, and whether the optimiser begins anew."""
+"""Shift of densities, and whether the optimiser restarts."""
 
 
 def main() -> None:
@@ -40,7 +40,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, help="by default one for each core")
     add_model(parser)
     arguments = parser.parse_args()
-    config = wn.TrainConfig(
+    config = plain_training(
         model=arguments.model,
         steps=arguments.steps,
         threads=arguments.threads,

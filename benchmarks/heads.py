@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from measuring import machine, options, write_record
+from measuring import machine, named, options, plain_training, write_record
 from plotting import plot_heads
 from training import path_of
 from turns import take_turns
@@ -40,7 +40,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--downscale", type=int, default=1)
     args = parser.parse_args()
-    config = wn.TrainConfig(steps=args.steps, time_limit=args.time_limit, device=args.device)
+    config = plain_training(steps=args.steps, time_limit=args.time_limit, device=args.device)
     print("scene                 seed  model      seconds   steps   PSNR    SSIM")
     rows = []
     for name in args.scenes:
@@ -76,7 +76,7 @@ def race(
     Returns:
         Of each model: seconds, steps, PSNR and SSIM at so many points on the way.
     """
-    trainers = {model: Trainer(scene, replace(config, model=model)) for model in models}
+    trainers = {model: Trainer(scene, replace(config, model=named(model))) for model in models}
     curves: dict[str, list[dict[str, Any]]] = {model: [] for model in models}
 
     def look(model: str, seconds: float) -> None:

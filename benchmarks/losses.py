@@ -28,6 +28,7 @@ from measuring import (
     machine,
     median_interval,
     options,
+    plain_training,
     show,
     write_record,
 )
@@ -36,7 +37,7 @@ from training import path_of
 import warpnerf as wn
 from warpnerf.config import LossConfig
 from warpnerf.model.models import MODELS
-from warpnerf.rendering.losses import Minimised
+from warpnerf.rendering.losses import Objective
 from warpnerf.rendering.rays import PixelSampler
 from warpnerf.rendering.render import TrainingPass
 from warpnerf.runtime.parallel import Workers
@@ -86,13 +87,13 @@ def ratios(
         TrainingPass(
             n_rays,
             field.model,
-            field.grid,
+            field.storage,
             field.weights,
             field.steps,
             "clamped",
             "none",
             workers,
-            Minimised(config=config, content_distance=scene.content_distance),
+            Objective(config=config, content_distance=scene.content_distance),
         )
         for config in (losses, LossConfig())
     )
@@ -125,7 +126,7 @@ def main() -> None:
     rows: list[dict[str, Any]] = []
     for name in args.scenes:
         scene = wn.load_scene(path_of(name))
-        config = wn.TrainConfig(model=args.model, steps=args.steps, threads=args.threads)
+        config = plain_training(model=args.model, steps=args.steps, threads=args.threads)
         field: Any = None
         for loss, losses in losses_of(scene, config).items():
             if loss != "squared" and loss not in args.losses:

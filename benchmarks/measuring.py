@@ -20,8 +20,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpnerf.model.models import MODELS
+from warpnerf.config import LossConfig, TrainConfig
+from warpnerf.model.interface import Model
+from warpnerf.model.models import MODELS, Deferred, model_of
 from warpnerf.runtime.memory import usable_cores
+
+wp.config.log_level = wp.LOG_ERROR  # a table is all that a benchmark prints
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
@@ -49,6 +53,16 @@ def _file(text: str) -> Path:
 def add_model(parser: argparse.ArgumentParser) -> None:
     """The option --model, of benchmarks that train one."""
     parser.add_argument("--model", default="deferred", choices=list(MODELS))
+
+
+def named(model: str) -> Model:
+    """The model of a name: of deferred the small one, which candidates and records have."""
+    return Deferred(specular=4, width=32) if model == "deferred" else model_of(model)
+
+
+def plain_training(model: str = "deferred", **changes: Any) -> TrainConfig:
+    """A training of a model, by name, with the squared error alone."""
+    return TrainConfig(model=named(model), loss=LossConfig(), **changes)
 
 
 class Stopwatch:

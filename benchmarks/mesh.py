@@ -1,4 +1,4 @@
-"""What is exported, held against the truth: builtin:room, whose surfaces are known exactly.
+"""What is exported, compared with the truth: builtin:room, whose surfaces are known exactly.
 
 Mesh: the distance of its vertices to the nearest true surface, and the distance of what training
 pixels see, exactly traced, to the nearest vertex; for several levels of density, with and without
@@ -19,7 +19,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from measuring import machine, options, write_record
+from measuring import machine, options, plain_training, write_record
 from PIL import Image
 from scipy.spatial import cKDTree
 
@@ -29,8 +29,8 @@ from warpnerf.exporting.splats import splats_ply
 from warpnerf.scenes.builtin.room import room_solids
 from warpnerf.scenes.builtin.solids import Ball, Cylinder
 
-sys.path.append(str(Path(__file__).parent.parent / "tests"))
-from reference.splats import draw_splats, read_splats
+sys.path.append(str(Path(__file__).parent.parent))
+from tests.reference.splats import draw_splats, read_splats
 
 OPACITIES = (0.1, 0.15, 0.2, 0.3, 0.5)
 """Of a voxel edge, at the levels that are tried."""
@@ -80,11 +80,11 @@ def psnr(squared_error: float) -> float:
 
 
 def measure_mesh(
-    field: wn.Field, sight: wn.Sight, opacity: float, unseen: bool, truth: tuple
+    field: wn.Field, visible: wn.Visibility, opacity: float, unseen: bool, truth: tuple
 ) -> dict[str, float]:
-    edge = float(field.grid.voxel_size.mean())
+    edge = float(field.lattice.voxel_size.mean())
     level = -np.log1p(-opacity) / edge
-    mesh = wn.extract_surface(field, sight, unseen=unseen, level=level)
+    mesh = wn.extract_surface(field, visible, unseen=unseen, level=level)
     points, colours = truth
     to_truth = distance_to_room(mesh.points.astype(np.float64))
     to_mesh, _ = cKDTree(mesh.points).query(points[::7])
@@ -122,15 +122,15 @@ def main() -> None:
     parser.add_argument("--picture", type=Path, help="JPEG of a test view: truth, field, splats")
     arguments = parser.parse_args()
     scene = wn.load_scene("builtin:room")
-    config = wn.TrainConfig(steps=arguments.steps, device=arguments.device)
+    config = plain_training(steps=arguments.steps, device=arguments.device)
     result = wn.train(scene, config)
     field = result.field
-    print(f"{arguments.steps} steps, voxel edge {field.grid.voxel_size.mean():.4f} m")
-    truth, sight = photographed(scene), wn.look(field, scene.training_cameras)
+    print(f"{arguments.steps} steps, voxel edge {field.lattice.voxel_size.mean():.4f} m")
+    truth, visible = photographed(scene), wn.visibility(field, scene.training_cameras)
     print("opacity unseen vertices  mesh->truth within 5 cm  truth->mesh within 5 cm  colours")
     rows = []
     for opacity, unseen in [*((o, False) for o in OPACITIES), (surface.LEVEL_OPACITY, True)]:
-        row = measure_mesh(field, sight, opacity, unseen, truth)
+        row = measure_mesh(field, visible, opacity, unseen, truth)
         rows.append(row)
         print(
             f"{opacity:7.2f} {unseen!s:6} {row['vertices']:8d}  "
@@ -139,7 +139,7 @@ def main() -> None:
             f"{row['colour_psnr']:.1f} dB",
             flush=True,
         )
-    made = wn.splats_of(field, sight)
+    made = wn.splats_of(field, visible)
     columns = read_splats(b"".join(splats_ply(made)))
     against_field, against_truth, pictures = [], [], []
     for index in scene.splits["test"][: arguments.views]:
@@ -170,7 +170,7 @@ def main() -> None:
     record = {
         "machine": machine(arguments.device, field.workers.count),
         "steps": arguments.steps,
-        "voxel_edge": float(field.grid.voxel_size.mean()),
+        "voxel_edge": float(field.lattice.voxel_size.mean()),
         "mesh": rows,
         "splats": {
             "count": len(made.centres),

@@ -4,7 +4,7 @@
 
 Scenes are as for training.py. Each model is trained on each scene by the preset fast up to nine
 tenths of its schedule; there the grid has all its nodes, and an update takes as many steps as it
-ever does. From there all go on in turns, each time with the same batches: eight updates, one of
+ever does. From there all continue in turns, each time with the same batches: eight updates, one of
 which smooths. A step is all that training does for 4096 rays: drawing them, the pass, its share of
 total variation and of Adam. Free space is not looked for, nor anything reported. Models differ in
 what they find to be free, too, so samples per ray are given.
@@ -25,6 +25,7 @@ from measuring import (
     default_threads,
     machine,
     median_interval,
+    named,
     options,
     show,
     write_record,
@@ -45,7 +46,7 @@ class Late:
     """A model late in its training, on a number of threads."""
 
     def __init__(self, scene: wn.Scene, state: wn.TrainingState, threads: int) -> None:
-        """Go on from a state."""
+        """Continue from a state."""
         config = replace(state.config, threads=threads)
         self._trainer = trainer = Trainer(scene, config, state)
         self._step = trainer.steps_done
@@ -87,7 +88,7 @@ class Late:
         return {
             "steps_an_update": n_steps,
             "samples_per_ray": float(self._trainer._pass.n_samples.numpy()[:rays].mean()),
-            "grid": self._trainer.grid.size,
+            "grid": self._trainer.lattice.size,
             "occupied": self._trainer.free.share(),
         }
 
@@ -155,7 +156,7 @@ def main() -> None:
         scene = wn.load_scene(path_of(name), downscale=args.downscale)
         states = {
             model: train_until_late(
-                scene, replace(wn.PRESETS["fast"], model=model, steps=args.steps)
+                scene, replace(wn.PRESETS["fast"], model=named(model), steps=args.steps)
             )
             for model in models
         }

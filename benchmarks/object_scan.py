@@ -25,7 +25,7 @@ from warpnerf.runtime.memory import usable_cores
 from warpnerf.scenes.builtin.raytrace import Light, Tracer
 from warpnerf.scenes.builtin.room_textures import checks, plain, spines, stripes
 from warpnerf.scenes.builtin.solids import Ball, Box, Cylinder, Room, Surface, Texture, Vec3
-from warpnerf.scenes.camera import Camera
+from warpnerf.scenes.cameras.camera import Camera
 
 AWAY = 4.03
 """Of the cameras from the middle, scene units, as in NeRF-synthetic."""
@@ -230,7 +230,7 @@ def write_scan(
 
 
 def main() -> None:
-    """Write the folder that is asked for."""
+    """Write the folder that is requested."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folder", type=Path, help="new")
     parser.add_argument("--size", type=int, default=800, help="width and height, pixels")

@@ -18,6 +18,9 @@ from typing import Any
 
 import numpy as np
 
+FORMER = {"per_sample": "features"}
+"""Names that models had in older trees."""
+
 
 class Tree:
     """A step of one workload at a time."""
@@ -33,13 +36,18 @@ class Tree:
         if model == "rgb":
             return True
         found = "model" in inspect.signature(self._make_workload).parameters
-        return found and model in importlib.import_module("workload").MODELS
+        return found and bool({model, FORMER.get(model)} & set(self._models()))
+
+    def _models(self) -> Any:
+        return importlib.import_module("workload").MODELS
 
     def load(self, case: dict[str, Any], n_rays: int, n_steps: int, threads: int) -> None:
         """Load a workload and compile for it."""
         named = dict(case)
         if named["model"] == "rgb":  # a tree may have no other, and no word for it
             del named["model"]
+        elif named["model"] not in self._models():
+            named["model"] = FORMER[named["model"]]
         work = self._make_workload(named.pop("rays"), named.pop("grid"), n_rays, n_steps, **named)
         self._step = None  # gives its memory back
         self._step = self._load(work, threads, "cpu")

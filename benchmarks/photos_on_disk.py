@@ -24,7 +24,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measuring import add_model, machine, median_interval, options, show, write_record
+from measuring import (
+    add_model,
+    machine,
+    median_interval,
+    options,
+    plain_training,
+    show,
+    write_record,
+)
 from PIL import Image
 
 import warpnerf as wn
@@ -143,7 +151,7 @@ def memory_of(process: int) -> dict[str, int]:
 
 def race(scene: Path, arguments: Any) -> list[float]:
     """Time on disk over time in memory, of each round."""
-    config = wn.TrainConfig(model=arguments.model, steps=10**6, device=arguments.device)
+    config = plain_training(model=arguments.model, steps=10**6, device=arguments.device)
     trainers = [Trainer(wn.load_scene(scene, images=place), config) for place in ("disk", "memory")]
     ratios = []
     for number in range(arguments.rounds + 1):

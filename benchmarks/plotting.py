@@ -14,7 +14,7 @@ COLOURS = {
     "drjit": "#1e8449",
 }
 
-MODEL_COLOURS = {"rgb": "#e8a33d", "sh": "#2471a3", "deferred": "#c0392b", "features": "#1e8449"}
+MODEL_COLOURS = {"rgb": "#e8a33d", "sh": "#2471a3", "deferred": "#c0392b", "per_sample": "#1e8449"}
 NO_PLOT = "no plot: matplotlib is not installed"
 
 

@@ -15,7 +15,16 @@ from unittest import mock
 
 import numpy as np
 import warp as wp
-from measuring import Stopwatch, add_model, machine, median_interval, options, show, write_record
+from measuring import (
+    Stopwatch,
+    add_model,
+    machine,
+    median_interval,
+    options,
+    plain_training,
+    show,
+    write_record,
+)
 from training import path_of
 from warpnerf_kernels.base.types import vec3
 from warpnerf_kernels.cpu import schedule
@@ -23,7 +32,8 @@ from warpnerf_kernels.launch import packed
 
 import warpnerf as wn
 from warpnerf.rendering.rays import PixelSampler
-from warpnerf.rendering.render import TrainingPass, variant_of
+from warpnerf.rendering.render import TrainingPass
+from warpnerf.rendering.structs import variant_of
 from warpnerf.runtime.parallel import Workers
 
 SLAB = sum(1 << (3 * bit + 2) for bit in range(schedule.BITS))
@@ -54,7 +64,7 @@ def main() -> None:
     print("scene           threads  steps  time in order over time as drawn")
     for name in arguments.scenes:
         scene = wn.load_scene(path_of(name), downscale=arguments.downscale)
-        config = wn.TrainConfig(
+        config = plain_training(
             model=arguments.model,
             steps=arguments.steps,
             time_limit=arguments.time_limit,
@@ -87,7 +97,7 @@ def ratios(scene: wn.Scene, field: wn.Field, steps: int, threads: int, rounds: i
         TrainingPass(
             steps * n_rays,
             field.model,
-            field.grid,
+            field.storage,
             field.weights,
             field.steps,
             "clamped",
@@ -113,9 +123,9 @@ def ratios(scene: wn.Scene, field: wn.Field, steps: int, threads: int, rounds: i
 def as_drawn(field: wn.Field, workers: Workers) -> wp.Kernel:
     """The kernel of a training pass, but for it all cells of a slab are one."""
     variant = variant_of(
-        field.model, "float32", field.grid.contraction, "clamped", "none", packed=True
+        field.model, "float32", field.lattice.contraction, "clamped", "none", packed=True
     )
-    # All made anew, for what is kept of them has the cells.
+    # All recomputed, for what is kept of them has the cells.
     with (
         mock.patch.object(schedule, "cell_at", cell_of_slab),
         mock.patch.object(packed, "ray_schedule", schedule.ray_schedule.__wrapped__),

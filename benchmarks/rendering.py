@@ -35,8 +35,10 @@ from warpnerf_kernels.base.types import real, vec3
 from workload import BOX, DENSITY_SHIFT, make_workload
 
 import warpnerf as wn
+from warpnerf.fields.dense import DenseGrid
 from warpnerf.rendering.rays import camera_rays
-from warpnerf.rendering.render import Steps, render_rays
+from warpnerf.rendering.render import render_rays
+from warpnerf.rendering.steps import Steps
 from warpnerf.runtime.parallel import Workers
 
 TRANSMITTANCE_MIN = 1e-3
@@ -50,7 +52,7 @@ def sphere_field(grid: int, workers: Workers) -> wn.Field:
     work = make_workload("random", grid, 1, math.ceil(4.0 / step), scene="sphere")
     return wn.Field(
         model=work.warp_model(),
-        grid=work.voxel_grid(workers),
+        storage=work.voxel_grid(workers),
         weights=work.weights(workers),
         free=work.free_cells(workers),
         steps=Steps(near=0.0, far=1e30, step=step, transmittance_min=TRANSMITTANCE_MIN),
@@ -62,8 +64,8 @@ def sphere_field(grid: int, workers: Workers) -> wn.Field:
 def camera_at(field: wn.Field, pixels: int) -> wn.Camera:
     """A square camera that has all occupied cells in view, from above and aside."""
     low, high = field.free.occupied_range() or (np.zeros(3), np.ones(3))
-    extent = field.grid.box_max - field.grid.box_min
-    centre = field.grid.box_min + 0.5 * (low + high) * extent
+    extent = field.lattice.box_max - field.lattice.box_min
+    centre = field.lattice.box_min + 0.5 * (low + high) * extent
     radius = 0.5 * float(np.linalg.norm((high - low) * extent))
     back = np.array([0.6, -0.6, 0.5])
     back /= np.linalg.norm(back)
@@ -96,18 +98,20 @@ class Choices:
 
 class TorchFrame:
     """The frame in eager torch: rays in batches, each from where it meets the occupied box, a few
-    steps at a time for those that still go on."""
+    steps at a time for those that still continue."""
 
     def __init__(self, field: wn.Field, camera: wn.Camera, choices: Choices) -> None:
         """Load a field without contraction, and the camera's rays."""
-        grid, steps = field.grid, field.steps
-        if grid.contraction != "none":
+        lattice, steps, grid = field.lattice, field.steps, field.storage
+        assert isinstance(grid, DenseGrid)
+        if lattice.contraction != "none":
             raise SystemExit("rendering: the field must not be contracted; train a bounded scene.")
         if field.model.name != "rgb":
             raise SystemExit("rendering: the field must be of the model rgb; train with it.")
         self.choices = choices
-        centre, half = 0.5 * (grid.box_min + grid.box_max), 0.5 * (grid.box_max - grid.box_min)
-        values = grid.values.numpy().reshape(*grid.size, 4).copy()
+        low, high = lattice.box_min, lattice.box_max
+        centre, half = 0.5 * (low + high), 0.5 * (high - low)
+        values = grid.values.numpy().reshape(*lattice.size, 4).copy()
         values[..., 0] += grid.density_shift - DENSITY_SHIFT
         free = field.free.distance.numpy().reshape(field.free.size)
         self._scene = TorchScene(values, free, choices.split, "cpu")
@@ -222,7 +226,7 @@ def main() -> None:
             seconds.append({name: stopwatch.seconds(side) for name, side in sides})
         row = {
             "threads": threads,
-            "grid": field.grid.size,
+            "grid": field.lattice.size,
             "free": 1.0 - field.free.share(),
             "difference": difference,
             "torch_choices": asdict(theirs.choices),
@@ -253,7 +257,7 @@ def count_samples(field: wn.Field, camera: wn.Camera) -> int:
     origins, directions = camera_rays(camera, field.workers)
     rays = render_rays(
         field.model,
-        field.grid,
+        field.storage,
         field.weights,
         field.free,
         field.steps,

@@ -19,7 +19,7 @@ Derived for a workload of the model rgb, in seconds:
                 written once, at the rate of the stream: for any order of the work
     walk        the lines that 64 rays in a row need, counted once for those 64, at the cost of a
                 random line: for whoever takes ray after ray
-    cached      its samples at that cost: warpnerf if memory were no matter
+    cached      its samples at that cost: warpnerf if memory cost nothing
 
 The first two bound every program on this machine; walk binds the order that most programs work in,
 cached this one program.
@@ -43,7 +43,7 @@ OPERATIONS = {
     "read: four columns of two nodes of four channels, then between the two": 68,
     "shade: five exponentials, a logarithm, five divisions, opacity": 125,
     "composite, and what flows back into density and colour, scaled": 40,
-    "hand it to eight nodes of four channels": 84,
+    "scatter it to eight nodes of four channels": 84,
 }
 """Floating-point operations of a sample, by what they are for."""
 
@@ -202,7 +202,7 @@ class Needs:
     lines: int
     """Different lines of the grid that its samples need."""
     lines_by_rays: int
-    """The same, counted anew every 64 rays."""
+    """The same, counted again every 64 rays."""
 
 
 def needs(work: Workload) -> Needs:

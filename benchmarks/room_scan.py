@@ -2,10 +2,10 @@
 
     python benchmarks/room_scan.py path/to/new/folder --size 320 240
 
-Who takes them turns around in its middle, walks around its table, or does both. A COLMAP text model
-beside them holds points of the room's surfaces with the photographs that show them, as structure
-from motion would find them: with noise, and with a share of outliers far behind the walls and close
-before the cameras.
+Who takes them turns around in its middle, walks around its table, far from it or close, or does
+both. A COLMAP text model beside them holds points of the room's surfaces with the photographs that
+show them, as structure from motion would find them: with noise, and with a share of outliers far
+behind the walls and close before the cameras.
 """
 
 from __future__ import annotations
@@ -20,10 +20,15 @@ from PIL import Image
 
 from warpnerf.exporting.quaternions import quaternions
 from warpnerf.scenes.builtin.room import first_hit, photograph
-from warpnerf.scenes.camera import Camera
+from warpnerf.scenes.cameras.camera import Camera
+from warpnerf.scenes.cameras.undistort import directions
 
 NOISE = 0.005
 """Of a point's distance, standard deviation."""
+GRAIN = (7.0, 17.0, 41.0, 83.0)
+"""Frequencies of the noise on grainy surfaces, 1 / metre."""
+GRAIN_CONTRAST = 0.15
+"""Of each of them."""
 OUTLIERS = 0.03
 """Share of points along their ray anywhere from 0.02 to 5 times as far."""
 
@@ -58,6 +63,20 @@ def inward_cameras(n: int, width: int, height: int, seed: int = 0) -> list[Camer
     return cameras
 
 
+def table_cameras(n: int, width: int, height: int, seed: int = 0) -> list[Camera]:
+    """Cameras close around the table, 0.6 to 1.1 m high, that look at what stands on it."""
+    rng = np.random.default_rng(seed)
+    cameras: list[Camera] = []
+    for k in itertools.count():
+        if len(cameras) == n:
+            return cameras
+        angle = 2.0 * np.pi * (k * 0.381966 + rng.uniform(-0.02, 0.02))
+        away = rng.uniform(0.45, 0.65) * np.array([np.cos(angle), np.sin(angle), 0.0])
+        eye = np.array([-0.3, 0.05, rng.uniform(0.6, 1.1)]) + away
+        target = np.array([-0.3, 0.05, 0.6]) + rng.uniform(-0.08, 0.08, 3)
+        cameras += _standing(eye, target - eye, width, height)
+
+
 def mixed_cameras(n: int, width: int, height: int, seed: int = 0) -> list[Camera]:
     """Half of them look inward, half outward."""
     inward = inward_cameras(n // 2, width, height, seed)
@@ -88,6 +107,7 @@ def _standing(eye: np.ndarray, ahead: np.ndarray, width: int, height: int) -> li
 SCANS: dict[str, Callable[[int, int, int], list[Camera]]] = {
     "room-scan": scan_cameras,
     "room-inward": inward_cameras,
+    "room-table": table_cameras,
     "room-mixed": mixed_cameras,
 }
 """The cameras of each capture, by how many there are, and width and height of its pictures."""
@@ -99,6 +119,8 @@ def write_scan(
     n_points: int = 4000,
     size: tuple[int, int] = (160, 120),
     scan: str = "room-scan",
+    *,
+    grainy: bool = False,
 ) -> float:
     """Write photographs and model.
 
@@ -108,6 +130,7 @@ def write_scan(
         n_points: Of the model.
         size: Width and height, pixels.
         scan: One of SCANS.
+        grainy: Whether all surfaces have a grain down to a centimetre, as real ones do.
 
     Returns:
         The median true distance over all pixels, metres.
@@ -120,6 +143,8 @@ def write_scan(
     poses = ["# Images"]
     for number, camera in enumerate(cameras):
         rgb, depth = photograph(camera)
+        if grainy:
+            rgb = _with_grain(camera, rgb, depth)
         depths.append(depth)
         Image.fromarray(rgb).save(folder / f"images/{number:04}.png")
         rotation = (camera.c2w[:, :3] * [1.0, -1.0, -1.0]).T
@@ -136,6 +161,33 @@ def write_scan(
     ]
     (model / "points3D.txt").write_text("\n".join(lines) + "\n")
     return float(np.median(np.stack(depths)))
+
+
+def _with_grain(camera: Camera, rgb: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """A photograph, [H, W, 3] uint8, with a grain on the surfaces at these depths, [H, W]."""
+    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    pixels = np.stack([u, v], axis=-1).reshape(-1, 2)
+    rays = directions(camera, pixels) @ camera.c2w[:, :3].T
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    places = camera.position + depth.reshape(-1, 1) * rays
+    grain = sum(_noise(places * frequency) for frequency in GRAIN)
+    shaded = rgb.reshape(-1, 3) * (1.0 + GRAIN_CONTRAST * np.asarray(grain)[:, None])
+    return np.clip(shaded, 0.0, 255.0).astype(np.uint8).reshape(rgb.shape)
+
+
+def _noise(places: np.ndarray) -> np.ndarray:
+    """Value noise of period 1 at places [n, 3]: [n] in [-1, 1]. See Ebert et al. 2003."""
+    corner = np.floor(places).astype(np.int64)
+    share = places - corner
+    share = share * share * (3.0 - 2.0 * share)
+    value = np.zeros(len(places))
+    for offset in itertools.product((0, 1), repeat=3):
+        i, j, k = (corner + offset).T
+        mixed = (i * 0x9E3779B1) ^ (j * 0x85EBCA77) ^ (k * 0xC2B2AE3D)
+        mixed = (mixed ^ (mixed >> 15)) * 0x2C1B3C6D & 0xFFFFFFFF
+        weight = np.where(np.array(offset) == 1, share, 1.0 - share).prod(axis=1)
+        value += weight * (((mixed >> 8) & 0xFFFF) / 32767.5 - 1.0)
+    return value
 
 
 def _points(
@@ -182,9 +234,11 @@ def main() -> None:
     parser.add_argument("--scan", choices=list(SCANS), default="room-scan")
     parser.add_argument("--views", type=int, default=125)
     parser.add_argument("--size", type=int, nargs=2, default=(160, 120), help="width, height")
+    parser.add_argument("--grainy", action="store_true", help="all surfaces have a fine grain")
     parser.add_argument("--points", type=int, default=4000, help="of the model; 0: none")
     args = parser.parse_args()
-    write_scan(args.folder, args.views, args.points, tuple(args.size), args.scan)
+    size = tuple(args.size)
+    write_scan(args.folder, args.views, args.points, size, args.scan, grainy=args.grainy)
 
 
 if __name__ == "__main__":

@@ -13,12 +13,12 @@ from __future__ import annotations
 from dataclasses import asdict, replace
 from unittest import mock
 
-from measuring import add_model, machine, options, write_record
+from measuring import add_model, machine, options, plain_training, write_record
 from training import Clock, path_of
 from turns import take_turns
 
 import warpnerf as wn
-from warpnerf.config import ACCUMULATE_AT
+from warpnerf.optim_config import ACCUMULATE_AT
 from warpnerf.rendering.render import TrainingPass
 from warpnerf.runtime.parallel import Workers
 from warpnerf.training.trainer import Trainer
@@ -43,7 +43,7 @@ def main() -> None:
     parser.add_argument("--downscale", type=int, default=1)
     add_model(parser)
     arguments = parser.parse_args()
-    config = wn.TrainConfig(
+    config = plain_training(
         model=arguments.model,
         steps=arguments.steps,
         time_limit=arguments.time_limit,

@@ -3,10 +3,10 @@
     python benchmarks/throughput.py
 
 4096 rays x 256 steps: march, composite, squared error, adjoint scaled by distance, and a gradient
-of the grid, and of the network where there is one, that is zeroed, added up and ready to be used.
+of the grid, and of the network where there is one, that is zeroed, summed and ready to be used.
 warpnerf against eager torch, torch.compile, numba, Taichi and Dr.Jit where installed
 (`pip install ".[bench]"`), each on one and two threads; candidates/ holds them. The models are
-those of warpnerf, as they are by default: `features` works out the colour of samples of a weight
+those of warpnerf, as they are by default: `per_sample` computes the colour of samples of a weight
 above 1e-4 only, whoever runs it. A case is one workload:
 
     random   single pixels of random cameras around the box, two thirds of the steps in it
@@ -51,7 +51,7 @@ from workload import DEFAULT_MODELS, ModelName, Rays, Scene, Workload, make_work
 
 TOLERANCE = 1e-4
 """Of the largest value: by how much candidates may differ from the first."""
-AT_KINKS = {"features": 1e-4, "dvgo": 4e-4}
+AT_KINKS = {"per_sample": 1e-4, "dvgo": 4e-4}
 """The share of the gradient's values that may differ by more: where a unit of a sample is next to
 0, or its weight next to the threshold, rounding decides what flows back; dvgo has four times the
 units."""

@@ -19,9 +19,10 @@ from typing import Any
 from unittest import mock
 
 import warp as wp
-from measuring import add_model, machine, options, write_record
+from measuring import add_model, machine, options, plain_training, write_record
 
 import warpnerf as wn
+from warpnerf.fields.total_variation import TotalVariation
 from warpnerf.rendering.rays import PixelSampler
 from warpnerf.rendering.render import TrainingPass
 from warpnerf.runtime.parallel import Workers
@@ -32,7 +33,7 @@ PARTS: dict[str, list[tuple[Any, str]]] = {
     "rays": [(TrainingPass, "run")],
     "drawing": [(PixelSampler, "draw")],
     "Adam": [(training, "adam_step")],
-    "smoothing": [(training, "add_total_variation")],
+    "smoothing": [(TotalVariation, "__call__")],
     "free space": [(Trainer, "_look_for_free_space")],
     "growing": [(Trainer, "_grow")],
     "reports": [(Trainer, "report")],
@@ -41,7 +42,7 @@ PARTS: dict[str, list[tuple[Any, str]]] = {
 
 
 class Clock:
-    """Adds up what calls take, without what they call of each other."""
+    """Sums what calls take, without what they call of each other."""
 
     def __init__(self, on_cuda: bool) -> None:
         """Nothing yet; on CUDA a call ends when its launches do."""
@@ -80,7 +81,7 @@ def main() -> None:
     parser.add_argument("--downscale", type=int, default=1)
     add_model(parser)
     arguments = parser.parse_args()
-    config = wn.TrainConfig(
+    config = plain_training(
         model=arguments.model,
         steps=arguments.steps,
         time_limit=arguments.time_limit,

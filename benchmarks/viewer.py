@@ -28,8 +28,8 @@ from measuring import machine, median_interval, options, show, write_record
 from page_client import PageClient
 
 import warpnerf as wn
+from warpnerf.runs.run import Run
 from warpnerf.runtime.parallel import Workers
-from warpnerf.training.run import Run
 from warpnerf.training.trainer import Trainer
 from warpnerf.viewer.painter import Painter, Settings, Subject
 from warpnerf.viewer.session import Session
@@ -52,13 +52,13 @@ def main() -> None:
     record: dict[str, Any] = {
         "machine": machine(arguments.device, Workers(arguments.device).count),
         "model": field.model.name,
-        "grid": field.grid.size,
+        "grid": field.lattice.size,
         "window": [WIDTH, HEIGHT],
     }
     record["painting"] = painting(field, Run(arguments.run), arguments.rounds)
     with served(arguments.run, arguments.device) as port:
         record |= measured(port, arguments.rounds, arguments.seconds)
-        reason = "not asked for" if arguments.no_browser else missing()
+        reason = "not requested" if arguments.no_browser else missing()
         record["browser"] = reason or in_a_browser(port, arguments.rounds)
     record |= beside_a_training(arguments.device, arguments.steps)
     print(f"wrote {write_record(record, arguments.output, 'viewer', arguments.device)}")

@@ -14,10 +14,13 @@ import numpy as np
 import warp as wp
 from warpnerf_kernels.base.types import real, vec3, vector
 
+from warpnerf.fields.dense import DenseGrid
+from warpnerf.fields.lattice import Lattice
+from warpnerf.fields.occupancy import FreeCells
+from warpnerf.fields.storage import allocate_nodes
 from warpnerf.model import interface, models
-from warpnerf.model.grid import FreeCells, VoxelGrid, room_for_nodes
 from warpnerf.rendering.rays import RayBatch
-from warpnerf.rendering.render import Steps
+from warpnerf.rendering.steps import Steps
 from warpnerf.runtime.parallel import Workers
 
 BOX = np.ones(3)
@@ -43,7 +46,7 @@ ALPHA_MIN = 1e-2
 
 Rays = Literal["inside", "random", "patches"]
 Scene = Literal["dense", "sphere"]
-ModelName = Literal["rgb", "sh", "deferred", "features", "dvgo"]
+ModelName = Literal["rgb", "sh", "deferred", "per_sample", "dvgo"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +77,7 @@ MODELS: dict[ModelName, Model] = {
     "rgb": Model(n_features=3, n_values=4),
     "sh": Model(n_features=27, n_values=32, degree=2),
     "deferred": Model(n_features=7, n_values=8, n_inputs=7 + 9, n_frequencies=1),
-    "features": Model(
+    "per_sample": Model(
         n_features=12,
         n_values=16,
         n_inputs=9 + 27,
@@ -86,7 +89,7 @@ MODELS: dict[ModelName, Model] = {
         n_features=12, n_values=16, n_inputs=12 + 27, width=128, n_frequencies=4, threshold=1e-4
     ),
 }
-"""Those of warpnerf as they are by default, and `features` as DVGO has it."""
+"""Those of warpnerf by default, but `deferred` a smaller one, and `per_sample` as DVGO has it."""
 
 DEFAULT_MODELS = tuple(name for name in MODELS if name != "dvgo")
 """Those that are compared by default; against_torch.py is about the other one."""
@@ -135,12 +138,12 @@ class Workload:
         """Whether anything is free."""
         return bool(self.free.any())
 
-    def voxel_grid(self, workers: Workers) -> VoxelGrid:
+    def voxel_grid(self, workers: Workers) -> DenseGrid:
         """The grid as warpnerf takes it."""
+        grid = voxel_grid(self.values, workers)
         return replace(
-            voxel_grid(self.values, workers),
-            box_min=self.box[0],
-            box_max=self.box[1],
+            grid,
+            lattice=replace(grid.lattice, box_min=self.box[0], box_max=self.box[1]),
             density_shift=self.density_shift,
             density_scale=self.density_scale,
         )
@@ -148,7 +151,10 @@ class Workload:
     def warp_model(self) -> interface.Model:
         """The model as warpnerf takes it."""
         if self.model == "dvgo":
-            return models.Features(width=128, residual=False)
+            return models.PerSample(width=128, residual=False)
+        if self.model == "deferred":
+            shape = MODELS[self.model]
+            return models.Deferred(specular=shape.n_features - 3, width=shape.width)
         return models.model_of(self.model)
 
     def weights(self, workers: Workers) -> wp.array:
@@ -205,16 +211,14 @@ class Workload:
         return q, needed & (self.free[i, j, k] == 0)
 
 
-def voxel_grid(values: np.ndarray, workers: Workers) -> VoxelGrid:
+def voxel_grid(values: np.ndarray, workers: Workers) -> DenseGrid:
     """Raw values [X, Y, Z, n_values] over the box as warpnerf takes them."""
     size, n_values = values.shape[:3], values.shape[3]
-    nodes = room_for_nodes(math.prod(size), vector(n_values), workers.device)
+    nodes = allocate_nodes(math.prod(size), vector(n_values), workers.device)
     nodes.assign(values.reshape(-1, n_values))
-    return VoxelGrid(
+    return DenseGrid(
         values=nodes,
-        size=(size[0], size[1], size[2]),
-        box_min=-BOX,
-        box_max=BOX,
+        lattice=Lattice(size=(size[0], size[1], size[2]), box_min=-BOX, box_max=BOX),
         density_shift=DENSITY_SHIFT,
     )
 

@@ -5,16 +5,24 @@ import os
 import signal
 from pathlib import Path
 
+# Before torch is imported: between tests' small tensors, threads of OpenMP would mostly spin.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
 import pytest
 import warp as wp
-from drive import Kernels
-from made_up_colmap import Colmap, photographs
-from watched_command import assert_trained, make_scene, train
 
+from tests.support import cli_process
+from tests.support.compiling import compile_as_tests_do
+from tests.support.fake_colmap import Colmap, photographs
+from tests.support.kernel_runner import Kernels
 from warpnerf.sfm import pose as sfm_pose
 
+wp.config.log_level = wp.LOG_ERROR  # as the command has it
 if "WARP_CACHE_PATH" in os.environ:
     wp.config.kernel_cache_dir = os.environ["WARP_CACHE_PATH"]
+
+compile_as_tests_do()
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # As shells have it for what runs in the background; commands under test would inherit it.
@@ -23,6 +31,10 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--device", default="cpu", help="as Warp names it: cpu, cuda:0")
+
+
+def pytest_sessionfinish() -> None:
+    cli_process.close_server()
 
 
 @pytest.fixture(scope="session")
@@ -60,7 +72,8 @@ def packed(device: str) -> Kernels:
 def compiled_kernels(tmp_path_factory: pytest.TempPathFactory) -> None:
     """What a run compiles is in the cache, so that commands under test take their usual time."""
     folder = tmp_path_factory.mktemp("compiled")
-    assert_trained(train(make_scene(folder), folder=folder, limit=None))
+    scene = cli_process.make_scene(folder)
+    cli_process.assert_trained(cli_process.train(scene, folder=folder, limit=None))
 
 
 @pytest.fixture

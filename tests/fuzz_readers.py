@@ -27,13 +27,12 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))
 sys.path.insert(0, str(Path(__file__).parents[1] / "kernels"))
 
-from test_colmap import write_model
-from test_llff import write_llff
-from tiny_scenes import picture, ring, save, write_transforms
-
+from tests.scenes.test_colmap import write_model
+from tests.scenes.test_llff import write_llff
+from tests.support.tiny_scenes import picture, ring, save, write_transforms
 from warpnerf.checks import InputError
-from warpnerf.scenes.load import load_scene
-from warpnerf.scenes.survey import survey
+from warpnerf.scenes.formats.load import load_scene
+from warpnerf.scenes.formats.survey import survey
 
 LIMIT = 10.0
 """Seconds for a mutant."""

@@ -1,4 +1,4 @@
-"""Voxel-grid radiance fields from posed photographs, without floaters near the cameras.
+"""Voxel-grid radiance fields from posed photographs, with fewer floaters near the cameras.
 
     scene = warpnerf.load_scene("path/to/scene")
     result = warpnerf.train(scene)
@@ -14,34 +14,38 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from warpnerf.checks import InputError
-    from warpnerf.config import GridConfig, LossConfig, MarchConfig, OptimConfig, TrainConfig
+    from warpnerf.config import GridConfig, MarchConfig, TrainConfig
     from warpnerf.evaluation.evaluate import Evaluation, evaluate
-    from warpnerf.evaluation.inspection import Inspection, inspect
     from warpnerf.exporting.export import export
-    from warpnerf.exporting.sight import Sight, look
     from warpnerf.exporting.splats import Splats, splats_of
     from warpnerf.exporting.surface import Surface, extract_surface
+    from warpnerf.exporting.visibility import Visibility, visibility
+    from warpnerf.inspection.inspection import Inspection, inspect
+    from warpnerf.loss_config import LossConfig
     from warpnerf.media.camera_path import camera_path
-    from warpnerf.media.demonstration import Demo, demo
     from warpnerf.media.filming import render_stills, render_video
     from warpnerf.media.recorded_path import RecordedPath, read_path
     from warpnerf.media.scene_plan import plan_picture
     from warpnerf.model.interface import Model
-    from warpnerf.model.models import Deferred, Features, Rgb, SphericalHarmonics
+    from warpnerf.model.models import Deferred, PerSample, Rgb, SphericalHarmonics
+    from warpnerf.model.sampler_kinds import Resampled
+    from warpnerf.model.storage_kinds import Dense, Hash, Vm
+    from warpnerf.optim_config import OptimConfig
     from warpnerf.presets import PRESETS
     from warpnerf.rendering.field import Field, Rendering
-    from warpnerf.scenes.camera import Camera
-    from warpnerf.scenes.load import load_scene
-    from warpnerf.scenes.scene import Scene, View
-    from warpnerf.sfm.config import PoseConfig
-    from warpnerf.sfm.pose import pose
-    from warpnerf.sfm.summary import Posing
-    from warpnerf.training.checkpoint import (
+    from warpnerf.reports.demonstration import Demo, demo
+    from warpnerf.runs.checkpoint import (
         load_checkpoint,
         load_field,
         save_checkpoint,
         save_field,
     )
+    from warpnerf.scenes.cameras.camera import Camera
+    from warpnerf.scenes.formats.load import load_scene
+    from warpnerf.scenes.scene import Scene, View
+    from warpnerf.sfm.config import PoseConfig
+    from warpnerf.sfm.pose import pose
+    from warpnerf.sfm.summary import Posing
     from warpnerf.training.state import Progress, TrainingState
     from warpnerf.training.train import TrainResult, train
     from warpnerf.viewer.view import view
@@ -49,32 +53,36 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOMES = {
-    "Camera": "scenes.camera",
+    "Camera": "scenes.cameras.camera",
     "camera_path": "media.camera_path",
-    "load_checkpoint": "training.checkpoint",
-    "load_field": "training.checkpoint",
-    "save_checkpoint": "training.checkpoint",
-    "save_field": "training.checkpoint",
+    "load_checkpoint": "runs.checkpoint",
+    "load_field": "runs.checkpoint",
+    "save_checkpoint": "runs.checkpoint",
+    "save_field": "runs.checkpoint",
     "InputError": "checks",
     "PRESETS": "presets",
     "GridConfig": "config",
-    "LossConfig": "config",
+    "LossConfig": "loss_config",
     "MarchConfig": "config",
-    "OptimConfig": "config",
+    "OptimConfig": "optim_config",
     "TrainConfig": "config",
     "Deferred": "model.models",
-    "Features": "model.models",
+    "PerSample": "model.models",
     "Model": "model.interface",
     "Rgb": "model.models",
     "SphericalHarmonics": "model.models",
-    "load_scene": "scenes.load",
-    "Demo": "media.demonstration",
-    "demo": "media.demonstration",
+    "Dense": "model.storage_kinds",
+    "Hash": "model.storage_kinds",
+    "Resampled": "model.sampler_kinds",
+    "Vm": "model.storage_kinds",
+    "load_scene": "scenes.formats.load",
+    "Demo": "reports.demonstration",
+    "demo": "reports.demonstration",
     "Evaluation": "evaluation.evaluate",
     "evaluate": "evaluation.evaluate",
     "export": "exporting.export",
-    "Sight": "exporting.sight",
-    "look": "exporting.sight",
+    "Visibility": "exporting.visibility",
+    "visibility": "exporting.visibility",
     "Splats": "exporting.splats",
     "splats_of": "exporting.splats",
     "Surface": "exporting.surface",
@@ -85,8 +93,8 @@ _HOMES = {
     "render_video": "media.filming",
     "RecordedPath": "media.recorded_path",
     "read_path": "media.recorded_path",
-    "Inspection": "evaluation.inspection",
-    "inspect": "evaluation.inspection",
+    "Inspection": "inspection.inspection",
+    "inspect": "inspection.inspection",
     "plan_picture": "media.scene_plan",
     "PoseConfig": "sfm.config",
     "Posing": "sfm.summary",
@@ -115,18 +123,22 @@ __all__ = [  # noqa: RUF022 (grouped by home, as above)
     "OptimConfig",
     "TrainConfig",
     "Deferred",
-    "Features",
+    "PerSample",
     "Model",
     "Rgb",
     "SphericalHarmonics",
+    "Dense",
+    "Hash",
+    "Resampled",
+    "Vm",
     "load_scene",
     "Demo",
     "demo",
     "Evaluation",
     "evaluate",
     "export",
-    "Sight",
-    "look",
+    "Visibility",
+    "visibility",
     "Splats",
     "splats_of",
     "Surface",
@@ -155,6 +167,11 @@ __all__ = [  # noqa: RUF022 (grouped by home, as above)
 
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
+        from warpnerf.renamed import FORMER_NAMES, warn_renamed
+
+        if name in FORMER_NAMES:
+            warn_renamed(f"warpnerf.{name}", f"warpnerf.{FORMER_NAMES[name]}")
+            return getattr(importlib.import_module("warpnerf"), FORMER_NAMES[name])
         raise AttributeError(f"module 'warpnerf' has no attribute {name!r}")
     value = getattr(importlib.import_module(f"warpnerf.{_HOMES[name]}"), name)
     globals()[name] = value

@@ -17,14 +17,14 @@ from nerfbaselines import register
 from warpnerf.checks import InputError
 from warpnerf.config import TrainConfig
 from warpnerf.presets import PRESETS
-from warpnerf.scenes.camera import Camera
-from warpnerf.scenes.focus import estimate_extent
-from warpnerf.scenes.overlap import in_picture
-from warpnerf.scenes.points import Points, extent_by_points, usable
+from warpnerf.runs.checkpoint import load_checkpoint, save_checkpoint
+from warpnerf.scenes.cameras.camera import Camera
+from warpnerf.scenes.cameras.focus import estimate_extent
+from warpnerf.scenes.cameras.overlap import in_picture
+from warpnerf.scenes.cameras.undistort import seen_pixels
+from warpnerf.scenes.extent.points import Points, extent_by_points, usable
 from warpnerf.scenes.scene import Scene, View
-from warpnerf.scenes.undistort import seen_pixels
-from warpnerf.training.checkpoint import load_checkpoint, save_checkpoint
-from warpnerf.training.coarse import begin
+from warpnerf.training.coarse import prepare_trainer
 from warpnerf.training.state import TrainingState
 from warpnerf.training.trainer import Trainer
 
@@ -39,7 +39,7 @@ LENSES = tuple(COEFFICIENTS_OF)
 """By the number that its cameras hold."""
 
 FEATURES = ("color", "points3D_xyz")
-"""What datasets are asked for; points are left out by those that have none."""
+"""What is requested of datasets; points are left out by those that have none."""
 
 MIN_IN_PICTURES = 0.95
 """Share of a dataset's points that at least two of its cameras must have in their pictures. Matched
@@ -50,6 +50,8 @@ CHECKPOINT = "checkpoint.safetensors"
 OPTIONS: dict[str, type] = {
     "preset": str,
     "model": str,
+    "field": str,
+    "sampler": str,
     "scaling": str,
     "steps": int,
     "rays_per_step": int,
@@ -76,10 +78,10 @@ class WarpnerfMethod:
         train_dataset: Any = None,
         config_overrides: dict[str, Any] | None = None,
     ) -> None:
-        """Begin a training, go on with one, or open what it has left.
+        """Begin a training, resume one, or open what it has left.
 
         Args:
-            checkpoint: A folder that ``save`` wrote; None: begin anew.
+            checkpoint: A folder that ``save`` wrote; None: begin again.
             train_dataset: Photographs and cameras; None: only to render.
             config_overrides: Names and values of ``OPTIONS``, for a new training.
 
@@ -96,7 +98,7 @@ class WarpnerfMethod:
             config = (
                 configured(config_overrides or {}, background) if state is None else state.config
             )
-            self._trainer = begin(scene_of(train_dataset), config, state)
+            self._trainer = prepare_trainer(scene_of(train_dataset), config, state)
             self._config = config
         elif state is not None:
             self._config = state.config
@@ -185,7 +187,7 @@ class WarpnerfMethod:
         return {name: outputs[name] for name in wanted if name in outputs}
 
     def save(self, path: str) -> None:
-        """Write all that it takes to go on and to render.
+        """Write all that it takes to resume and to render.
 
         Args:
             path: A folder, which is made where it is missing.
@@ -202,7 +204,7 @@ class WarpnerfMethod:
 
 
 def configured(overrides: dict[str, Any], background: np.ndarray | None) -> TrainConfig:
-    """The configuration that --set asks for.
+    """The configuration that --set requests.
 
     Args:
         overrides: Names and values of ``OPTIONS``; a preset, "fast" unless named, is the start.
@@ -229,8 +231,9 @@ def configured(overrides: dict[str, Any], background: np.ndarray | None) -> Trai
         config = replace(config, time_limit=None)
     if "voxels" in given:
         given["grid"] = replace(config.grid, voxels=given.pop("voxels"))
-    if given.get("model") == config.model.name:  # as the preset has it, not by default
-        del given["model"]
+    for name in ("model", "field", "sampler"):
+        if given.get(name) == getattr(config, name).name:  # as the preset has it, not by default
+            del given[name]
     if background is not None:
         given["background"] = tuple(float(c) / 255.0 for c in background)
     return replace(config, **given)
@@ -265,11 +268,11 @@ def scene_of(dataset: Any) -> Scene:
     see_through = [v.image.shape[2] == 4 and bool((v.image[..., 3] < 255).any()) for v in views]
     unbounded = sum(see_through) < len(views) / 2
     cameras = [view.camera for view in views]
-    extent, sight = estimate_extent(cameras, unbounded=unbounded), None
+    extent, observed = estimate_extent(cameras, unbounded=unbounded), None
     training = range(len(views))
     points = _points(dataset.get("points3D_xyz"), cameras)
     if points is not None:
-        extent, sight = extent_by_points(extent, points, views, training, unbounded)
+        extent, observed = extent_by_points(extent, points, views, training, unbounded)
     return Scene(
         name=str(dataset["metadata"].get("scene") or "dataset"),
         views=views,
@@ -278,10 +281,11 @@ def scene_of(dataset: Any) -> Scene:
         box_max=extent.box_max,
         unbounded=unbounded,
         content_distance=extent.content_distance,
-        content_distances=None if sight is None else sight.distances,
-        guessed=extent.guessed and sight is None,
-        near_content=None if sight is None else sight.near_content,
-        points=None if sight is None or points is None else points.sample,
+        content_distances=None if observed is None else observed.distances,
+        guessed=extent.guessed and observed is None,
+        near_content=None if observed is None else observed.near_content,
+        observations=None if observed is None else observed.observations,
+        points=None if observed is None or points is None else points.sample,
         notes=extent.notes,
     )
 

@@ -1,7 +1,7 @@
 """Configurations to begin with, by name.
 
 ``fast`` and ``quality`` are what warpnerf reaches in a minute or three and in a quarter of an hour
-on two cores; docs/benchmarks.md says how they were chosen. The others are the published
+on two cores; docs/decisions/presets.md says how they were chosen. The others are the published
 hyperparameters of DirectVoxGO, to compare with; they take hours on two cores.
 
 Source of these: Sun et al. 2022 (CVPR), Sun et al. 2022 (arXiv 2206.05085), and the configurations
@@ -13,8 +13,8 @@ in their repository: default.py, nerf_unbounded_default.py, llff_default.py. Dif
   the grid's own first steps do.
 - In dvgo-unbounded their box is a cube that holds all cameras' rays at the near clip; here it is
   0.75 content distances to each side.
-- Outside the box their samples are thinned to 0.95 of a step in folded space; here steps grow.
-- Their free space only ever grows; here it is looked for anew.
+- Outside the box their samples are thinned to 0.95 of a step in contracted space; here steps grow.
+- Their free space only ever grows; here it is recomputed.
 - Rays that meet free space only are left out; there they are replaced by others.
 - The opacity below which space is free rises there in the first 5500 steps of dvgo-unbounded.
 - Total variation reaches the nodes that rays have touched; theirs reaches all of them, in
@@ -26,21 +26,32 @@ in their repository: default.py, nerf_unbounded_default.py, llff_default.py. Dif
   is given here as it is for the final grid.
 - Their near clip needs a distance for each scene; the distance scaling takes its place.
 - Their planes in normalised device coordinates begin with a density each; here all begin with one.
+
+``tensorf`` is TensoRF's VM-192 for objects: Chen et al. 2022 (ECCV), configs/lego.txt in their
+repository. Different here:
+
+- The near plane is 0 and gradients are scaled by distance, as above.
+- One matrix decodes all products, to density and to features; theirs adds 48 products up to the
+  density, and decodes the other 144. Features are not encoded by sines before the MLP.
+- Density is softplus over a voxel of the final lattice; theirs over a 25th of a scene unit.
+- Grids before the last have half the nodes of the next, and the first 119^3; theirs grow from
+  128^3 in five equal ratios.
+- L1 has the lower of their two weights, reaches entries that rays have touched, and is added to
+  each eighth update, which counts eight times. The weight is three times theirs, as the squared
+  error is.
+- Free space is looked for each 1000 steps, not twice, and the box becomes tight at each growth.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-from warpnerf.config import GridConfig, LossConfig, MarchConfig, OptimConfig, TrainConfig
-from warpnerf.model.models import Deferred, Features
+from warpnerf.config import GridConfig, LossConfig, MarchConfig, TrainConfig
+from warpnerf.model.models import PerSample
+from warpnerf.model.storage_kinds import Vm
+from warpnerf.optim_config import OptimConfig
 
-_FAST = TrainConfig(
-    model=Deferred(specular=12, width=64),
-    # Without the entropy of remaining light, colours of the MLP make up for walls that stay soft;
-    # without opacity, the background makes up for what is as dark as it.
-    loss=LossConfig(distortion=0.01, entropy=1e-3, opacity="auto"),
-)
+_FAST = TrainConfig()
 
 _DVGO = TrainConfig(
     steps=20_000,
@@ -48,7 +59,7 @@ _DVGO = TrainConfig(
     coarse_steps=0,
     occupancy_every=1000,
     alpha_min=1e-4,
-    model=Features(width=128, residual=False, learning_rate_features=0.1, learning_rate_mlp=1e-3),
+    model=PerSample(width=128, residual=False, learning_rate_features=0.1, learning_rate_mlp=1e-3),
     grid=GridConfig(
         voxels=160**3,
         grow_at=(0.05, 0.1, 0.15, 0.2),
@@ -63,7 +74,6 @@ _DVGO = TrainConfig(
         restart_at_growth=True,
         tv_density=0.0,
         tv_rgb=0.0,
-        tv_every=1,
         accumulate_at=(),
     ),
     loss=LossConfig(entropy=3e-3, sample_colour=3e-2),
@@ -90,8 +100,18 @@ PRESETS: dict[str, TrainConfig] = {
             shift_at_growth=1.0,
             alpha_init=1e-4,
             contraction="linf",
+            box="scene",
+            border=0.2,
         ),
-        optim=replace(_DVGO.optim, decay=0.1**0.5, tv_density=3e-10, tv_rgb=3e-11, tv_until=0.5),
+        march=replace(_DVGO.march, growth=0.1),
+        optim=replace(
+            _DVGO.optim,
+            decay=0.1**0.5,
+            tv_density=3e-10,
+            tv_rgb=3e-11,
+            tv_until=0.5,
+            tv_every=1,
+        ),
         loss=LossConfig(distortion=3e-2, entropy=3e-3, sample_colour=3e-2),
     ),
     "dvgo-llff": replace(
@@ -99,7 +119,7 @@ PRESETS: dict[str, TrainConfig] = {
         steps=30_000,
         rays_per_step=4096,
         alpha_min=1e-3,
-        model=Features(
+        model=PerSample(
             features=9,
             frequencies=0,
             width=64,
@@ -116,11 +136,36 @@ PRESETS: dict[str, TrainConfig] = {
             alpha_init=1 / 128,
             contraction="ndc",
         ),
-        optim=replace(_DVGO.optim, decay=0.1**1.5, tv_density=4e-9, tv_rgb=4e-10),
+        optim=replace(_DVGO.optim, decay=0.1**1.5, tv_density=4e-9, tv_rgb=4e-10, tv_every=1),
         loss=LossConfig(distortion=3e-2, entropy=3e-3, sample_colour=3e-2),
+    ),
+    "tensorf": replace(
+        _DVGO,
+        steps=30_000,
+        rays_per_step=4096,
+        model=PerSample(
+            features=27, frequencies=2, width=128, residual=False, learning_rate_mlp=1e-3
+        ),
+        field=Vm(
+            density=16,
+            appearance=48,
+            learning_rate=0.02,
+            learning_rate_decoder=1e-3,
+            sparsity=1.2e-4,
+        ),
+        grid=GridConfig(
+            voxels=300**3,
+            grow_at=(2000 / 30_000, 3000 / 30_000, 4000 / 30_000, 7000 / 30_000),
+            alpha_init=1e-5,
+        ),
+        march=MarchConfig(step_voxels=0.5),
+        optim=OptimConfig(
+            decay=0.1, restart_at_growth=True, tv_density=0.0, tv_rgb=0.0, accumulate_at=()
+        ),
+        loss=LossConfig(),
     ),
 }
 """By name; change one with ``dataclasses.replace``."""
 
-EVERYDAY = ("fast", "quality")
+DEFAULT_PRESETS = ("fast", "quality")
 """Those that every command knows the cost of, and that ``warmup`` compiles for."""

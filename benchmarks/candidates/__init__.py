@@ -53,7 +53,7 @@ MODULES_OF_OTHERS = {
 """The same, of models besides rgb."""
 
 MODULES_OF_DVGO = {"warpnerf": "warpnerf_step", "torch": "torch_models"}
-"""The same, of `features` with a network as wide as DVGO's."""
+"""The same, of `per_sample` with a network as wide as DVGO's."""
 
 
 def find(device: str, model: ModelName = "rgb") -> tuple[dict[str, Load], dict[str, str]]:

@@ -3,7 +3,7 @@
 The adjoint reads samples again: keeping them in memory was no faster on a 64^3 grid, and took 1.4
 times as long on 160^3. Scattering is expanded, Dr.Jit's word for a copy of the gradient for each
 thread; atomic, or reduced within a packet, the step takes three to five times as long. It is
-frozen, which saves tracing it anew.
+frozen, which saves tracing it again.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ from workload import DENSITY_SHIFT, Workload
 F, S, U = np.float32, np.int32, np.uintp
 """Numbers, signed and unsigned integers: every constant is wrapped, or it would all be float64."""
 TILE = U(16)
-"""Nodes in a run along z that are zeroed and added up together, if any was touched."""
+"""Nodes in a run along z that are zeroed and summed together, if any was touched."""
 RUN = 4 * int(TILE)
 """Numbers in it."""
 T, FX, FY, FZ, ATTENUATION, ALPHA, WEIGHT, LIGHT, BACK, RAW, N_ROWS = range(11)

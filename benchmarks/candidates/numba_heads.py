@@ -23,7 +23,7 @@ FACTOR = RAW + 1
 class Shape(NamedTuple):
     """What a model fixes."""
 
-    n_channels: int  # added up along a ray
+    n_channels: int  # accumulated along a ray
     n_own: int  # inputs of the network that differ from row to row
     n_view: int  # and of those of the direction
 
@@ -33,7 +33,7 @@ def shape_of(name: ModelName) -> Shape:
     model = MODELS[name]
     return Shape(
         n_channels=model.n_features if name == "deferred" else 3,
-        n_own={"sh": 1, "deferred": model.n_inputs, "features": 9}[name],
+        n_own={"sh": 1, "deferred": model.n_inputs, "per_sample": 9}[name],
         n_view=model.n_inputs - 9,
     )
 
@@ -85,7 +85,7 @@ def colors(name: ModelName) -> tuple[Callable[..., Any], ...]:
 
     @njit(fastmath=True, error_model="numpy")
     def color_samples(n, rows, k, view, net):
-        """Rows raw to color; of `features`, n are those that have one."""
+        """Rows raw to color; of `per_sample`, n are those that have one."""
         if is_sh:
             for s in range(n):
                 red, green, blue = F(0.0), F(0.0), F(0.0)

@@ -124,7 +124,7 @@ def functions(name: ModelName) -> Callable[..., None]:
     run_network, adj_run_network = network(n_own, width)
     color_samples, adj_color_samples = colors(name)
     see = view_of(name)
-    is_deferred, is_features = name == "deferred", name == "features"
+    is_deferred, is_features = name == "deferred", name == "per_sample"
 
     @njit(fastmath=True, error_model="numpy")
     def train_ray(

@@ -25,7 +25,7 @@ Vec3s = ti.types.ndarray(dtype=vec3, ndim=1)
 Vec4s = ti.types.ndarray(dtype=vec4, ndim=1)
 TILE_BITS = 4
 TILE = 1 << TILE_BITS
-"""Nodes in a run along z that are zeroed and added up together, if any was touched."""
+"""Nodes in a run along z that are zeroed and summed together, if any was touched."""
 
 
 @ti.func
@@ -118,7 +118,7 @@ def train(
     touched: ti.types.ndarray(dtype=ti.u8, ndim=1),
     out_rgb: Vec3s,
 ):
-    """Forward, loss and adjoint; then the threads' gradients are added up in the first's.
+    """Forward, loss and adjoint; then the threads' gradients are summed in the first's.
 
     What a workload has only one of is constant: compiled in, it saves a fifth of the time.
     """

@@ -37,7 +37,7 @@ class CompiledStep:
         self._steps = (torch.arange(work.n_steps, device=device) + 0.5) * work.step
         self._last = torch.tensor(work.values.shape[:3], device=device) - 1
         self._background = torch.tensor(work.background, device=device)
-        # Workloads differ in shape and in threads; each is compiled anew.
+        # Workloads differ in shape and in threads; each is compiled again.
         torch._dynamo.config.recompile_limit = 256
         self._compiled = torch.compile(self._shade_and_back, dynamic=False)
         self._gradient = self._rgb = torch.empty(0)

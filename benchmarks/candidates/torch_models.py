@@ -1,8 +1,8 @@
 """Eager torch for sh, deferred, features and dvgo; late in trainings, for rgb too.
 
 Samples are packed; autograd does what lies between nodes and loss, in parts of the rays, and
-torch_nodes.py reads the nodes. `features` has its densities apart, since most samples need nothing
-else, and does once for a ray what its network makes of the direction. How many parts, and how
+torch_nodes.py reads the nodes. `per_sample` has its densities apart, since most samples need no
+others, and does once for a ray what its network makes of the direction. How many parts, and how
 gradients go to the nodes, is decided by timing.
 """
 
@@ -135,7 +135,7 @@ class Choices:
     parts: int = 1
     """Parts into which the rays are cut, so that what one needs stays in the caches."""
     scattering: Scattering = "rows"
-    """How gradients are handed to the nodes."""
+    """How gradients are scattered to the nodes."""
     sparse: bool = False
     """Whether it is noted which nodes a step has touched, so that the next one zeroes only these,
     and an optimiser updates only these."""
@@ -201,7 +201,7 @@ class TorchModels:
             "rgb": self._rgb,
             "sh": self._sh,
             "deferred": self._deferred,
-            "features": self._features,
+            "per_sample": self._features,
             "dvgo": self._features,
         }[work.model]
 

@@ -48,7 +48,7 @@ class CompiledModels(TorchModels):
 
     @property
     def _is_features(self) -> bool:
-        return self._work.model == "features"
+        return self._work.model == "per_sample"
 
     @torch.no_grad()
     def step(self) -> None:
@@ -58,7 +58,7 @@ class CompiledModels(TorchModels):
         node = part.node.long()
         if self._is_features:
             density, weight = self._read_densities(node, part)
-            seen = (weight > MODELS["features"].threshold).nonzero()[:, 0]
+            seen = (weight > MODELS["per_sample"].threshold).nonzero()[:, 0]
             found = self._train(node, part, density, seen)
         else:
             found = self._train(node, part)
@@ -154,7 +154,7 @@ class CompiledModels(TorchModels):
             density: torch.Tensor, raw: torch.Tensor, *network: torch.Tensor
         ) -> tuple[torch.Tensor, torch.Tensor]:
             weight, passed = self._composited(density, part)
-            encoded = view_encoding(part.directions, MODELS["features"].n_frequencies)
+            encoded = view_encoding(part.directions, MODELS["per_sample"].n_frequencies)
             weights, bias = network[:2]
             of_ray = torch.addmm(bias, encoded, weights[9:])
             hidden = torch.relu(raw[:, 4:13] @ weights[:9] + of_ray[ray])

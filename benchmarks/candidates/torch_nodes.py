@@ -1,7 +1,7 @@
 """What nodes hold, in eager torch: reading it at samples, and handing gradients back.
 
 embedding_bag reads without a copy of eight nodes for each sample; gradients are added in place to a
-table that stays. Milliseconds of the two ways to hand them to the nodes, in a whole step of 4096
+table that stays. Milliseconds of the two ways to scatter them to the nodes, in a whole step of 4096
 rays on one thread, 160^3 grid, dense:
 
                       sh    deferred    features
@@ -21,7 +21,7 @@ import torch
 import torch.nn.functional as F
 
 PIECE = 32768
-"""Samples whose gradient is handed to the nodes at once."""
+"""Samples whose gradient is scattered to the nodes at once."""
 REST = 0.02
 """Share of samples for which another round of `add_by_pairs` is not worth it."""
 

@@ -11,12 +11,12 @@ import numpy as np
 import warp as wp
 from warpnerf_kernels.base.tiles import (
     GROUP,
-    STRETCH,
+    NODES_PER_THREAD,
     TILE,
-    but_first,
     first_of,
     tile_of,
     touched_tiles,
+    without_first,
 )
 from warpnerf_kernels.base.types import gradient_type
 from workload import MODELS, Workload
@@ -68,7 +68,7 @@ def clear_kernel(n_floats: int) -> wp.Kernel:
                 tile = group + first_of(tiles)
                 node = wp.max(start, tile * wp.static(TILE))
                 clear_nodes(gradient.values, node, wp.min(end, (tile + 1) * wp.static(TILE)) - node)
-                tiles = but_first(tiles)
+                tiles = without_first(tiles)
 
     return clear
 
@@ -104,7 +104,7 @@ class WarpStep:
     def step(self) -> None:
         """Zero what the last step touched, then the training pass."""
         gradients = self._pass.gradients
-        span = 1 if self._workers.device.is_cuda else STRETCH
+        span = 1 if self._workers.device.is_cuda else NODES_PER_THREAD
         n = -(-gradients.values.shape[0] // span)
         self._workers.launch(self._clear, n, span, gradients.struct, cache=self._launches)
         gradients.touched.zero_()
@@ -150,14 +150,14 @@ class WarpStep:
         sink = self._pass.launch.sink
         if sink is None:
             return used, used
-        room = used + sink.records.capacity + sink.addressed.capacity
+        room = used + sink.records.capacity + sink.recipients.capacity
         records = sink.records.numpy()
         records = records.view(np.uint8).reshape(-1, records.dtype.itemsize)
         records.fill(255)
-        sink.addressed.fill_(-1)
+        sink.recipients.fill_(-1)
         self.step()
         used += int((records != 255).any(axis=1).sum()) * records.shape[1]
-        used += 4 * int((sink.addressed.numpy() != -1).sum())
+        used += 4 * int((sink.recipients.numpy() != -1).sum())
         return used, room
 
 

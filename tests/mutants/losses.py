@@ -2,7 +2,7 @@
 
 from mutant import Mutant
 
-_TESTS = "test_losses.py"
+_TESTS = "kernels/test_losses.py"
 _F64 = f"{_TESTS}::test_values_and_gradients_against_autograd"
 HUBER, DISTORTION, ENTROPY = f"{_F64}[huber]", f"{_F64}[distortion]", f"{_F64}[entropy]"
 OPACITY = f"{_F64}[opacity]"
@@ -17,12 +17,15 @@ P_SCALING = f"{_TESTS}::test_the_scaling_multiplies_each_once[packed]"
 LIGHT = f"{_TESTS}::test_light_that_is_all_there_or_gone_has_no_entropy"
 OWN = f"{_TESTS}::test_losses_with_a_models_own"
 ALONE = f"{_TESTS}::test_distortion_where_colours_are_right"
-BOTH = "test_seams.py::test_gradient_against_central_differences[two losses]"
-SEAM = "test_seams.py::test_gradient_on_the_cpu[two losses]"
+BOTH = "kernels/test_seams.py::test_gradient_against_central_differences[two losses]"
+SEAM = "kernels/test_seams.py::test_gradient_on_the_cpu[two losses]"
 
 END = f"{_TESTS}::test_a_ray_that_meets_hardly_anything_has_a_slope_that_ends"
-D, E, OP, N = (
-    f"volume/losses/{name}.py" for name in ("distortion", "entropy", "opacity", "near_clip")
+LANES = "kernels/test_seams.py::test_gradient_on_the_cpu[loss on samples]"
+LANES_MLP = "kernels/test_seams.py::test_loss_on_samples_that_an_mlp_colours"
+D, E, OP, N, C = (
+    f"volume/losses/{name}.py"
+    for name in ("distortion", "entropy", "opacity", "near_clip", "sample_colour")
 )
 
 MUTANTS = [
@@ -52,9 +55,9 @@ MUTANTS = [
     Mutant("distortion: too small a bound", D,
            "real(8.0) / real(3.0)", "real(0.01)", ALONE),
     Mutant("distortion, packs: its own weight before it", D,
-           "before.weight + UP_1(weights, zero)", "before.weight + weights", P_DISTORTION),
+           "before.weight + SHIFT_LANES_1(weights, zero)", "before.weight + weights", P_DISTORTION),
     Mutant("distortion, packs: moments of this pack only", D,
-           "before.moment + UP_1(moments, zero)", "UP_1(moments, zero)", P_DISTORTION),
+           "before.moment + SHIFT_LANES_1(moments, zero)", "SHIFT_LANES_1(moments, zero)", P_DISTORTION),
     Mutant("distortion, packs: weights are not carried on", D,
            "pack.distortion.c[1] = before.weight + weights", "pack.distortion.c[1] = weights",
            P_DISTORTION),
@@ -76,10 +79,10 @@ MUTANTS = [
            "transmittance <= real(LEAST) or transmittance >= real(MOST)",
            "transmittance < real(-1.0)", LIGHT),
     Mutant("entropy: not in the adjoint", "volume/walk.py",
-           "adj_end += adj_loss_value * adj_light(on_ray, total.transmittance)",
+           "adj_end += adj.loss * adj_light(on_ray, total.transmittance)",
            "adj_end += real(0.0)", ENTROPY),
     Mutant("entropy, packs: of one ray's weight", "volume/walk_packs.py",
-           "adj_end += adj_loss_value * adj_light(", "adj_end += adj_light(", P_ENTROPY),
+           "adj_end += adj.loss * adj_light(", "adj_end += adj_light(", P_ENTROPY),
     # opacity.py
     Mutant("opacity: sign of the slope", OP,
            "return params.factor / wp.max(", "return -params.factor / wp.max(", OPACITY),
@@ -99,44 +102,57 @@ MUTANTS = [
            "    if t < params.distance:\n        out.raw_density += raw_density",
            "    out.raw_density += raw_density", NEAR_CLIP),
     Mutant("near clip: not scaled", "volume/walk.py",
-           "scale * (adj_loss_value * adj_density(", "(adj_loss_value * adj_density(", NEAR_CLIP),
+           "scale * (adj.loss * adj_density(", "(adj.loss * adj_density(", NEAR_CLIP),
     Mutant("near clip, packs: not scaled", "volume/pack.py",
            "+ load(pack.scale) * load(pack.adj_density)", "+ load(pack.adj_density)", P_SCALING),
     Mutant("near clip, packs: without its weight", N,
-           "all(params.factor * adj_value)", "all(adj_value)", P_NEAR_CLIP),
+           "splat(params.factor * adj_value)", "splat(adj_value)", P_NEAR_CLIP),
     Mutant("near clip, packs: sum of the last pack", N,
            "before.raw_density + sum(", "sum(", P_NEAR_CLIP),
-    # sample_loss.py, and where it is called
-    Mutant("samples: factor of the slope", "volume/walk.py",
-           "slope = real(2.0) * scene.loss.on_samples", "slope = scene.loss.on_samples", COLOUR),
-    Mutant("samples: sign", "volume/sample_loss.py",
+    # sample_colour.py, sample_loss.py, and where they are called
+    Mutant("samples: factor of the slope", C,
+           "slope = real(2.0) * params.factor", "slope = params.factor", COLOUR),
+    Mutant("samples: sign", C,
            "slope * (rgb - target_rgb)", "slope * (target_rgb - rgb)", COLOUR),
-    Mutant("samples: crossed once", "volume/sample_loss.py",
+    Mutant("samples: crossed once", C,
            "real(2.0) * wp.dot(rgb", "wp.dot(rgb", COLOUR),
-    Mutant("samples: not of the target", "volume/sample_loss.py",
-           "sums.weight * wp.length_sq(target_rgb)", "sums.weight", COLOUR),
-    Mutant("samples: opacity for weights with a colour", "volume/walk.py",
-           "                        total.of_samples.weight += weight\n",
-           "                        total.of_samples.weight = real(1.0) - total.transmittance\n", MLP),
+    Mutant("samples: not of the target", C,
+           "state.weight * wp.length_sq(target_rgb)", "state.weight", COLOUR),
+    Mutant("samples: those without a colour count", "volume/walk.py",
+           "if weight > real(weight_min):", "if weight > real(0.0):", MLP, 1, 2),
+    Mutant("samples: the ray's slope alone", "volume/walk.py",
+           "adj_own += adj_sample(scene.loss.on_samples, channels, target_rgb, adj.loss)",
+           "adj_own += real(0.0) * channels", COLOUR),
     Mutant("samples, packs: weights without a colour count", "volume/pack.py",
-           "weight > WEIGHT_MIN ? weight : all(0.0f)", "weight", P_FEATURES),
-    Mutant("samples, packs: no target", "heads/rgb.py",
-           "(channel - rows.data[row].target_rgb.c[c])", "channel", P_COLOUR),
-    Mutant("samples, packs: slope of another weight", "volume/walk_packs.py",
-           "2.0 * scene.loss.on_samples * adj_loss_value", "scene.loss.on_samples * adj_loss_value",
-           P_COLOUR),
-    Mutant("samples, packs: squares of the last pack", "volume/walk_packs.py",
-           "of_samples.square += packs", "of_samples.square = packs", P_COLOUR),
+           "weight > WEIGHT_MIN ? weight : splat(0.0f)", "weight", P_FEATURES),
+    Mutant("samples, packs: no target", C,
+           "load(pack.channel.data[c]) - target_rgb.c[c]", "load(pack.channel.data[c])", P_COLOUR),
+    Mutant("samples, packs: slope of another weight", C,
+           "slope = 2.0f * params.factor * adj_value", "slope = params.factor * adj_value", P_COLOUR),
+    Mutant("samples, packs: squares of the last pack", C,
+           "state.square + packs", "packs", P_COLOUR),
+    Mutant("samples, packs: the ray's slope forgotten", C,
+           "load(pack.adj_channel.data[c]) + slope * off", "slope * off", P_COLOUR),
+    Mutant("samples, packs: what flows back to the ray", "heads/rgb.py",
+           "OF_SAMPLE if by_sample else OF_RAY", "OF_RAY", P_COLOUR),
+    Mutant("samples, by lanes: all have a colour", "volume/sample_loss.py",
+           "packs[slot].colour_weight[lane]", "packs[slot].weight[lane]", LANES_MLP),
+    Mutant("samples, by lanes: the last channel's", "volume/sample_loss.py",
+           "adj[c, lane] = own[c]", "adj[c, lane] = own[n_channels - 1]", LANES),
+    Mutant("samples, by lanes: without the ray's", "volume/sample_loss.py",
+           "packs[slot].adj_channel + adj", "adj", LANES),
+    Mutant("samples, by lanes: sums of one sample", "volume/sample_loss.py",
+           "after = add(params, after, weight", "after = add(params, state, weight", LANES),
     # ray_loss.py: any loss, and two as one
     Mutant("loss: of lanes that are no samples", "volume/ray_loss.py",
-           "            if packs[slot].visited[lane] != 0:\n", "            if packs[slot].visited[lane] == 0:\n",
+           "            if packs[slot].active[lane] != 0:\n", "            if packs[slot].active[lane] == 0:\n",
            SEAM, 1, 2),
     Mutant("loss: sums do not grow", "volume/ray_loss.py",
            "after = add(params, after, weight, t, dt, packs[slot].raw[0, lane])", "after = state", SEAM, 1, 2),
     Mutant("loss: its factor", "volume/ray_loss.py",
            "adj[lane] = adj_value * adj_weight(", "adj[lane] = adj_weight(", SEAM),
     Mutant("loss: not behind", "volume/walk_packs.py",
-           "            behind += adj_loss_value * weighted(on_ray, rows[row].loss)\n", "", SEAM),
+           "            suffix_sum += adj.loss * weighted(on_ray, rows[row].loss)\n", "", SEAM),
     Mutant("loss: no slope", "volume/pack.py",
            "adj_weight += load(pack.adj_weight);", "", SEAM),
     Mutant("two losses: light of the first only", "volume/ray_loss.py",

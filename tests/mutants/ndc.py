@@ -2,11 +2,11 @@
 
 from mutant import Mutant
 
-VALUES = "test_kernel_render.py::test_values_and_visited_samples"
+VALUES = "kernels/test_render.py::test_values_and_visited_samples"
 PLAIN = f"{VALUES}[ndc]"
 CLIPPED = f"{VALUES}[ndc, clipped]"
-EQUAL = "test_kernel_packs.py::test_packs_equal_the_plain_kernels"
-LOSSES = "test_seams.py::test_losses_in_a_frustum_are_those_of_distances_in_the_scene"
+EQUAL = "kernels/test_packs.py::test_packs_equal_the_plain_kernels"
+LOSSES = "kernels/test_seams.py::test_losses_in_a_frustum_are_those_of_distances_in_the_scene"
 
 MUTANTS = [
     # ndc.py
@@ -114,63 +114,63 @@ MUTANTS = [
     Mutant(
         "ndc: distances in its own units",
         "sampling/traversal.py",
-        "sample.t = distance_of(ray, t, contraction)",
+        "sample.t = distance_of(ray, t)",
         "sample.t = t",
         PLAIN,
     ),
     Mutant(
         "ndc: far plane a step late",
-        "sampling/traversal.py",
-        "if contraction == NDC and sample.t >= box.frustum.end:",
-        "if contraction == NDC and sample.t > real(1.0e9):",
+        "space/ndc.py",
+        "return distance >= box.frustum.end",
+        "return distance > real(1.0e9)",
         CLIPPED,
     ),
     Mutant(
         "ndc: direction of any length",
-        "sampling/traversal.py",
+        "space/ndc.py",
         "ray.q_direction = wp.cw_div(along, box.half)",
-        "ray.q_direction = wp.cw_div(direction, box.half)",
+        "ray.q_direction = wp.cw_div(ray.direction, box.half)",
         PLAIN,
     ),
     Mutant(
         "ndc: lengths of losses in its own units",
-        "sampling/traversal.py",
+        "space/ndc.py",
         "return dt * stretch_at(ray.line, distance)",
         "return dt",
         LOSSES,
     ),
     Mutant(
         "packs, ndc: far plane a step late",
-        "sampling/traversal.py",
-        "    visited &= t < box.frustum.end;\n",
+        "space/ndc.py",
+        "active &= t < box.frustum.end;\n",
         "",
         f"{EQUAL}[ndc, clipped]",
     ),
     Mutant(
         "packs, ndc: sign of the slope",
-        "sampling/traversal.py",
+        "space/ndc.py",
         "ray.line.speed - t * ray.line.slope",
         "ray.line.speed + t * ray.line.slope",
         f"{EQUAL}[ndc]",
     ),
     Mutant(
         "packs, ndc: t without its beginning",
-        "sampling/traversal.py",
+        "space/ndc.py",
         "t = ray.line.t + t * ray.line.w / left;",
         "t = t * ray.line.w / left;",
         f"{EQUAL}[ndc]",
     ),
     Mutant(
         "packs, ndc: samples beside the box",
-        "sampling/traversal.py",
-        "if (!folds) {",
-        "if (contraction == 0) {",
+        "space/ndc.py",
+        "locate=WITHIN",
+        'locate=""',
         f"{EQUAL}[ndc]",
     ),
     Mutant(
         "packs, ndc: lengths of losses in its own units",
-        "sampling/traversal.py",
-        "    length *= w * w / (ray.line.w * ray.line.speed);\n",
+        "space/ndc.py",
+        "length *= w * w / (ray.line.w * ray.line.speed);\n",
         "",
         LOSSES,
     ),

@@ -2,25 +2,25 @@
 
 from mutant import Mutant
 
-INTERP = "test_kernel_interp.py"
-LOST = "test_kernel_render.py::test_rays_that_are_not_finite_see_the_background"
-VARIATION = "test_kernel_total_variation.py"
-ADAM = "test_kernel_adam.py"
-TILES = "test_kernel_tiles.py"
-OCCUPANCY = "test_kernel_occupancy.py"
-CAMERA = "test_kernel_camera.py"
-COVERAGE = "test_kernel_coverage.py"
-RAYS = "test_rays.py"
-GRADSCALE = "test_gradscale.py"
-VALUES = "test_kernel_render.py::test_values_and_visited_samples"
+INTERP = "kernels/test_interpolation.py"
+LOST = "kernels/test_render.py::test_rays_that_are_not_finite_see_the_background"
+VARIATION = "kernels/test_total_variation.py"
+ADAM = "kernels/test_adam.py"
+TILES = "kernels/test_tiles.py"
+OCCUPANCY = "kernels/test_free_space.py"
+CAMERA = "kernels/test_camera_rays.py"
+COVERAGE = "kernels/test_coverage.py"
+RAYS = "rendering/test_rays.py"
+GRADSCALE = "kernels/test_gradscale.py"
+VALUES = "kernels/test_render.py::test_values_and_visited_samples"
 GROWING = f"{VALUES}[linf]"
-ADJOINT = "test_kernel_render.py::test_adjoint_against_autograd"
-EACH_OUTPUT = "test_kernel_render.py::test_each_output_alone"
-OPAQUE = "test_kernel_render.py::test_nothing_flows_back_from_behind_an_opaque_wall"
+ADJOINT = "kernels/test_render.py::test_adjoint_against_autograd"
+EACH_OUTPUT = "kernels/test_render.py::test_each_output_alone"
+OPAQUE = "kernels/test_render.py::test_nothing_flows_back_from_behind_an_opaque_wall"
 SCALING = (
-    "test_kernel_render.py::test_scaling_against_the_papers_operation[none-quadratic-none-True]"
+    "kernels/test_render.py::test_scaling_against_the_papers_operation[none-quadratic-none-True]"
 )
-TRAINING = "test_kernel_render.py::test_training_launch_against_autograd[none-quadratic-none]"
+TRAINING = "kernels/test_render.py::test_training_launch_against_autograd[none-quadratic-none]"
 
 MUTANTS = [
     # scalar.py, walk.py and compositing.py: values
@@ -30,8 +30,8 @@ MUTANTS = [
            "behind_all = ray_value(rays.background, i)",
            "behind_all = ray_value(rays.background, 0)", TRAINING),
     Mutant("attenuated twice", "volume/walk.py",
-           "total.transmittance *= matter.attenuation\n",
-           "total.transmittance *= matter.attenuation * matter.attenuation\n", VALUES),
+           "total.transmittance *= activated.attenuation\n",
+           "total.transmittance *= activated.attenuation * activated.attenuation\n", VALUES),
     Mutant("depth at the step's end", "volume/walk.py",
            "total.depth += weight * sample.t",
            "total.depth += weight * (sample.t + sample.dt)", VALUES),
@@ -40,40 +40,38 @@ MUTANTS = [
     Mutant("far included", "sampling/traversal.py",
            "if t >= march.far:", "if t > march.far + dt:", VALUES),
     Mutant("density scale dropped from the value", "volume/compositing.py",
-           "matter.sigma = density.scale * softplus(shifted)",
-           "matter.sigma = softplus(shifted)", VALUES),
+           "activated.sigma = density.scale * softplus(shifted)",
+           "activated.sigma = softplus(shifted)", VALUES),
     Mutant("early stop a sample late", "volume/walk.py",
            "if total.transmittance < scene.march.transmittance_min:\n",
-           "if total.transmittance < scene.march.transmittance_min * matter.attenuation:\n",
+           "if total.transmittance < scene.march.transmittance_min * activated.attenuation:\n",
            VALUES),
     # scalar.py, walk.py and compositing.py: adjoint
     Mutant("sign of the suffix", "volume/walk.py",
-           "(transmittance * adj_weight - behind)",
-           "(transmittance * adj_weight + behind)", ADJOINT),
+           "(transmittance * adj_weight - suffix_sum)",
+           "(transmittance * adj_weight + suffix_sum)", ADJOINT),
     Mutant("T_i for T_{i+1}", "volume/walk.py",
-           "            transmittance *= matter.attenuation\n            scale",
-           "            scale_of_next = matter.attenuation\n            scale", ADJOINT),
+           "            transmittance *= activated.attenuation\n            scale",
+           "            scale_of_next = activated.attenuation\n            scale", ADJOINT),
     Mutant("T_end term dropped", "volume/walk.py",
            "            + adj_end * total.transmittance\n", "", ADJOINT),
     Mutant("opacity's sign", "launch/scalar.py",
-           "        adj_transmittance = wp.dot(adj_rgb[i], ray_value(rays.background, i)) - adj_opacity[i]",
-           "        adj_transmittance = wp.dot(adj_rgb[i], ray_value(rays.background, i)) + adj_opacity[i]",
-           ADJOINT),
+           "wp.dot(adj_rgb[i], ray_value(rays.background, i)) - adj_opacity[i]",
+           "wp.dot(adj_rgb[i], ray_value(rays.background, i)) + adj_opacity[i]", ADJOINT),
     Mutant("background term dropped", "launch/scalar.py",
-           "        adj_transmittance = wp.dot(adj_rgb[i], ray_value(rays.background, i)) - adj_opacity[i]",
-           "        adj_transmittance = -adj_opacity[i]", ADJOINT),
+           "wp.dot(adj_rgb[i], ray_value(rays.background, i)) - adj_opacity[i]", "-adj_opacity[i]", ADJOINT),
     Mutant("background term dropped, training", "launch/scalar.py",
            "wp.dot(adj_rgb, behind_all) - adj_opacity", "-adj_opacity", TRAINING),
     Mutant("depth term dropped", "volume/walk.py",
-           "adj_weight = adj_depth * sample.t + adj_loss_value", "adj_weight = adj_loss_value", ADJOINT),
+           "adj_weight = adj.depth * sample.t + adj.loss", "adj_weight = adj.loss", ADJOINT),
     Mutant("depth dropped from what lies behind", "volume/walk.py",
-           "            + adj_depth * total.depth\n", "", ADJOINT),
+           "            + adj.depth * total.depth\n", "", ADJOINT),
     Mutant("colour dropped from what lies behind", "volume/walk.py",
-           "            wp.dot(adj_channels, total.channels)\n", "            real(0.0)\n", ADJOINT),
+           "            wp.dot(adj.channels, total.channels)\n", "            real(0.0)\n", ADJOINT),
     Mutant("colour term dropped", "volume/walk.py",
-           "                adj_weight += wp.dot(adj_channels, channels)\n", "", ADJOINT),
+           "                adj_weight += wp.dot(adj.channels, channels)\n", "", ADJOINT),
     Mutant("suffix sheds after use", "volume/compositing.py",
-           "behind - weight * adj_weight", "behind - real(0.999) * weight * adj_weight", ADJOINT),
+           "suffix_sum - weight * adj_weight", "suffix_sum - real(0.999) * weight * adj_weight", ADJOINT),
     Mutant("dt dropped", "volume/walk.py",
            "scale * (sample.dt * (transmittance", "scale * ((transmittance", ADJOINT),
     Mutant("scale dropped from density", "volume/walk.py",
@@ -82,8 +80,8 @@ MUTANTS = [
            "adj_sample_channels = scale * (weight * adj_own)",
            "adj_sample_channels = weight * adj_own", SCALING),
     Mutant("scale from the step's start", "volume/walk.py",
-           "                sample.t, content_distance",
-           "                sample.t - real(0.5) * sample.dt, content_distance", SCALING),
+           "                sample.t, adj.content_distance",
+           "                sample.t - real(0.5) * sample.dt, adj.content_distance", SCALING),
     Mutant("content distance of ray 0", "launch/scalar.py",
            "ray_value(rays.content_distance, i)", "ray_value(rays.content_distance, 0)", SCALING, 1, 2),
     Mutant("content distance of ray 0, training", "launch/scalar.py",
@@ -100,11 +98,11 @@ MUTANTS = [
     Mutant("bound without the colour", "volume/walk.py",
            "        of_channels += wp.abs(adj_channels[c])\n", "        of_channels += real(0.0)\n", EACH_OUTPUT),
     Mutant("bound up to the ray's beginning", "volume/walk.py",
-           "end = distance_of(ray, edge(scene.march, ray, ray.end), contraction)",
-           "end = distance_of(ray, edge(scene.march, ray, ray.begin), contraction)", EACH_OUTPUT),
+           "end = distance_of(ray, edge(scene.march, ray, ray.end))",
+           "end = distance_of(ray, edge(scene.march, ray, ray.begin))", EACH_OUTPUT),
     Mutant("density scale dropped from the slope", "volume/compositing.py",
-           "matter.sigma_slope = density.scale * softplus_slope",
-           "matter.sigma_slope = softplus_slope", ADJOINT),
+           "activated.sigma_slope = density.scale * softplus_slope",
+           "activated.sigma_slope = softplus_slope", ADJOINT),
     Mutant("density shift dropped", "volume/compositing.py",
            "raw_density + density.shift", "raw_density", VALUES),
     # heads/rgb.py
@@ -142,12 +140,14 @@ MUTANTS = [
     Mutant("tiles_ahead: beyond the grid", "base/tiles.py", "ahead < n_tiles", "true", TILES),
     Mutant("first_of: the last", "base/tiles.py",
            "__builtin_ctzll(tiles)", "(63 - __builtin_clzll(tiles))", TILES),
-    Mutant("but_first: the last", "base/tiles.py",
+    Mutant("without_first: the last", "base/tiles.py",
            "tiles & (tiles - wp.uint64(1))", "tiles & (tiles >> wp.uint64(1))", TILES),
-    Mutant("a group of nine", "optim/adam.py", "last, wp.static(GROUP)", "last, wp.static(GROUP + 1)",
-           ADAM),
-    Mutant("variation: a group of nine", "optim/total_variation.py",
-           "last, wp.static(GROUP)", "last, wp.static(GROUP + 1)", VARIATION),
+    Mutant("tile_loop: a group of nine", "base/tiles.py",
+           "last, wp.static(GROUP)", "last, wp.static(GROUP + 1)", ADAM),
+    Mutant("tile_loop: into the tile before", "base/tiles.py",
+           "work(on, node, wp.max(start, node),", "work(on, node, node,", VARIATION),
+    Mutant("tile_loop: into the tile after", "base/tiles.py",
+           "wp.min(end, node + wp.static(TILE))", "node + wp.static(TILE)", VARIATION),
     # interp.py, again
     Mutant("far face out of the grid", "fields/interp.py",
            "wp.clamp(int(u[1]), 0, size[1] - 2)", "wp.clamp(int(u[1]), 0, size[1] - 1)", INTERP),
@@ -165,12 +165,17 @@ MUTANTS = [
            "for n in range(len(y)):", "for n in range(len(y) - 1):", ADJOINT),
     # contraction.py
     Mutant("contraction: border term", "space/contraction.py",
-           "real(1.0) + border - border / n", "real(1.0) + border + border / n", INTERP),
+           "real(1.0) + box.border - box.border / n", "real(1.0) + box.border + box.border / n", INTERP),
     Mutant("determinant: a power of n", "space/contraction.py",
-           "return border / (n * n) * across * across",
-           "return border / n * across * across", INTERP),
-    Mutant("norms swapped", "space/contraction.py",
-           "if contraction == L2:", "if contraction == LINF:", INTERP),
+           "return box.border / (n * n) * across * across",
+           "return box.border / n * across * across", INTERP),
+    Mutant("norm of two axes", "space/contraction.py",
+           "wp.max(wp.max(wp.abs(q[0]), wp.abs(q[1])), wp.abs(q[2]))",
+           "wp.max(wp.abs(q[0]), wp.abs(q[1]))", INTERP),
+    Mutant("boxes out: as contracted", "space/contraction.py",
+           "return box.border / (real(1.0) + box.border - norm_of_c)", "return norm_of_c", INTERP),
+    Mutant("boxes out: infinity is near", "space/contraction.py",
+           "return real(wp.static(INFINITELY_FAR))", "return real(1.0)", INTERP),
     # steps.py and traversal.py
     Mutant("growth one step early", "sampling/steps.py",
            "if k <= march.n_linear or", "if k < march.n_linear - 1 or", GROWING),
@@ -181,7 +186,7 @@ MUTANTS = [
     Mutant("directions that are not finite", "sampling/traversal.py",
            " and wp.isfinite(ray.q_direction)\n", "\n", LOST),
     Mutant("no direction", "sampling/traversal.py",
-           " and wp.length_sq(ray.q_direction) > real(0.0):", ":", LOST),
+           " and wp.length_sq(ray.q_direction) > real(0.0))", ")", LOST),
     Mutant("origins that are not finite", "sampling/traversal.py",
            "wp.isfinite(ray.q_origin) and wp", "wp", LOST),
     Mutant("a slab's axis", "sampling/traversal.py",
@@ -196,13 +201,14 @@ MUTANTS = [
     Mutant("mask off by one cell", "sampling/traversal.py",
            "i = wp.clamp(int(m[0]), 0", "i = wp.clamp(int(m[0]) + 1, 0", OCCUPANCY),
     Mutant("a ring too far", "sampling/traversal.py",
-           "rings = real(distance - 1)", "rings = real(distance)", OCCUPANCY),
+           "rings = real(distance - 1)", "rings = real(distance)", OCCUPANCY, 1, 2),
+    Mutant("a ring too far in contracted space", "sampling/traversal.py",
+           "rings = real(distance - 1)", "rings = real(distance + 1)", OCCUPANCY, 2, 2),
     Mutant("leap backwards along a ray", "sampling/traversal.py",
            "return (rings + within) / -speed",
            "return (rings + real(1.0) - within) / -speed", OCCUPANCY),
-    Mutant("leap under contraction", "sampling/traversal.py",
-           "(real(2.0) * wp.length(ray.q_direction) * widest)",
-           "(real(0.2) * wp.length(ray.q_direction) * widest)", OCCUPANCY),
+    Mutant("leap under contraction", "space/contraction.py",
+           "stretch=2.0", "stretch=0.2", OCCUPANCY),
     Mutant("leap a sample too far", "sampling/steps.py",
            "- ray.offset - real(1.0e-3))", "- ray.offset + real(2.0))", OCCUPANCY),
     # gradscale.py
@@ -236,19 +242,19 @@ MUTANTS = [
     Mutant("variation: weights dropped", "optim/total_variation.py",
            "wp.cw_mul(weight, total)", "total", VARIATION),
     Mutant("variation: strengths dropped", "optim/total_variation.py",
-           "weights = here * weight", "weights = weight", VARIATION),
+           "weights = here * on.weight", "weights = on.weight", VARIATION),
     Mutant("variation: strengths dropped in tiles", "optim/total_variation.py",
            "= strength * weight.c", "= weight.c", VARIATION),
     Mutant("variation: strengths of tiles", "optim/total_variation.py",
-           "node // wp.static(RUN)", "node // wp.static(TILE)", VARIATION),
+           "node // wp.static(TV_BLOCK)", "node // wp.static(TILE)", VARIATION),
     Mutant("variation: across the first plane", "optim/total_variation.py",
            "if n >= stride_x:", "if n >= 0:", VARIATION),
     Mutant("variation: across the last plane", "optim/total_variation.py",
            "if n < values.shape[0] - stride_x:", "if n <= values.shape[0] - stride_x:", VARIATION),
     Mutant("variation: rows not counted", "optim/total_variation.py",
-           "                        j += 1\n", "", VARIATION),
+           "                j += 1\n", "", VARIATION),
     Mutant("variation: planes not counted", "optim/total_variation.py",
-           "                        if j == size[1]:\n                            j = 0\n", "", VARIATION),
+           "                if j == size[1]:\n                    j = 0\n", "", VARIATION),
     Mutant("tile: axis", "optim/total_variation.py",
            "pull(here - stride_y)", "pull(here - stride_x)", VARIATION),
     Mutant("tile: one side twice", "optim/total_variation.py", "pull(here - FLOATS)", "pull(here + FLOATS)", VARIATION),
@@ -262,14 +268,13 @@ MUTANTS = [
     Mutant("tile: nodes without a gradient", "optim/total_variation.py",
            "const numbers after = seen ? before + weights * total : before;",
            "const numbers after = before + weights * total;", VARIATION),
-    Mutant("tile: twice", "optim/total_variation.py", "                    end_node = first_node\n",
-           "                    end_node = end_node\n", VARIATION),
+    Mutant("tile: twice", "optim/total_variation.py", "            last = begin\n", "            last = last\n", VARIATION),
     Mutant("tile: cut short", "optim/total_variation.py",
-           "inside = end_node - first_node == wp.static(TILE)", "inside = end_node > 0",
+           "inside = end - begin == wp.static(TILE)", "inside = end > 0",
            VARIATION),
     Mutant("tile: on the first plane", "optim/total_variation.py", "node >= stride_x and ", "", VARIATION),
     Mutant("tile: on the last plane", "optim/total_variation.py",
-           " and node < n_nodes - stride_x", "", VARIATION),
+           " and node < on.values.shape[0] - stride_x", "", VARIATION),
     Mutant("tile: in the first row", "optim/total_variation.py", "j > 0 and", "j >= 0 and", VARIATION),
     Mutant("tile: in the last row", "optim/total_variation.py", "and j + 1 < size[1]\n", "and j < size[1]\n",
            VARIATION),
@@ -281,11 +286,11 @@ MUTANTS = [
            "k + wp.static(TILE) < size[2]", "k < size[2]", VARIATION),
     # adam.py
     Mutant("Adam: betas swapped", "optim/adam.py",
-           "beta1 * mean_of(old)", "beta2 * mean_of(old)", ADAM),
+           "adam.beta1 * mean_of(old)", "adam.beta2 * mean_of(old)", ADAM),
     Mutant("Adam: bias correction swapped", "optim/adam.py",
-           "root(correction2 * v)", "root(correction1 * v)", ADAM),
+           "root(adam.correction2 * v)", "root(adam.correction1 * v)", ADAM),
     Mutant("Adam: epsilon under the root", "optim/adam.py",
-           "(root(correction2 * v) + epsilon)", "root(correction2 * v + epsilon)", ADAM),
+           "root(adam.correction2 * v);", "root(adam.correction2 * v + adam.epsilon) - adam.epsilon;", ADAM),
     Mutant("Adam: zero gradients move values", "optim/adam.py",
            "g != 0.0f ? moved : value", "moved", ADAM),
     Mutant("Adam: zero gradients move moments", "optim/adam.py",
@@ -297,7 +302,7 @@ MUTANTS = [
     Mutant("Adam: a tile cut short is written whole", "optim/adam.py",
            "else memcpy((float*)(to + node) + c, &x, sizeof(float) * n_here);",
            "else memcpy((float*)(to + node) + c, &x, sizeof(x));", ADAM),
-    Mutant("Adam: a tile cut short is passed over", "optim/adam.py",
+    Mutant("Adam: a tile cut short is skipped", "optim/adam.py",
            "else memcpy((float*)(to + node) + c, &x, sizeof(float) * n_here);", "", ADAM),
     Mutant("Adam: rounded to the nearest", "optim/adam.py",
            "join(m, v, noise)", "join(m, v, 0u * noise + 0x80004000u)", ADAM),
@@ -384,17 +389,17 @@ MUTANTS = [
     Mutant("camera: beyond a fisheye's rim", "space/camera.py",
            "high = view.angle_max", "high = real(3.0)", CAMERA),
     Mutant("camera: each step draws the same", "space/camera.py",
-           "ray = rays_before + wp.uint32(i)", "ray = wp.uint32(i)", RAYS),
+           "ray = draw.rays_before + wp.uint32(i)", "ray = wp.uint32(i)", RAYS),
     Mutant("camera: the view before", "space/camera.py",
            "views[middle].first_pixel <= pixel", "views[middle].first_pixel < pixel", CAMERA),
     Mutant("camera: the run before", "space/camera.py",
            "view.runs[middle][0] <= number", "view.runs[middle][0] < number", RAYS),
     Mutant("camera: blocks of the first view", "space/camera.py",
-           "at = first_blocks[view] + ", "at = ", RAYS),
+           "at = source.first_blocks[view] + ", "at = ", RAYS),
     Mutant("camera: rows of blocks cut short", "space/camera.py",
            "across = (width + block - 1) // block\n        at", "across = width // block + 1\n        at", RAYS),
     Mutant("camera: draws from what is not covered", "space/camera.py",
-           "if covered[at] != wp.uint8(0):", "if covered[at] == wp.uint8(0):", RAYS),
+           "if source.covered[at] != wp.uint8(0):", "if source.covered[at] == wp.uint8(0):", RAYS),
     # coverage.py
     Mutant("coverage: a cone as wide as a ray", "sampling/coverage.py",
            "spread = wp.max(spread, wp.length(pixel_direction(view, at_u, at_v) - ray.direction))",

@@ -2,15 +2,15 @@
 
 from mutant import Mutant
 
-ANY = "test_kernel_packs.py::test_packs_equal_the_plain_kernels[random background]"
-TILES = "test_kernel_scatter.py::test_only_tiles_around_a_sample_are_flagged"
-SEVERAL = "test_kernel_scatter.py::test_one_thread_against_more"
+ANY = "kernels/test_packs.py::test_packs_equal_the_plain_kernels[random background]"
+TILES = "kernels/test_scatter.py::test_only_tiles_around_a_sample_are_flagged"
+SEVERAL = "kernels/test_scatter.py::test_one_thread_against_more"
 TWO = f"{SEVERAL}[none-2]"
 THREE = f"{SEVERAL}[none-3]"
-OWN = "test_kernel_scatter.py::test_workers_add_to_no_planes_but_their_own"
-NOTHING = "test_kernel_scatter.py::test_nothing_is_left_of_what_is_all_one_s_own"
-NUMBERS = "test_kernel_scatter.py::test_any_number_of_records"
-ROOM = "test_kernel_scatter.py::test_there_is_room_for_all_records"
+OWN = "kernels/test_scatter.py::test_workers_add_to_no_planes_but_their_own"
+NOTHING = "kernels/test_scatter.py::test_nothing_is_left_of_what_is_all_one_s_own"
+NUMBERS = "kernels/test_scatter.py::test_any_number_of_records"
+ROOM = "kernels/test_scatter.py::test_there_is_room_for_all_records"
 
 MUTANTS = [
     # what a sample has for its nodes
@@ -19,13 +19,13 @@ MUTANTS = [
     Mutant("adj_composite: density's slope dropped", "volume/pack.py",
            "load(pack.sigma_slope) * adj_sigma", "adj_sigma", ANY),
     Mutant("adj_decode: blue's for green's", "heads/rgb.py",
-           "adj_channels.c[c]\"", "adj_channels.c[c == 1 ? 2 : c]\"", ANY),
+           "adj.channels.c[c]\"", "adj.channels.c[c == 1 ? 2 : c]\"", ANY),
     Mutant("add_own: what is no sample adds", "fields/dense.py",
-           "            if (!(visited >> n & 1)) continue;\n", "", ANY),
+           "            if (!(active >> n & 1)) continue;\n", "", ANY),
     Mutant("add_own: what is no sample adds to the lower plane", "fields/dense.py",
-           "lower = visited & owned", "lower = owned", TWO),
+           "lower = active & owned", "lower = owned", TWO),
     Mutant("add_own: what is no sample adds to the upper plane", "fields/dense.py",
-           "upper = visited & owned", "upper = owned", TWO),
+           "upper = active & owned", "upper = owned", TWO),
     Mutant("add_own: too much for the lower node", "fields/dense.py",
            "both.lo = adj[n] - both.hi", "both.lo = adj[n]", ANY),
     Mutant("add_own: column", "fields/dense.py",
@@ -63,13 +63,13 @@ MUTANTS = [
            "node < first_node(owner + 1)", "node <= first_node(owner + 1)", TWO),
     # adj_read: to whom
     Mutant("add_own: upper plane taken for the lower", "fields/dense.py",
-           "upper = visited & owned(worker, base + stride_x)",
-           "upper = visited & owned(worker, base)", OWN),
+           "upper = active & owned(worker, base + stride_x)",
+           "upper = active & owned(worker, base)", OWN),
     Mutant("add_own: all where the lower plane is one's own", "fields/dense.py",
-           "(lower & upper) == visited", "lower == visited", OWN),
+           "(lower & upper) == active", "lower == active", OWN),
     Mutant("add_own: all where the upper plane is one's own", "fields/dense.py",
-           "(lower & upper) == visited", "upper == visited", OWN),
-    Mutant("add_own: all", "fields/dense.py", "(lower & upper) == visited", "true", OWN),
+           "(lower & upper) == active", "upper == active", OWN),
+    Mutant("add_own: all", "fields/dense.py", "(lower & upper) == active", "true", OWN),
     Mutant("add_own: never all", "fields/dense.py", "return true;", "return false;", NOTHING),
     Mutant("adj_read: nothing sent", "fields/dense.py",
            "    const unsigned theirs = owned(receiver, base) | owned(receiver, base + stride_x);",
@@ -79,7 +79,7 @@ MUTANTS = [
     Mutant("adj_read: upper plane not sent", "fields/dense.py",
            "| owned(receiver, base + stride_x)", "", TWO),
     Mutant("adj_read: sent to oneself", "fields/dense.py", "receiver == worker ||", "", TWO),
-    Mutant("adj_read: the first receiver passed over", "fields/dense.py",
+    Mutant("adj_read: the first receiver skipped", "fields/dense.py",
            "receiver = 0;", "receiver = 1;", TWO),
     Mutant("adj_read: two receivers at most", "fields/dense.py",
            "receiver < n_workers", "receiver < 2", THREE),
@@ -95,13 +95,13 @@ MUTANTS = [
     Mutant("adj_read: addressed to another", "fields/dense.py",
            "((size_t)worker * n_workers + receiver)", "((size_t)worker * n_workers)", THREE),
     Mutant("adj_read: addresses counted in another's row", "fields/dense.py",
-           "n_addressed.data[worker * row + receiver]", "n_addressed.data[receiver]", TWO),
+           "n_recipients.data[worker * row + receiver]", "n_recipients.data[receiver]", TWO),
     Mutant("adj_read: one count for all receivers", "fields/dense.py",
-           "n_addressed.data[worker * row + receiver]", "n_addressed.data[worker * row]", TWO),
+           "n_recipients.data[worker * row + receiver]", "n_recipients.data[worker * row]", TWO),
     Mutant("adj_read: the record before", "fields/dense.py", "n++] = sent;", "n++] = sent - 1;", TWO),
     Mutant("adj_read: addresses not counted", "fields/dense.py", "n++] = sent", "n] = sent", TWO),
     Mutant("adj_read: which are samples is not said", "fields/dense.py",
-           "record.visited = visited", "record.visited = 65535u", TWO),
+           "record.active = active", "record.active = 65535u", TWO),
     Mutant("adj_read: the base forgotten", "fields/dense.py",
            "store_int(record.base, base);", "store_int(record.base, 0 * base);", TWO),
     Mutant("adj_read: fraction, y for x", "fields/dense.py",
@@ -133,21 +133,21 @@ MUTANTS = [
     Mutant("add_records: addresses by receiver", "fields/dense.py",
            "((size_t)sender * n_workers + worker)", "((size_t)worker * n_workers + sender)", TWO),
     Mutant("add_records: count by receiver", "fields/dense.py",
-           "n_addressed.data[sender * row + worker]", "n_addressed.data[worker * row + sender]",
+           "n_recipients.data[sender * row + worker]", "n_recipients.data[worker * row + sender]",
            TWO),
     Mutant("add_records: the records in turn", "fields/dense.py",
            "record = records[which[k]]", "record = records[k]", THREE),
     Mutant("add_records: the first one is late", "fields/dense.py", "k = 0;", "k = 1;", NUMBERS),
     Mutant("add_records: one record too few", "fields/dense.py", "k < n;", "k < n - 1;", NUMBERS),
-    Mutant("deliver: before all rays are through", "cpu/scatter.py",
+    Mutant("apply_records: before all rays are through", "cpu/scatter.py",
            "if wait_for_all(sink.chunk.barrier, n_workers):", "if n_workers > 1:", TWO),
-    Mutant("leave_none: records of the last chunk", "cpu/scatter.py",
+    Mutant("clear_records: records of the last chunk", "cpu/scatter.py",
            "    sink.n_records[worker, 0] = 0\n", "", ROOM),
-    Mutant("leave_none: addresses of the last chunk", "cpu/scatter.py",
-           "        sink.n_addressed[worker, receiver] = 0\n", "        pass\n",
-           "test_kernel_scatter.py::test_rays_in_chunks[none]"),
+    Mutant("clear_records: addresses of the last chunk", "cpu/scatter.py",
+           "        sink.n_recipients[worker, receiver] = 0\n", "        pass\n",
+           "kernels/test_scatter.py::test_rays_in_chunks[none]"),
     # which rays are whose
     Mutant("rays as they come", "launch/packed.py",
            "i = chunk.rays[worker, begin + r]", "i = begin + r",
-           "test_kernel_scatter.py::test_nothing_is_left_where_each_takes_its_own_rays", 1, 5),
+           "kernels/test_scatter.py::test_nothing_is_left_where_each_takes_its_own_rays", 1, 3),
 ]  # fmt: skip

@@ -2,12 +2,14 @@
 
 from mutant import Mutant
 
-ROOM = "test_kernel_scatter.py::test_there_is_room_for_all_records"
-SHARED_OUT = "test_kernel_schedule.py::test_rays_are_shared_out_by_slab_and_work"
-WORK = "test_kernel_schedule.py::test_each_worker_has_as_much_work"
-NEAREST = "test_kernel_schedule.py::test_each_worker_has_the_rays_nearest_its_part_cell_by_cell"
-WAITING = "test_parallel.py::test_workers_wait_for_each_other"
-CELL = "test_kernel_schedule.py::test_cells_are_numbered_along_a_curve"
+ROOM = "kernels/test_scatter.py::test_there_is_room_for_all_records"
+SHARED_OUT = "kernels/test_ray_schedule.py::test_rays_are_shared_out_by_slab_and_work"
+WORK = "kernels/test_ray_schedule.py::test_each_worker_has_as_much_work"
+NEAREST = (
+    "kernels/test_ray_schedule.py::test_each_worker_has_the_rays_nearest_its_part_cell_by_cell"
+)
+WAITING = "runtime/test_parallel.py::test_workers_wait_for_each_other"
+CELL = "kernels/test_ray_schedule.py::test_cells_are_numbered_along_a_curve"
 
 MUTANTS = [
     Mutant("measure_ray: where rays begin", "cpu/schedule.py", "(ray.begin + ray.end) // 2",
@@ -15,7 +17,7 @@ MUTANTS = [
     Mutant("measure_ray: beyond far", "cpu/schedule.py",
            "(ray.begin + ray.end) // 2", "(ray.begin + ray.end)", NEAREST),
     Mutant("measure_ray: not contracted", "cpu/schedule.py",
-           "contract(ray.q_origin + t * ray.q_direction, box.border, contraction)",
+           "contract(box, ray.q_origin + t * ray.q_direction)",
            "ray.q_origin + t * ray.q_direction", NEAREST),
     Mutant("place: half of the grid", "fields/dense.py", "real(2.0) * grid.middle",
            "grid.middle", NEAREST),
@@ -38,49 +40,49 @@ MUTANTS = [
            "wp.min(int(scaled), wp.static(ACROSS - 1))", "int(scaled)", CELL),
     Mutant("slab_of: along z", "cpu/schedule.py", "(cell >> (3 * bit + 2))", "(cell >> (3 * bit))",
            SHARED_OUT),
-    Mutant("pick_out: more than there is room for", "cpu/schedule.py",
+    Mutant("select_rays: more than there is room for", "cpu/schedule.py",
            "<= chunk.most_work", "<= wp.int64(2) * chunk.most_work", SHARED_OUT),
-    Mutant("pick_out: not one ray at least", "cpu/schedule.py", "last == chunk.begin or ", "", SHARED_OUT),
-    Mutant("pick_out: the last chunk's work", "cpu/schedule.py",
+    Mutant("select_rays: not one ray at least", "cpu/schedule.py", "last == chunk.begin or ", "", SHARED_OUT),
+    Mutant("select_rays: the last chunk's work", "cpu/schedule.py",
            "        chunk.work_before[worker, slab] = wp.int64(0)\n", "        pass\n", SHARED_OUT),
-    Mutant("pick_out: the last chunk's rays", "cpu/schedule.py",
+    Mutant("select_rays: the last chunk's rays", "cpu/schedule.py",
            "        chunk.rays_before[worker, cell] = 0\n", "        pass\n", SHARED_OUT),
-    Mutant("pick_out: slabs after one's own", "cpu/schedule.py",
+    Mutant("select_rays: slabs after one's own", "cpu/schedule.py",
            "        chunk.work_before[worker, slab] = before\n        before += here\n",
            "        before += here\n        chunk.work_before[worker, slab] = before\n", SHARED_OUT),
-    Mutant("pick_out: cells after one's own", "cpu/schedule.py",
+    Mutant("select_rays: cells after one's own", "cpu/schedule.py",
            "        chunk.rays_before[worker, cell] = place\n        place += n\n",
            "        place += n\n        chunk.rays_before[worker, cell] = place\n", SHARED_OUT),
-    Mutant("pick_out: rays of a cell on one place", "cpu/schedule.py",
+    Mutant("select_rays: rays of a cell on one place", "cpu/schedule.py",
            "        chunk.rays_before[worker, chunk.cells[i]] = place + 1\n", "", SHARED_OUT),
-    Mutant("pick_out: rays of one slab all alike", "cpu/schedule.py",
+    Mutant("select_rays: rays of one slab all alike", "cpu/schedule.py",
            "        chunk.work_before[worker, slab] = before + wp.int64(chunk.work[i])\n", "",
            SHARED_OUT),
-    Mutant("pick_out: work beyond int", "cpu/schedule.py",
+    Mutant("select_rays: work beyond int", "cpu/schedule.py",
            "wp.int64(n_workers) * before", "wp.int64(n_workers * int(before))", SHARED_OUT),
-    Mutant("pick_out: those of lower workers as well", "cpu/schedule.py",
+    Mutant("select_rays: those of lower workers as well", "cpu/schedule.py",
            "beyond >= wp.int64(0) and ", "", SHARED_OUT),
-    Mutant("pick_out: those of higher workers as well", "cpu/schedule.py",
+    Mutant("select_rays: those of higher workers as well", "cpu/schedule.py",
            " and beyond < total", "", SHARED_OUT),
-    Mutant("pick_out: others' rays count as well", "cpu/schedule.py",
-           "            n_drawn += 1\n            chunk.rays_before[worker, cell] += 1\n",
-           "            n_drawn += 1\n        chunk.rays_before[worker, cell] += 1\n", SHARED_OUT),
-    Mutant("pick_out: another's list", "cpu/schedule.py",
-           "            chunk.drawn[worker, n_drawn] = i", "            chunk.drawn[0, n_drawn] = i",
+    Mutant("select_rays: others' rays count as well", "cpu/schedule.py",
+           "            n_candidates += 1\n            chunk.rays_before[worker, cell] += 1\n",
+           "            n_candidates += 1\n        chunk.rays_before[worker, cell] += 1\n", SHARED_OUT),
+    Mutant("select_rays: another's list", "cpu/schedule.py",
+           "            chunk.candidates[worker, n_candidates] = i", "            chunk.candidates[0, n_candidates] = i",
            SHARED_OUT),
-    Mutant("pick_out: rays as they come", "cpu/schedule.py",
+    Mutant("select_rays: rays as they come", "cpu/schedule.py",
            "        chunk.rays[worker, place] = i", "        chunk.rays[worker, k] = i", SHARED_OUT),
-    Mutant("take_share: picked out before all rays are measured", "cpu/schedule.py",
+    Mutant("assign_rays: selected before all rays are measured", "cpu/schedule.py",
            "            if not wait_for_all(chunk.barrier, n_workers):\n                return 0\n", "", NEAREST),
     Mutant("barrier: nobody waits", "cpu/barrier.py", "read(ARRIVED) < all", "false", WAITING),
     Mutant("barrier: one does not wait", "cpu/barrier.py",
            "read(ARRIVED) < all", "read(ARRIVED) < all - 1", WAITING),
     Mutant("barrier: the last wait's", "cpu/barrier.py",
            "(before / n_workers + 1)", "(before / n_workers)", WAITING),
-    Mutant("barrier: called off, and goes on", "cpu/barrier.py",
-           "    if (read(CALLED_OFF)) return false;\n", "    if (read(CALLED_OFF)) return true;\n",
-           "test_parallel.py::test_nobody_waits_for_who_does_not_come"),
-    Mutant("barrier: called off, and counted again", "cpu/barrier.py",
-           "if (read(CALLED_OFF)) return false;  // and is not counted again\n", "",
-           "test_kernel_scatter.py::test_nothing_is_added_where_a_worker_is_missing"),
+    Mutant("barrier: cancelled, and continues", "cpu/barrier.py",
+           "    if (read(CANCELLED)) return false;\n", "    if (read(CANCELLED)) return true;\n",
+           "runtime/test_parallel.py::test_nobody_waits_for_who_does_not_come"),
+    Mutant("barrier: cancelled, and counted again", "cpu/barrier.py",
+           "if (read(CANCELLED)) return false;  // and is not counted again\n", "",
+           "kernels/test_scatter.py::test_nothing_is_added_where_a_worker_is_missing"),
 ]  # fmt: skip

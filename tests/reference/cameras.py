@@ -68,7 +68,7 @@ def undistort(
         Undistorted (x, y) [...].
 
     Raises:
-        ValueError: Newton reaches no inverse of a point, or one where the image is folded over.
+        ValueError: Newton reaches no inverse of a point, or one where the image folds over itself.
     """
     target_x = np.asarray(x_distorted, dtype=np.float64)
     target_y = np.asarray(y_distorted, dtype=np.float64)

@@ -26,7 +26,7 @@ def params_type(real: Any) -> Any:
 @cache
 def sampler(load: Load) -> Any:
     types = load("base.types")
-    real, vec2, vec3, Ray, Box = types.real, types.vec2, types.vec3, types.Ray, types.Box
+    real, vec2, Ray = types.real, types.vec2, types.Ray
     Distances = params_type(real)
 
     @wp.func
@@ -58,7 +58,7 @@ def sampler(load: Load) -> Any:
         return k
 
     @wp.func
-    def longest(params: Distances, box: Box, c: vec3, contraction: int) -> real:
+    def longest(params: Distances, boxes_out: real) -> real:
         return params.longest
 
     return load("base.parts").Sampler(Distances, interval, edge, steps_within, step_after, longest)
@@ -78,7 +78,6 @@ class AtDistances(Model):
 
     def parts(self, load: Load) -> Any:
         return load("launch.assembly").Parts(
-            encoding=load("fields.dense").dense(self.n_floats),
             head=load("heads.rgb").rgb(),
             sampler=sampler(load),
         )

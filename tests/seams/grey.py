@@ -26,7 +26,7 @@ def head(load: Load) -> Any:
     ):
         return Channels(adj_rgb[0] + adj_rgb[1] + adj_rgb[2]), real(0.0)
 
-    return rgb.rgb().but(
+    return rgb.rgb().replace(
         n_channels=1, decode=decode, adj_decode=adj_decode, shade=shade, adj_shade=adj_shade
     )
 
@@ -43,6 +43,4 @@ class Grey(Model):
         return 1
 
     def parts(self, load: Load) -> Any:
-        return load("launch.assembly").Parts(
-            encoding=load("fields.dense").dense(self.n_floats), head=head(load)
-        )
+        return load("launch.assembly").Parts(head=head(load))

@@ -11,7 +11,7 @@ from warpnerf.model.interface import Load, Model
 
 @cache
 def around_two(load: Load, factor: float) -> Any:
-    """factor sum_i w_i (t_i - 2)^2: matter is drawn to a distance of 2.
+    """factor sum_i w_i (t_i - 2)^2: density is drawn to a distance of 2.
 
     The factor is known when kernels are compiled.
     """
@@ -128,9 +128,8 @@ class WithLosses(Model):
             losses.append(spread(load))
         loss = losses[0] if len(losses) == 1 else load("volume.ray_loss").sum_of(*losses)
         return load("launch.assembly").Parts(
-            encoding=load("fields.dense").dense(self.n_floats),
             head=load("heads.rgb").rgb(),
-            losses=load("volume.loss").PLAIN._replace(on_ray=loss),
+            losses=load("volume.loss").PHOTOMETRIC_ONLY._replace(on_ray=loss),
         )
 
     def loss_params(self, load: Load) -> Any:

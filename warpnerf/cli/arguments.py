@@ -7,18 +7,37 @@ import inspect
 import re
 import types
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Union
 
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec, PrimitiveTypeInfo
 
+from warpnerf.cli.config_options import field_docs, given_in, given_type, options
+from warpnerf.cli.given import SHORT, flag_of
+from warpnerf.cli.values import READERS, WANTED
+from warpnerf.config import TrainConfig
+
 RunFolder = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
 SceneName = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
 Settings = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE [NAME=VALUE ...]")]
 
-NUMBERS = {int: "a whole number", float: "a number"}
+Corners = Annotated[
+    tuple[float, float, float, float, float, float] | None,
+    tyro.conf.arg(metavar="X0 Y0 Z0 X1 Y1 Z1"),
+]
+
+
+@dataclass(frozen=True)
+class Usual:
+    """Which fields of a configuration --help shows; --help-all shows all."""
+
+    paths: tuple[str, ...]
+    """Their dotted names, in the order in which their options are shown. Options that are no
+    fields of it may stand among them, for the order."""
+
 
 registry = tyro.constructors.ConstructorRegistry()
 """How words become values. None is what an option is that is left out, and no word for it."""
@@ -27,15 +46,15 @@ registry = tyro.constructors.ConstructorRegistry()
 @registry.primitive_rule
 def number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
     """A number."""
-    of_type, what = info.type, NUMBERS.get(info.type)
-    if what is None:
+    of_type = info.type
+    if of_type not in (int, float):
         return None
 
     def read(words: list[str]) -> Any:
         try:
-            return of_type(words[0])
+            return READERS[of_type](words[0])
         except ValueError:
-            raise ValueError(f"must be {what}, not {words[0]!r}.") from None
+            raise ValueError(f"must be {WANTED[of_type]}, not {words[0]!r}.") from None
 
     return PrimitiveConstructorSpec(
         nargs=1,
@@ -88,28 +107,120 @@ def alternatives(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
     )
 
 
-def with_help(command: Callable[..., int]) -> Callable[..., int]:
-    """A subcommand whose options' help is what its docstring says, without the breaks of its lines.
+def with_help(
+    command: Callable[..., int], begin: TrainConfig | None = None, everything: bool = True
+) -> Callable[..., int]:
+    """A subcommand for tyro, with an option for each field of the dataclasses that it takes.
 
-    Defaults are told where they are values: what an option is that is left out, the docstring says.
+    Options' help is what its docstring says, or what stands below the fields, without the breaks
+    of its lines. Defaults are told where they are values: what an option is that is left out, the
+    help says.
+
+    Args:
+        command: Its arguments are options, dataclasses of options, or ``Given``: an option for each
+            field of a configuration.
+        begin: The configuration whose values help shows; None: fast.
+        everything: Whether there are options for all of its fields, or only the usual ones, for
+            help that is read at a glance.
+
+    Returns:
+        A function of all options; it calls the command.
     """
-    described = _described(inspect.getdoc(command) or "")
+    begin = begin or TrainConfig()
+    own = inspect.signature(command).parameters.values()
     types_of = typing.get_type_hints(command, include_extras=True)
-    signature = inspect.signature(command)
-
-    def annotated(name: str) -> Any:
-        told = tyro.conf.arg(help=described.get(name), help_behavior_hint=_default)
-        return Annotated[types_of[name], told]
+    described = _described(inspect.getdoc(command) or "")
+    parameters: list[inspect.Parameter] = []
+    shown: tuple[str, ...] = ()
+    for p in own:
+        kind = types_of[p.name]
+        if is_dataclass(kind):
+            parameters += _of_fields(kind)
+        elif usual := _usual(kind):
+            shown = () if everything else usual
+            parameters += _of_config(p.name, begin, shown)
+        else:
+            told = tyro.conf.arg(help=described.get(p.name), help_behavior_hint=_default)
+            how = p.kind if p.kind is p.POSITIONAL_ONLY else p.KEYWORD_ONLY
+            parameters.append(p.replace(annotation=Annotated[kind, told], kind=how))
+    if shown:
+        first = {path.replace(".", "_"): place for place, path in enumerate(shown)}
+        parameters.sort(key=lambda p: first.get(p.name, len(first)))
+    signature = inspect.Signature(parameters)
 
     def called(*args: Any, **kwargs: Any) -> int:
-        return command(*args, **kwargs)
+        values = signature.bind(*args, **kwargs).arguments
+        arguments: dict[str, Any] = {}
+        for p in own:
+            kind = types_of[p.name]
+            if is_dataclass(kind):
+                make: Any = kind
+                names = {f.name for f in fields(kind)} & values.keys()
+                arguments[p.name] = make(**{name: values[name] for name in names})
+            elif p.name in values:
+                value = values[p.name]
+                arguments[p.name] = given_in(value) if _usual(kind) else value
+        placed = [p.name for p in own if p.kind is p.POSITIONAL_ONLY and p.name in arguments]
+        first = [arguments.pop(name) for name in placed]
+        return command(*first, **arguments)
 
-    parameters = [p.replace(annotation=annotated(p.name)) for p in signature.parameters.values()]
     functools.update_wrapper(called, command, updated=())
     del called.__wrapped__  # type: ignore[attr-defined]  # else its annotations count
-    called.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+    called.__signature__ = signature  # type: ignore[attr-defined]
     called.__annotations__ = {p.name: p.annotation for p in parameters}
     return called
+
+
+def _of_fields(kind: Any) -> Iterator[inspect.Parameter]:
+    """A parameter for each field of a dataclass."""
+    types_of, described = typing.get_type_hints(kind, include_extras=True), field_docs(kind)
+    for f in fields(kind):
+        told = tyro.conf.arg(help=described.get(f.name), help_behavior_hint=_default)
+        default = inspect.Parameter.empty if f.default is MISSING else f.default
+        yield inspect.Parameter(
+            f.name,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=default,
+            annotation=Annotated[types_of[f.name], told],
+        )
+
+
+def _of_config(
+    name: str, begin: TrainConfig, shown: tuple[str, ...]
+) -> Iterator[inspect.Parameter]:
+    """One parameter for all fields of a configuration, or one for each of those that are shown."""
+    how, all_of_them = inspect.Parameter.KEYWORD_ONLY, options(begin)
+    if not shown:
+        fields_of, told = given_type(begin), tyro.conf.arg(name="", help="The configuration.")
+        yield inspect.Parameter(
+            name, how, default=fields_of(), annotation=Annotated[fields_of, told]
+        )
+        return
+    for path in all_of_them.keys() & set(shown):
+        flag = flag_of(path).removeprefix("--")
+        annotation = all_of_them[path].annotation(flag)
+        yield inspect.Parameter(path.replace(".", "_"), how, default=None, annotation=annotation)
+
+
+def _usual(kind: Any) -> tuple[str, ...]:
+    """What help shows of a configuration, where an argument stands for one."""
+    marks = getattr(kind, "__metadata__", ())
+    return next((mark.paths for mark in marks if isinstance(mark, Usual)), ())
+
+
+def flags_of(command: Callable[..., int]) -> set[str]:
+    """All words that begin an option of a subcommand."""
+    flags = {"--help"}
+    for p in inspect.signature(with_help(command)).parameters.values():
+        marks = p.annotation.__metadata__
+        if is_dataclass(typing.get_args(p.annotation)[0]):
+            paths = options(TrainConfig())
+            flags |= {"--help-all", *SHORT.values(), *(f"--{path}" for path in paths)}
+        elif tyro.conf.Positional not in marks:
+            flags.add(f"--{p.name}")
+            if typing.get_args(p.annotation)[0] is bool:
+                flags.add(f"--no-{p.name}")
+    return {flag.replace("_", "-") for flag in flags}
 
 
 def _default(value: str) -> str:

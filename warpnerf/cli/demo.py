@@ -23,8 +23,8 @@ def demo_command(
         device: cpu, cuda, cuda:1, ...
         threads: CPU threads; by default one per usable core.
     """
-    from warpnerf.media.demonstration import FPS, demo
     from warpnerf.media.video import video_file
+    from warpnerf.reports.demonstration import FPS, demo
 
     print(
         "Space near a camera is crossed by many rays of that one camera. It gets more gradient\n"

@@ -36,9 +36,9 @@ def eval_command(
         threads: CPU threads; by default one per usable core.
     """
     from warpnerf.evaluation.evaluate import evaluate, require_measurable
-    from warpnerf.scenes.load import load_scene
-    from warpnerf.training.run import Run
-    from warpnerf.training.run_scene import path_of
+    from warpnerf.runs.run import Run
+    from warpnerf.runs.scene import path_of
+    from warpnerf.scenes.formats.load import load_scene
 
     require_writable(json)
     distance = None
@@ -53,7 +53,11 @@ def eval_command(
         print(f"warpnerf: note: {note}", file=sys.stderr)
     folder_of_masks = masks or (config.masks if scene is None else None)
     views = load_scene(
-        path_of(config, scene), downscale=config.downscale, masks=folder_of_masks, images="files"
+        path_of(config, scene),
+        downscale=config.downscale,
+        masks=folder_of_masks,
+        images="files",
+        threads=threads,
     )
     views = config.as_trained(views)
     require_measurable(views, split)

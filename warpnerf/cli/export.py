@@ -9,10 +9,8 @@ from typing import Annotated
 import tyro
 
 from warpnerf.checks import InputError
-from warpnerf.cli.arguments import RunFolder
+from warpnerf.cli.arguments import Corners, RunFolder
 from warpnerf.cli.progress import ProgressBar
-
-CORNERS = "X0 Y0 Z0 X1 Y1 Z1"
 
 
 def export_command(
@@ -20,9 +18,7 @@ def export_command(
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")],
     /,
     level: float | None = None,
-    crop: Annotated[
-        tuple[float, float, float, float, float, float] | None, tyro.conf.arg(metavar=CORNERS)
-    ] = None,
+    crop: Corners = None,
     min_size: float | None = None,
     unseen: bool = False,
     scene: str | None = None,
@@ -41,8 +37,8 @@ def export_command(
         file: Where to write; a file is replaced, a folder has to be new.
         level: Density of the surface, 1 / scene unit; by default that of which a voxel edge is
             20 % opaque.
-        crop: Two corners of the box that is written, scene units; by default the run's box, for
-            splats all of space.
+        crop: Two corners of the box that is written, scene units; by default what the cameras see,
+            for splats all of space.
         min_size: Parts of a surface are dropped whose box has a shorter diagonal, scene units; by
             default eight voxel edges.
         unseen: Also write what no training camera sees.
@@ -51,8 +47,8 @@ def export_command(
         threads: CPU threads; by default one per usable core.
     """
     from warpnerf.exporting.export import FORMATS, checked_ending, export
-    from warpnerf.training.run import Run
-    from warpnerf.training.run_scene import load_run_scene
+    from warpnerf.runs.run import Run
+    from warpnerf.runs.scene import load_run_scene
 
     run = Run(folder)
     config = run.read_config()
@@ -60,9 +56,9 @@ def export_command(
     field, notes = run.load_field(device, threads)
     for note in notes:
         print(f"warpnerf: note: {note}", file=sys.stderr)
-    views = load_run_scene(config, scene)
+    views = load_run_scene(config, scene, threads)
     n_cameras = len(views.training_cameras)
-    grid = " x ".join(map(str, field.grid.size))
+    grid = " x ".join(map(str, field.lattice.size))
     what = kind if kind.endswith("s") else f"a {kind}"
     print(f"exporting a grid of {grid} nodes as {what}", flush=True)
     with ProgressBar("first training camera") as bar:

@@ -2,68 +2,87 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
-from warpnerf.checks import InputError, cannot_write, require_at_least
-from warpnerf.cli.arguments import SceneName, Settings
+from warpnerf.checks import InputError, cannot_write
+from warpnerf.cli.arguments import SceneName, Settings, Usual
+from warpnerf.cli.configured import begun_with, configured
+from warpnerf.cli.given import NOTHING, Given
 from warpnerf.cli.machine import require_writable, write_json
-from warpnerf.cli.model_options import chosen_model
-from warpnerf.presets import EVERYDAY, PRESETS
+from warpnerf.presets import DEFAULT_PRESETS, PRESETS
 from warpnerf.runtime.memory import usable_cores
 
 
-def inspect_command(
-    scene: SceneName,
-    /,
-    output: Path | None = None,
-    json: Path | None = None,
-    downscale: int = 1,
-    masks: Path | None = None,
-    content_distance: float | None = None,
-    near: float = 0.0,
-    model: str | None = None,
-    model_options: Settings = (),
-    threads: int | None = None,
-) -> int:
-    """Say what was understood of a scene, what training will take, and what is odd.
+@dataclass(frozen=True, kw_only=True)
+class InspectOptions:
+    """What `warpnerf inspect` is given besides a configuration."""
 
-    Args:
-        scene: Folder of a scene (transforms.json, Blender, COLMAP, LLFF), an .npz file,
-            builtin:room or builtin:room-sparse.
-        output: FILE.png for a plan: cameras, box and content distance from above and the side.
-        json: Also write all of it to this file.
-        downscale: As training will be given.
-        masks: As training will be given.
-        content_distance: As training will be given; by default the estimate.
-        near: As training will be given.
-        model: As training will be given: deferred, features, sh, or rgb.
-        model_options: As training will be given.
-        threads: CPU threads that training would have; by default one per usable core.
+    scene: SceneName
+    """Folder of a scene (transforms.json, Blender, COLMAP, LLFF), an .npz file, builtin:room or
+    builtin:room-sparse."""
+    output: Path | None = None
+    """FILE.png for a plan: cameras, box and content distance from above and the side."""
+    json: Path | None = None
+    """Also write all of it to this file."""
+    downscale: int = 1
+    """As training will be given."""
+    masks: Path | None = None
+    """As training will be given."""
+    model_options: Settings = ()
+    """As training will be given."""
+    loss: Settings = ()
+    """As training will be given."""
+
+
+USUAL = Usual(
+    (
+        "model",
+        "time_limit",
+        "content_distance",
+        "grid.voxels",
+        "box",
+        "grid.border",
+        "grid.contraction",
+        "march.near",
+        "threads",
+    )
+)
+
+
+def inspect_command(options: InspectOptions, given: Annotated[Given, USUAL] = NOTHING) -> int:
+    """Summarise a scene: what was understood, diagnostics, what training will take.
+
+    Options that train has as well replace the values of both fast and quality.
+
+    --help-all shows one for each field of the configuration.
     """
-    from warpnerf.evaluation.inspection import inspect
+    from warpnerf.inspection.inspection import inspect
 
+    output, json = options.output, options.json
     if output is not None:
         if output.suffix != ".png":
             raise InputError(f"--output {output}: the plan is a PNG; let its name end in .png.")
         if not output.parent.is_dir():
             raise InputError(f"--output {output}: its folder does not exist; make it first.")
     require_writable(json)
-    if threads is not None:
-        require_at_least("--threads", threads, 1)
+    configs = {
+        name: begun_with(
+            configured(PRESETS[name], given, options.model_options, options.loss), given
+        )
+        for name in DEFAULT_PRESETS
+    }
+    first = configs[DEFAULT_PRESETS[0]]
+    distance = first.content_distance
     found = inspect(
-        scene,
-        downscale=downscale,
-        masks=masks,
-        content_distance=content_distance,
-        near=near,
-        configs={
-            name: replace(
-                PRESETS[name], model=chosen_model(PRESETS[name].model, model, model_options)
-            )
-            for name in EVERYDAY
-        },
-        threads=threads or usable_cores(),
+        options.scene,
+        downscale=options.downscale,
+        masks=options.masks,
+        content_distance=None if isinstance(distance, str) else distance,
+        near=first.march.near,
+        configs=configs,
+        threads=first.threads or usable_cores(),
     )
     print(found)
     if json is not None:

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import os
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from warpnerf.checks import InputError, cannot_write
 from warpnerf.cli.arguments import Settings
-from warpnerf.cli.model_options import chosen_model
-from warpnerf.presets import EVERYDAY, PRESETS
+from warpnerf.cli.configured import configured
+from warpnerf.presets import DEFAULT_PRESETS, PRESETS
 
 if TYPE_CHECKING:
-    from warpnerf.evaluation.verify import Result
-    from warpnerf.training.warmup import Warmed
+    from warpnerf.training.warmup import CompiledKernel
+    from warpnerf.verification.verify import Result
 
 FAILED = 1
 
@@ -29,8 +28,8 @@ def check_command(device: str = "cpu", threads: int | None = None, json: Path | 
         json: Also write the results to this file.
     """
     require_writable(json)
-    from warpnerf.evaluation.verify import report, verify
     from warpnerf.runtime.terminal import print_table
+    from warpnerf.verification.verify import report, verify
 
     def shown(result: Result) -> None:
         word = "passed" if result.passed else "FAILED"
@@ -60,24 +59,32 @@ def check_command(device: str = "cpu", threads: int | None = None, json: Path | 
 
 
 def warmup_command(
-    device: str = "cpu", model: str | None = None, model_options: Settings = ()
+    device: str = "cpu",
+    model: str | None = None,
+    model_options: Settings = (),
+    field: str | None = None,
+    sampler: str | None = None,
 ) -> int:
     """Compile all kernels that training and evaluation with fast and quality need.
 
     Args:
         device: Where they are to run: cpu, cuda, cuda:1, ...
-        model: As training will be given: deferred, features, sh, or rgb.
+        model: As training will be given: deferred, per_sample, sh, or rgb.
         model_options: As training will be given.
+        field: As training will be given: dense, vm, or hash.
+        sampler: As training will be given: march, or resampled.
     """
     from warpnerf.training.warmup import warm_up
 
-    def shown(kernel: Warmed) -> None:
+    def shown(kernel: CompiledKernel) -> None:
         how = f"compiled in {kernel.seconds:.1f} s" if kernel.compiled else "in the cache"
         print(f"{kernel.name}: {how}", flush=True)
 
     start = time.perf_counter()
-    presets = [PRESETS[name] for name in EVERYDAY]
-    configs = [replace(p, model=chosen_model(p.model, model, model_options)) for p in presets]
+    presets = [PRESETS[name] for name in DEFAULT_PRESETS]
+    named = {"model": model, "field": field, "sampler": sampler}
+    given = {name: (kind,) for name, kind in named.items() if kind is not None}
+    configs = [configured(preset, given, model_options) for preset in presets]
     kernels = warm_up(device, shown, configs)
     compiled = sum(kernel.compiled for kernel in kernels)
     seconds = time.perf_counter() - start
@@ -100,7 +107,7 @@ def require_writable(path: Path | None) -> None:
 
 
 def write_json(path: Path, text: str) -> None:
-    """Write what --json asks for, whole or not at all.
+    """Write what --json names, whole or not at all.
 
     Raises:
         InputError: It cannot be written.

@@ -7,23 +7,26 @@ import logging
 import re
 import sys
 import warnings
-from collections.abc import Callable
-from decimal import Decimal
+from collections.abc import Callable, Sequence
+from itertools import pairwise
 
 import tyro
 
 from warpnerf import __version__
 from warpnerf.checks import InputError, way_out
-from warpnerf.cli.arguments import registry, with_help
+from warpnerf.cli.arguments import flags_of, registry, with_help
 from warpnerf.cli.demo import demo_command
 from warpnerf.cli.evaluate import eval_command
 from warpnerf.cli.export import export_command
+from warpnerf.cli.given import near_to
 from warpnerf.cli.inspect import inspect_command
 from warpnerf.cli.machine import FAILED, check_command, warmup_command
 from warpnerf.cli.pose import pose_command
 from warpnerf.cli.render import render_command
 from warpnerf.cli.train import train_command
 from warpnerf.cli.view import view_command
+from warpnerf.presets import PRESETS
+from warpnerf.runtime import process
 from warpnerf.runtime.signals import Stopped, raise_when_asked
 from warpnerf.runtime.terminal import UntilClosed
 
@@ -42,8 +45,11 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "warmup": warmup_command,
 }
 
-PATHS = ("--output", "--resume", "--scene", "--masks", "--json")
+PATHS = ("--output", "--resume", "--config", "--scene", "--masks", "--json")
 """Options whose value may be any name."""
+
+HELP_ALL = "--help-all"
+"""Lists all options of a subcommand, --help those that are used often."""
 
 OUT_OF_MEMORY = re.compile("failed to allocate|can't start new thread", re.IGNORECASE)
 """What Warp and the standard library say in a RuntimeError where a MemoryError is meant."""
@@ -57,7 +63,7 @@ class _Printer(logging.Handler):
 
 
 def _meant(option: str, word: str) -> str:
-    """A word of the command line as it is understood: counts such as 1e6 without their exponent.
+    """A word of the command line, looked at.
 
     Raises:
         InputError: It is empty, or None, by which Python's default would be meant.
@@ -73,13 +79,57 @@ def _meant(option: str, word: str) -> str:
             f"{option} has no value, as {word} may be an option: give a path, and one that begins "
             f"with - as {option}=./{word}."
         )
-    joined = re.fullmatch(r"(--[\w-]+)=(.*)", word)
+    joined = re.fullmatch(r"(--[\w.-]+)=(.*)", word)
     if joined:
         return f"{joined[1]}={_meant(joined[1], joined[2])}"
-    if option in ("--steps", "--voxels") and re.fullmatch(r"\d+(\.\d+)?e\d{1,2}", word.lower()):
-        count = Decimal(word)
-        return str(int(count)) if count == count.to_integral_value() else word
     return word
+
+
+def _require_known(name: str, words: Sequence[str]) -> None:
+    """Raise InputError where a word begins an option that a subcommand has not."""
+    flags = flags_of(COMMANDS[name])
+    for word in words:
+        if word == "--":
+            return
+        flag = word.partition("=")[0].replace("_", "-")
+        if flag.startswith("--") and flag not in flags:
+            raise InputError(
+                f"{name} has no option {word.partition('=')[0]}{near_to(flag, sorted(flags))}; "
+                f"warpnerf {name} --help{'-all' if '--help-all' in flags else ''} lists all."
+            )
+
+
+def _parsed(words: list[str]) -> int:
+    """Read the line, and call its subcommand. Only that one is looked at: the others are named."""
+    name = words[0] if words and not words[0].startswith("-") else None
+    if name is not None and name not in COMMANDS:
+        raise InputError(
+            f"there is no command {name}{near_to(name, COMMANDS)}; warpnerf --help lists all."
+        )
+    everything = HELP_ALL in words or not {"--help", "-h"} & {*words}
+    split = [part for word in words for part in word.split("=", maxsplit=1)]
+    begin = PRESETS.get(dict(pairwise(split)).get("--preset", "fast"))
+    if name is not None:
+        _require_known(name, words[1:])
+        words = ["--help" if word == HELP_ALL else word for word in words]
+
+    def shown(command: Callable[..., int]) -> Callable[..., int]:
+        if command is COMMANDS.get(name or ""):
+            return with_help(command, begin, everything)
+
+        def named() -> int:
+            raise AssertionError("it is only listed")
+
+        named.__doc__ = (command.__doc__ or "").partition("\n\n")[0]
+        return named
+
+    with registry:
+        return tyro.extras.subcommand_cli_from_dict(
+            {name: shown(command) for name, command in COMMANDS.items()},
+            prog="warpnerf",
+            description="Voxel-grid radiance fields from photographs, with fewer floaters.",
+            args=words,
+        )
 
 
 def _said(error: Exception) -> str:
@@ -102,6 +152,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"warpnerf {__version__}")
         return 0
     raise_when_asked()
+    process.make_own()
     warnings.filterwarnings("ignore", module="PIL")  # what matters in an image is refused
     logging.getLogger("PIL").setLevel(logging.CRITICAL)
     own = logging.getLogger("warpnerf")
@@ -113,13 +164,7 @@ def main(arguments: list[str] | None = None) -> int:
         sys.stdout = UntilClosed(sys.stdout)
     try:
         arguments = [_meant(arguments[at - 1], word) for at, word in enumerate(arguments)]
-        with registry:
-            return tyro.extras.subcommand_cli_from_dict(
-                {name: with_help(command) for name, command in COMMANDS.items()},
-                prog="warpnerf",
-                description="Voxel-grid radiance fields from posed photographs, without floaters.",
-                args=arguments,
-            )
+        return _parsed(arguments)
     except InputError as error:
         print(f"warpnerf: error: {error}", file=sys.stderr)
         return BAD_INPUT

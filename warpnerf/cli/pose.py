@@ -9,57 +9,29 @@ from typing import Annotated
 import tyro
 
 from warpnerf.cli.progress import ProgressBar
-from warpnerf.sfm.config import CameraModel, Lenses, Mapper, Matching, PoseConfig
+from warpnerf.sfm.config import PoseConfig
 
 
 def pose_command(
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")],
+    config: PoseConfig,
     /,
     output: Path,
-    camera_model: CameraModel = "auto",
-    lenses: Lenses = "auto",
-    matching: Matching = "auto",
-    mapper: Mapper = "incremental",
-    frames: int = 150,
-    max_image_size: int = 1600,
-    masks: Path | None = None,
-    threads: int | None = None,
     overwrite: bool = False,
 ) -> int:
     """Estimate the poses of photographs, or of frames of a video, and make a scene of them.
 
     Args:
         source: Folder of photographs, or a video.
+        config: How.
         output: The scene's folder; may be that of the photographs.
-        camera_model: Of the lens, as COLMAP names it; auto: RADIAL, but SIMPLE_RADIAL where fewer
-            than ten photographs share one.
-        lenses: Which photographs share a lens. auto: those of one size, camera and focal length by
-            EXIF. one: all. each: none.
-        matching: Which pairs are compared. exhaustive: all. sequential: those near each other by
-            name. auto: sequential for videos and more than 200 photographs.
-        mapper: incremental: one photograph after the other. global: all at once, which is faster
-            where they are many.
-        frames: To take from a video, the sharpest of each of as many equal parts.
-        max_image_size: Longer side, pixels, to which photographs are reduced to look for features.
-        masks: Folder of masks, named after the photographs; where they are black, nothing is looked
-            for, and nothing will be trained on.
-        threads: CPU threads, at most one per usable core, which is the default.
         overwrite: Replace the posed scene that the output folder holds.
     """
-    config = PoseConfig(
-        camera_model=camera_model,
-        lenses=lenses,
-        matching=matching,
-        mapper=mapper,
-        frames=frames,
-        max_image_size=max_image_size,
-        masks=masks,
-        threads=threads,
-    )
     _estimate(source, output, config, overwrite)
     named = shlex.quote(str(output))
     print(
-        f"wrote {output}; go on with: warpnerf train {named} --output runs/{output.resolve().name}"
+        f"wrote {output}; continue with: warpnerf train {named} "
+        f"--output runs/{output.resolve().name}"
     )
     return 0
 
@@ -80,7 +52,7 @@ def with_poses(source: str, run: Path, masks: Path | None, threads: int | None) 
     Raises:
         InputError: The poses cannot be estimated.
     """
-    from warpnerf.scenes.contents import is_unposed
+    from warpnerf.scenes.formats.contents import is_unposed
     from warpnerf.sfm.pose import is_made_of
     from warpnerf.sfm.scene_files import IN_RUN, NEXT_IN_RUN
     from warpnerf.sfm.worker import is_installed

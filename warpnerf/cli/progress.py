@@ -56,7 +56,7 @@ class ProgressBar:
             self._bar.update(self._task, completed=fraction, description=text)
             return
         seconds = time.monotonic() - self._began
-        # What came before, such as compiling or what a run went on from, is not repeated.
+        # What came before, such as compiling or what a run was resumed from, is not repeated.
         self._first = self._first or (seconds, fraction)
         if seconds >= self._line_at or fraction >= 1.0:
             line = f"{fraction:4.0%}  {text}"

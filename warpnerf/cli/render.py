@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, cast, get_args
 
@@ -15,11 +16,11 @@ from warpnerf.cli.progress import ProgressBar
 
 if TYPE_CHECKING:
     from warpnerf.media.recorded_path import RecordedPath
-    from warpnerf.scenes.camera import Camera
+    from warpnerf.scenes.cameras.camera import Camera
     from warpnerf.scenes.scene import Scene
 
 FPS = 30.0
-"""Frames per second, unless asked for."""
+"""Frames per second, unless requested."""
 
 SECONDS = 8.0
 """Length of a video along a path that has no length of its own."""
@@ -28,17 +29,62 @@ MAX_FRAMES = 100_000
 """An hour at 25 frames per second, and a little more."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class RenderOptions:
+    """What is rendered of a run, and how."""
+
+    path: Annotated[str, tyro.conf.arg(metavar="{auto,orbit,through,back}|FILE.json")] = "auto"
+    """orbit: around what the cameras look at. through: through the training cameras. back: the
+    same, backing away from them, where floaters show. auto: orbit where the cameras look at one
+    thing, else through. FILE.json: a path recorded in the viewer."""
+    stills: Literal["test", "train", "val", "all"] | None = None
+    """Render the views of this split as PNG pictures instead of a video."""
+    output: Path | None = None
+    """FILE.mp4, FILE.gif, or a new folder for PNG frames; for stills a folder. By default PATH.mp4
+    (video.mp4 for auto, and for a recorded path its file's name) or stills/ in the run's folder."""
+    size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="WIDTH HEIGHT")] = None
+    """Of the colour picture, pixels; by default as the photographs, or as recorded."""
+    fps: float | None = None
+    """Frames per second, by default 30."""
+    seconds: float | None = None
+    """Length of the video; by default 8, or as recorded."""
+    distance: float | None = None
+    """How far `back` backs away, scene units; by default half the content distance."""
+    depths: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="NEAR FAR")] = None
+    """What gets the first and the last colour, scene units; by default what is seen."""
+
+    def recorded(self, scene: str | None) -> RecordedPath | None:
+        """The path that was recorded; None: it is of another kind.
+
+        Args:
+            scene: What --scene names.
+
+        Raises:
+            InputError: Options do not go together.
+        """
+        from warpnerf.media.filming import checked_depths
+
+        if self.depths is not None:
+            checked_depths(self.depths)
+        stills, path = self.stills is not None, self.path
+        if self.distance is not None and (stills or path != "back"):
+            raise InputError("--distance is how far --path back backs away; give both or neither.")
+        if stills and path != "auto":
+            raise InputError(
+                "--stills renders the views of a split, along no path; give one of them."
+            )
+        if stills and not (self.fps is None and self.seconds is None):
+            raise InputError("--fps and --seconds are of a video, not of --stills; leave them out.")
+        recorded = _recorded(path)
+        if recorded is not None and scene is not None:
+            raise InputError(f"--scene is not needed for the cameras of {path}; leave it out.")
+        return recorded
+
+
 def render_command(
     folder: RunFolder,
+    options: RenderOptions,
     /,
-    path: Annotated[str, tyro.conf.arg(metavar="{auto,orbit,through,back}|FILE.json")] = "auto",
-    stills: Literal["test", "train", "val", "all"] | None = None,
-    output: Path | None = None,
-    size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="WIDTH HEIGHT")] = None,
-    fps: float | None = None,
-    seconds: float | None = None,
-    distance: float | None = None,
-    depths: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="NEAR FAR")] = None,
     scene: str | None = None,
     device: str = "cpu",
     threads: int | None = None,
@@ -47,39 +93,19 @@ def render_command(
 
     Args:
         folder: Output folder of a training run.
-        path: orbit: around what the cameras look at. through: through the training cameras.
-            back: the same, backing away from them, where floaters show. auto: orbit where the
-            cameras look at one thing, else through. FILE.json: a path recorded in the viewer.
-        stills: Render the views of this split as PNG pictures instead of a video.
-        output: FILE.mp4, FILE.gif, or a new folder for PNG frames; for stills a folder. By default
-            PATH.mp4 (video.mp4 for auto, and for a recorded path its file's name) or stills/ in
-            the run's folder.
-        size: Of the colour picture, pixels; by default as the photographs, or as recorded.
-        fps: Frames per second, by default 30.
-        seconds: Length of the video; by default 8, or as recorded.
-        distance: How far `back` backs away, scene units; by default half the content distance.
-        depths: What gets the first and the last colour, scene units; by default what is seen.
+        options: What, and how.
         scene: Where the run's photographs are now, if they have moved.
         device: cpu, cuda, cuda:1, ...
         threads: CPU threads; by default one per usable core.
     """
-    from warpnerf.media.filming import checked_depths, depth_range, render_stills, render_video
+    from warpnerf.media.filming import depth_range, render_stills, render_video
     from warpnerf.media.video import video_file
-    from warpnerf.training.run import Run
-    from warpnerf.training.run_scene import load_run_scene
+    from warpnerf.runs.run import Run
+    from warpnerf.runs.scene import load_run_scene
 
-    if depths is not None:
-        checked_depths(depths)
-    if distance is not None and (stills is not None or path != "back"):
-        raise InputError("--distance is how far --path back backs away; give both or neither.")
-    if stills is not None and path != "auto":
-        raise InputError("--stills renders the views of a split, along no path; give one of them.")
-    if stills is not None and not (fps is None and seconds is None):
-        raise InputError("--fps and --seconds are of a video, not of --stills; leave them out.")
-    recorded = _recorded(path)
-    if recorded is not None and scene is not None:
-        raise InputError(f"--scene is not needed for the cameras of {path}; leave it out.")
-    fps = FPS if fps is None else fps
+    recorded = options.recorded(scene)
+    path, stills, output = options.path, options.stills, options.output
+    fps = FPS if options.fps is None else options.fps
     run = Run(folder)
     config = run.read_config()
     if stills is None:
@@ -97,24 +123,24 @@ def render_command(
     cameras: list[Camera]
     if recorded is not None:
         length = recorded.seconds or SECONDS  # one place only takes no time
-        n_frames = _n_frames(fps, length if seconds is None else seconds)
-        cameras = recorded.cameras(n_frames, size)
+        n_frames = _n_frames(fps, length if options.seconds is None else options.seconds)
+        cameras = recorded.cameras(n_frames, options.size)
         what = f"{n_frames} frames, path {path}"
     elif stills is None:
         from warpnerf.media.camera_path import PathKind, camera_path, natural_path
 
-        views = load_run_scene(config, scene)
+        views = load_run_scene(config, scene, threads)
         kind = natural_path(views) if path == "auto" else cast(PathKind, path)
-        n_frames = _n_frames(fps, SECONDS if seconds is None else seconds)
-        cameras = camera_path(views, kind, n_frames, size=size, distance=distance)
+        n_frames = _n_frames(fps, SECONDS if options.seconds is None else options.seconds)
+        cameras = camera_path(views, kind, n_frames, size=options.size, distance=options.distance)
         what = f"{n_frames} frames, path {kind!r}"
     else:
-        views = load_run_scene(config, scene)
-        named = _still_cameras(views, stills, size)
+        views = load_run_scene(config, scene, threads)
+        named = _still_cameras(views, stills, options.size)
         cameras = list(named.values())
         what = f"{len(cameras)} views"
     width, height = cameras[0].width, cameras[0].height
-    shown = depths or depth_range(field, cameras)
+    shown = options.depths or depth_range(field, cameras)
     print(
         f"rendering {what}, colour and depth of {width} x {height} pixels each, "
         f"depth from {shown[0]:g} yellow to {shown[1]:g} blue, scene units",

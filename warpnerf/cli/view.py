@@ -42,7 +42,7 @@ def view_command(
         device: cpu, cuda, cuda:1, ...
         threads: CPU threads; by default one per usable core.
     """
-    from warpnerf.training.run import Run
+    from warpnerf.runs.run import Run
     from warpnerf.viewer.server import require_place
     from warpnerf.viewer.view import open_view
 
@@ -89,7 +89,7 @@ class PageOptions:
 def training_page(
     options: PageOptions | None, scene: Scene, trainer: Trainer
 ) -> AbstractContextManager[Session | None]:
-    """The page of a training, within a ``with`` statement; None where none was asked for.
+    """The page of a training, within a ``with`` statement; None where none was requested.
 
     Raises:
         InputError: It cannot be served there.
@@ -102,7 +102,7 @@ def training_page(
     session = Session(
         [Subject(name=scene.name, field=trainer.field, stamp=lambda: trainer.steps_done)],
         scene,
-        content_distance=trainer.content_distance,
+        content_distance=trainer.plan.content_distance,
         training=True,
         host=options.host,
         port=options.port,

@@ -1,4 +1,4 @@
-"""Looking at a field through a scene's cameras and measuring how well it does."""
+"""Evaluation: rendering a field through a scene's cameras, and its image metrics."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ FOG_PSNR = 20.0
 
 @dataclass(frozen=True, kw_only=True)
 class ImageMetrics:
-    """One view's figures, over the pixels that its mask keeps."""
+    """Image metrics of a view, over the pixels that its mask keeps."""
 
     name: str
     """The view's."""
@@ -118,7 +118,7 @@ class Evaluation:
         if not fog:
             return []
         return [
-            f"fog: {len(fog)} of {len(self.images)} views look into matter within "
+            f"fog: {len(fog)} of {len(self.images)} views look into density within "
             f"{self.near_field.within:.3g} scene units (first: {fog[0].name}, "
             f"{fog[0].near_rays:.0%} of its rays), where no training camera shows that space is "
             "free; add photographs from there, train with a larger --near, or leave the views out"
@@ -133,7 +133,7 @@ def evaluate(
     lpips: Distance | None = None,
     on_progress: Callable[[float, str], None] = lambda done, words: None,
 ) -> Evaluation:
-    """Render a split's views and hold them against the photographs.
+    """Evaluate a field: render a split's views and compare them with the photographs.
 
     Args:
         field: A trained scene.

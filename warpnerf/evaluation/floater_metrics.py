@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from warpnerf.rendering.field import Field
-from warpnerf.scenes.camera import Camera
+from warpnerf.scenes.cameras.camera import Camera
 
 N_DIRECTIONS = 2000
 """Rays around a camera."""
@@ -39,7 +39,7 @@ def near_density(field: Field, cameras: Sequence[Camera], first_hit: FirstHit) -
     for camera in cameras:
         origins = np.broadcast_to(camera.position, directions.shape)
         steps = replace(field.steps, far=clearance(camera, first_hit), transmittance_min=0.0)
-        seen = replace(field, steps=steps).render_rays(origins, directions)
+        seen = replace(field, steps=steps, proposal=None).render_rays(origins, directions)
         depths.append(float(-np.log(np.maximum(1.0 - seen.opacity, 1e-6)).mean()))
     return float(np.mean(depths))
 

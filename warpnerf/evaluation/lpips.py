@@ -28,7 +28,7 @@ SCALE = (0.458, 0.448, 0.450)
 
 @dataclass(frozen=True, kw_only=True)
 class Layer:
-    """A convolution and the rectifier behind it."""
+    """A convolution and its ReLU."""
 
     name: str
     """Of its tensors in the file."""
@@ -107,7 +107,7 @@ class Lpips:
                     'there; save lpips.LPIPS(net="alex" or "vgg").state_dict() whole.'
                 )
             if not tensor.isfinite().all():
-                raise InputError(f"{path}: {name} holds NaN or infinity; save the weights anew.")
+                raise InputError(f"{path}: {name} holds NaN or infinity; save the weights again.")
             return tensor.float()
 
         self._weights = []

@@ -1,4 +1,4 @@
-"""How close a rendering is to its photograph: PSNR, SSIM, and FLIP where its package is."""
+"""Image metrics of a rendering against its photograph: PSNR, SSIM, FLIP where its package is."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 As a rule, nothing that was photographed is nearer to a camera than a small share of the content
 distance; what a trained field holds there was put there by training. Where a scene can be
-photographed anew, views from further back show as well what hangs in front of the cameras.
+photographed again, views from further back show as well what hangs in front of the cameras.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ MIN_TRANSMITTANCE = 1e-6
 
 @dataclass(frozen=True, kw_only=True)
 class NearField:
-    """What a field holds close to the training cameras."""
+    """Floater metrics: what a field holds close to the training cameras."""
 
     within: float
     """What counts as close, scene units: NEAR_SHARE times the scene's content distance."""
@@ -71,7 +71,7 @@ class NearField:
 
 
 def measure_near_field(field: Field, scene: Scene) -> NearField:
-    """Look for what hangs in front of the training cameras.
+    """Measure floaters: what hangs in front of the training cameras.
 
     near_mass = mean over rays of the integral of sigma dt over t < within = mean of -log T(within)
     near_rays = share of rays with opacity >= 1/2 and (sum_i w_i t_i) / opacity < within
@@ -82,11 +82,11 @@ def measure_near_field(field: Field, scene: Scene) -> NearField:
     Args:
         field: A trained field.
         scene: Its training views and content distance are those of the field's training; a scene
-            that can be photographed anew also gives PSNR of cameras pulled back.
+            that can be photographed again also gives PSNR of cameras pulled back.
     """
     within = NEAR_SHARE * scene.content_distance
     steps = replace(field.steps, far=within, transmittance_min=0.0)
-    close_by = replace(field, steps=steps)
+    close_by = replace(field, steps=steps, proposal=None)  # all matter that is there
     mass, near, n_rays = 0.0, 0, 0
     for whole in scene.training_cameras:
         camera = whole.downscaled(whole.block_for(MAX_PIXELS))
@@ -117,7 +117,7 @@ def pulled_psnr(field: Field, scene: Scene) -> list[float]:
     """PSNR of training cameras moved straight back, where the scene can be photographed from there.
 
     Returns:
-        dB, one for each view; none where the scene cannot be photographed anew.
+        dB, one for each view; none where the scene cannot be photographed again.
     """
     if scene.photograph is None:
         return []

@@ -1,4 +1,4 @@
-"""A scene as a folder that other programs train on: photographs, cameras twice, and points.
+"""Export of a scene as a folder that others train on: photographs, cameras twice, and points.
 
 transforms.json      cameras as nerfstudio and instant-ngp have them, with the split
 sparse/0/*.txt       the same as a COLMAP model, for gsplat, 3DGS, Brush
@@ -19,9 +19,9 @@ from warpnerf.exporting.mesh import points_ply
 from warpnerf.exporting.quaternions import quaternions
 from warpnerf.exporting.surface import Surface
 from warpnerf.media.pictures import picture_files
-from warpnerf.scenes.camera import Camera
+from warpnerf.scenes.cameras.camera import Camera
+from warpnerf.scenes.formats.transforms_text import PosedFile, transforms_text
 from warpnerf.scenes.scene import Scene
-from warpnerf.scenes.transforms_text import PosedFile, transforms_text
 
 MAX_POINTS = 100_000
 """Points that are written, at most: enough to begin splats from."""

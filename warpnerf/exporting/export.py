@@ -1,4 +1,4 @@
-"""One door to every format: ``export`` writes what the ending of a file's name says."""
+"""The entry point of exports: ``export`` writes the format that the name of the file says."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from pathlib import Path
 from warpnerf.checks import InputError, require_kind
 from warpnerf.exporting import cameras as scenes
 from warpnerf.exporting import mesh, page, splats, surface, volume
-from warpnerf.exporting.sight import look
+from warpnerf.exporting.visibility import visibility
 from warpnerf.rendering.field import Field
-from warpnerf.scenes.focus import up_direction
+from warpnerf.scenes.cameras.focus import up_direction
 from warpnerf.scenes.scene import Scene
 from warpnerf.writing import write_atomically
 
@@ -58,8 +58,8 @@ def export(
             and a folder it is needed.
         unseen: Write what no training camera sees, too.
         level: Of a surface's density, 1 / scene unit; see ``extract_surface``.
-        crop: Lower and upper corner of what is written, scene units; None: the field's box, for
-            splats all of space.
+        crop: Lower and upper corner of what is written, scene units; None: what cameras
+            see, for splats all of space; volumes end at the box of the grid.
         min_size: Smaller parts of a surface are dropped, scene units; see ``extract_surface``.
         on_camera: Called with the number of training cameras that were looked through.
 
@@ -90,19 +90,19 @@ def export(
     if ending in VOLUMES:
         volume.checked_block(field, crop)
     views = [] if scene is None else [scene.views[index] for index in scene.splits["train"]]
-    sight = look(field, views, on_camera) if views else None
+    visible = visibility(field, views, on_camera) if views else None
     if ending in SPLATS:
-        made = splats.splats_of(field, sight, unseen=unseen, crop=crop)
+        made = splats.splats_of(field, visible, unseen=unseen, crop=crop)
         if scene is not None and ending == ".html":
             pieces = page.splats_html(made, scene, field.background)
         else:
             pieces = splats.splats_ply(made)
     elif ending in VOLUMES:
-        block = volume.volume_of(field, sight, unseen=unseen, crop=crop)
+        block = volume.volume_of(field, visible, unseen=unseen, crop=crop)
         pieces = volume.volume_nvdb(block) if ending == ".nvdb" else volume.volume_npz(block)
     else:
         found = surface.extract_surface(
-            field, sight, unseen=unseen, level=level, crop=crop, min_size=min_size
+            field, visible, unseen=unseen, level=level, crop=crop, min_size=min_size
         )
         if scene is not None and ending == "":
             scenes.write_scene(path, scene, found)

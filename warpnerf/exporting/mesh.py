@@ -1,4 +1,4 @@
-"""A surface as a mesh: glTF in one file (.glb), PLY and OBJ, with colours at vertices."""
+"""Export of a triangle mesh: glTF in one file (.glb), PLY and OBJ, with colours at vertices."""
 
 from __future__ import annotations
 

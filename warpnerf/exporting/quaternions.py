@@ -1,4 +1,4 @@
-"""Rotations as quaternions, which is how files of splats and of cameras hold them."""
+"""Rotation matrices to unit quaternions, which is how files of splats and of cameras hold them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A field as Gaussian splats: one for each node that cameras see, as opaque as the field is there.
+"""Export of a field as Gaussian splats: one for each node that cameras see, as opaque as it is.
 
 Opacity. Splats of opacity o and standard deviation k voxel edges on a lattice let through what a
 density of
@@ -7,7 +7,7 @@ density of
 
 lets through along the unit direction d: the columns of J are a cell's edges, so a splat's
 covariance is k^2 J J^T, and the integral of -log(1 - o exp(-r^2 / 2)) over the plane is
-2 pi Li2(o). Where space is not folded, |J^-1 d| is 1 / voxel edge for every d.
+2 pi Li2(o). Where space is not contracted, |J^-1 d| is 1 / voxel edge for every d.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from warpnerf.checks import InputError
 from warpnerf.exporting.colour import colours
 from warpnerf.exporting.ply import ply
 from warpnerf.exporting.quaternions import quaternions
-from warpnerf.exporting.sight import Sight
 from warpnerf.exporting.surface import (
     Crop,
     checked_crop,
@@ -30,7 +29,9 @@ from warpnerf.exporting.surface import (
     normals_at,
     raw_density,
 )
-from warpnerf.model.nodes import points_of
+from warpnerf.exporting.visibility import Visibility
+from warpnerf.fields.nodes import points_of
+from warpnerf.renamed import renamed_argument
 from warpnerf.rendering.field import Field
 
 SPREAD = 0.5
@@ -65,20 +66,21 @@ class Splats:
     """[n, 3] float32 in [0, 1], sRGB as in the photographs."""
 
 
+@renamed_argument("sight", "visibility")
 def splats_of(
     field: Field,
-    sight: Sight | None = None,
+    visibility: Visibility | None = None,
     *,
     unseen: bool = False,
     crop: Crop | None = None,
 ) -> Splats:
-    """Make splats of a field.
+    """Convert a field to Gaussian splats.
 
     Args:
         field: A trained field.
-        sight: Of the cameras of its training, as for ``extract_surface``.
+        visibility: Of the cameras of its training, as for ``extract_surface``.
         unseen: Keep what no camera sees, too.
-        crop: Only splats with their centres inside; None: all, also in folded space.
+        crop: Only splats with their centres inside; None: all, also in contracted space.
 
     Returns:
         The splats, in the order of the grid.
@@ -86,15 +88,15 @@ def splats_of(
     Raises:
         InputError: The crop is no box, or nothing is left.
     """
-    grid = field.grid
+    lattice = field.lattice
     raw = raw_density(field)
     sigma = density(field, raw)
-    # How opaque a cell is at most: far out in folded space they are long.
-    kept = -np.expm1(-sigma * float(grid.voxel_size.max())) > FAINTEST
-    if sight is not None and not unseen:
-        kept &= sight.light > LEAST_LIGHT
+    # How opaque a cell is at most: far out in contracted space they are long.
+    kept = -np.expm1(-sigma * float(lattice.voxel_size.max())) > FAINTEST
+    if visibility is not None and not unseen:
+        kept &= visibility.light > LEAST_LIGHT
     nodes = np.argwhere(kept).astype(np.float64)
-    points = points_of(grid, nodes)
+    points = points_of(lattice, nodes)
     jacobian = _cells(field, nodes)
     usable = np.isfinite(points).all(axis=1) & np.isfinite(jacobian).all(axis=(1, 2))
     if crop is not None:
@@ -105,21 +107,21 @@ def splats_of(
             "training camera; enlarge the crop, or keep what is unseen."
         )
     points, jacobian, sigma = points[usable], jacobian[usable], sigma[kept][usable]
-    # Where space is folded, cells are long and are looked along, from the box outward.
-    middle = 0.5 * (grid.box_min + grid.box_max)
-    outward = points - (middle if grid.frustum is None else grid.frustum.origin)
+    # Where space is contracted, cells are long and are looked along, from the box outward.
+    middle = 0.5 * (lattice.box_min + lattice.box_max)
+    outward = points - (middle if lattice.frustum is None else lattice.frustum.origin)
     length = np.linalg.norm(outward, axis=1, keepdims=True)
     outward = np.where(length > 0.0, outward / np.maximum(length, 1e-30), [1.0, 0.0, 0.0])
     crossed = np.linalg.norm(np.linalg.solve(jacobian, outward[..., None])[..., 0], axis=1)
-    if grid.frustum is not None:  # whose densities are those of its coordinates
-        crossed[:] = 1.0 / float(grid.voxel_size.mean())
+    if lattice.frustum is not None:  # whose densities are those of its coordinates
+        crossed[:] = 1.0 / float(lattice.voxel_size.mean())
     scales, rotations = _axes(jacobian)
     return Splats(
         centres=points.astype(np.float32),
         scales=scales.astype(np.float32),
         rotations=rotations.astype(np.float32),
         opacity=_opacity(sigma / (2.0 * math.pi * SPREAD**2 * crossed)).astype(np.float32),
-        rgb=colours(field, sight, points, normals_at(field, raw, points)),
+        rgb=colours(field, visibility, points, normals_at(field, raw, points)),
     )
 
 
@@ -148,10 +150,10 @@ def splats_ply(splats: Splats) -> list[bytes]:
 
 def _cells(field: Field, nodes: np.ndarray) -> np.ndarray:
     """The edges of the cells around nodes as columns, [n, 3, 3] scene units; some not finite."""
-    grid, half_steps = field.grid, 0.5 * np.eye(3)
-    beyond = np.stack([points_of(grid, nodes + step) for step in half_steps], axis=2)
-    before = np.stack([points_of(grid, nodes - step) for step in half_steps], axis=2)
-    with np.errstate(invalid="ignore"):  # both are infinite at the rim of folded space
+    lattice, half_steps = field.lattice, 0.5 * np.eye(3)
+    beyond = np.stack([points_of(lattice, nodes + step) for step in half_steps], axis=2)
+    before = np.stack([points_of(lattice, nodes - step) for step in half_steps], axis=2)
+    with np.errstate(invalid="ignore"):  # both are infinite at the rim of contracted space
         return np.asarray(beyond - before)
 
 

@@ -1,4 +1,4 @@
-"""The surface of a field: where its density crosses a level, as far as cameras see it."""
+"""Isosurface of a field (marching cubes), as far as cameras see it, at a level of its density."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ import warp as wp
 
 from warpnerf.checks import InputError, require_at_least, require_positive
 from warpnerf.exporting.colour import colours
-from warpnerf.exporting.sight import SEEN, Sight
-from warpnerf.model.nodes import nodes_of, points_of, values_at, voxel_edges
+from warpnerf.exporting.visibility import SEEN, Visibility
+from warpnerf.fields.nodes import nodes_of, points_of, values_at, voxel_edges
+from warpnerf.renamed import renamed_argument
 from warpnerf.rendering.field import Field
 
 LEVEL_OPACITY = 0.2
@@ -27,7 +28,7 @@ Crop = tuple[Sequence[float], Sequence[float]]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Surface:
-    """Triangles with normals and colours at their vertices."""
+    """A triangle mesh with normals and colours at its vertices."""
 
     points: np.ndarray
     """[n_vertices, 3] float32, scene units."""
@@ -39,29 +40,30 @@ class Surface:
     """[n_vertices, 3] float32 in [0, 1], sRGB as in the photographs."""
 
 
+@renamed_argument("sight", "visibility")
 def extract_surface(
     field: Field,
-    sight: Sight | None = None,
+    visibility: Visibility | None = None,
     *,
     unseen: bool = False,
     level: float | None = None,
     crop: Crop | None = None,
     min_size: float | None = None,
 ) -> Surface:
-    """Find the surface by marching cubes.
+    """Extract the isosurface of the density as a triangle mesh, by marching cubes.
 
     They run over the raw density, whose trilinear interpolation is what rendering reads, so that
     vertices lie exactly where the density has the level.
 
     Args:
         field: A trained field.
-        sight: From ``look`` through the cameras of its training: what none of them sees is dropped,
-            and colours are those that they see. None: all is kept, and colours are those seen
-            along the normals.
+        visibility: From ``visibility`` with the cameras of its training: what none of them sees is
+            dropped, and colours are those that they see. None: all is kept, and colours are those
+            seen along the normals.
         unseen: Keep what no camera sees, too.
         level: Density of the surface, 1 / scene unit, in a frustum 1 / unit of its coordinates;
             None: that of which a voxel edge is 20 % opaque.
-        crop: Only triangles inside this box; None: the field's box.
+        crop: Only triangles inside this box; None: what cameras see.
         min_size: Components whose box has a shorter diagonal are dropped, scene units; None: eight
             voxel edges.
 
@@ -72,26 +74,26 @@ def extract_surface(
     Raises:
         InputError: A value is wrong, or there is no such surface.
     """
-    grid = field.grid
-    edge = float(grid.voxel_size.mean())
+    lattice = field.lattice
+    edge = float(lattice.voxel_size.mean())
     check_options(field, level, crop, min_size)
     require_crossed(field, level, crop)
     level = default_level(field) if level is None else level
     box = checked_crop(field, crop)
     raw = raw_density(field)
     nodes, faces = _marching_cubes(raw, _raw_of(field, level), field)
-    points = points_of(grid, nodes)
+    points = points_of(lattice, nodes)
     kept = inside(points, box)
     if not kept.any():
         raise InputError(
             f"level {level:g}: the surface of this density does not reach into the crop; enlarge "
             "the crop, or choose another level."
         )
-    if sight is not None and not unseen:
-        kept &= values_at(sight.light, nodes) > SEEN
+    if visibility is not None and not unseen:
+        kept &= values_at(visibility.light, nodes) > SEEN
     if min_size is None:
-        if grid.frustum is not None and kept.any():
-            edge = float(np.median(voxel_edges(grid, points[kept])))
+        if lattice.frustum is not None and kept.any():
+            edge = float(np.median(voxel_edges(lattice, points[kept])))
         min_size = MIN_SIZE * edge
     faces = faces[kept[faces].all(axis=1)]
     faces = faces[_large_components(points, faces, min_size)]
@@ -108,7 +110,7 @@ def extract_surface(
         points=points.astype(np.float32),
         faces=faces.reshape(-1, 3).astype(np.int32),
         normals=normals.astype(np.float32),
-        rgb=colours(field, sight, points, normals),
+        rgb=colours(field, visibility, points, normals),
     )
 
 
@@ -125,7 +127,7 @@ def check_options(
 
 def default_level(field: Field) -> float:
     """The density of which a voxel edge is 20 % opaque, 1 / scene unit."""
-    return -math.log1p(-LEVEL_OPACITY) / float(field.grid.voxel_size.mean())
+    return -math.log1p(-LEVEL_OPACITY) / float(field.lattice.voxel_size.mean())
 
 
 def require_crossed(field: Field, level: float | None, crop: Crop | None) -> None:
@@ -133,13 +135,14 @@ def require_crossed(field: Field, level: float | None, crop: Crop | None) -> Non
 
     Of fields in which a box holds no block of nodes, all nodes are looked at.
     """
-    grid = field.grid
+    lattice = field.lattice
     level = default_level(field) if level is None else level
     box = checked_crop(field, crop)
     raw = raw_density(field)
     where = " inside the crop" if crop is not None else " in its box"
-    if grid.frustum is None and (box >= grid.box_min).all() and (box <= grid.box_max).all():
-        low, high = nodes_of(grid, box)
+    inside = (box >= lattice.box_min).all() and (box <= lattice.box_max).all()
+    if lattice.frustum is None and inside:
+        low, high = nodes_of(lattice, box)
         first, last = np.floor(low).astype(int), np.ceil(high).astype(int)
         raw = raw[tuple(slice(max(a, 0), b + 1) for a, b in zip(first, last, strict=True))]
     if not raw.min() < _raw_of(field, level) <= raw.max():
@@ -156,27 +159,27 @@ def checked_crop(field: Field, crop: Crop | None) -> np.ndarray:
     Raises:
         InputError: It is no box, holds no node, or is outside of a field that ends at its own.
     """
-    own = np.stack([field.grid.box_min, field.grid.box_max])
-    if field.grid.frustum is not None:  # which is no box in the scene
+    own = np.stack([field.lattice.box_min, field.lattice.box_max])
+    if field.lattice.frustum is not None:  # which is no box in the scene
         own = np.array([[-np.inf] * 3, [np.inf] * 3])
     if crop is None:
-        return own
+        return own if field.lattice.content is None else field.lattice.content
     box = np.asarray(crop, np.float64)
     if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[0] < box[1]).all():
         raise InputError(
             "crop must be a lower and an upper corner, x y z each, the first below the second, not "
             f"{_corner(box.ravel())}."
         )
-    if field.grid.contraction == "none" and ((box[1] <= own[0]) | (box[0] >= own[1])).any():
+    if field.lattice.kind.bounded and ((box[1] <= own[0]) | (box[0] >= own[1])).any():
         raise InputError(
             f"crop from {_corner(box[0])} to {_corner(box[1])} lies outside of the field, which "
             f"reaches from {_corner(own[0])} to {_corner(own[1])}; choose a box that meets it."
         )
     with np.errstate(invalid="ignore"):  # behind the cameras of a frustum
-        low, high = np.sort(nodes_of(field.grid, box), axis=0)
+        low, high = np.sort(nodes_of(field.lattice, box), axis=0)
     if (np.floor(high + 1e-6) < np.ceil(low - 1e-6)).any():
-        edge, outside = f"{field.grid.voxel_size.max():.3g} scene units", ""
-        if field.grid.folded:
+        edge, outside = f"{field.lattice.voxel_size.max():.3g} scene units", ""
+        if field.lattice.contracted:
             outside = f" in the box from {_corner(own[0])} to {_corner(own[1])} and longer outside"
         raise InputError(
             f"crop from {_corner(box[0])} to {_corner(box[1])} lies between two nodes of the grid, "
@@ -192,13 +195,13 @@ def inside(points: np.ndarray, box: np.ndarray) -> np.ndarray:
 
 def raw_density(field: Field) -> np.ndarray:
     """What the grid holds of density, [X, Y, Z] float32."""
-    return np.ascontiguousarray(field.grid.values.numpy()[:, 0]).reshape(field.grid.size)
+    return field.storage.raw_densities(field.workers)
 
 
 def density(field: Field, raw: np.ndarray) -> np.ndarray:
     """Density of raw densities, in 1 / scene unit; the same shape."""
-    grid = field.grid
-    return (grid.density_scale * np.logaddexp(0.0, raw + grid.density_shift)).astype(np.float32)
+    stored = field.storage
+    return (stored.density_scale * np.logaddexp(0.0, raw + stored.density_shift)).astype(np.float32)
 
 
 def normals_at(field: Field, raw: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -212,11 +215,11 @@ def normals_at(field: Field, raw: np.ndarray, points: np.ndarray) -> np.ndarray:
     Returns:
         [n, 3] float64; upward where the gradient is 0.
     """
-    half = 0.5 * voxel_edges(field.grid, points)
+    half = 0.5 * voxel_edges(field.lattice, points)
     falling = np.empty((len(points), 3))
     for axis, direction in enumerate(np.eye(3)):
         before, after = (
-            values_at(raw, nodes_of(field.grid, points + (sign * half)[:, None] * direction))
+            values_at(raw, nodes_of(field.lattice, points + (sign * half)[:, None] * direction))
             for sign in (-1.0, 1.0)
         )
         falling[:, axis] = before - after
@@ -226,8 +229,8 @@ def normals_at(field: Field, raw: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 def _raw_of(field: Field, level: float) -> float:
     """The raw density of a density: the inverse of ``density``."""
-    x = max(level / field.grid.density_scale, 1e-300)
-    raw = x + math.log(-math.expm1(-x)) - field.grid.density_shift
+    x = max(level / field.storage.density_scale, 1e-300)
+    raw = x + math.log(-math.expm1(-x)) - field.storage.density_shift
     return min(max(raw, -1e30), 1e30)  # as far as single precision goes
 
 

@@ -1,4 +1,4 @@
-"""Density, and colour, at the nodes of a regular grid: numpy's .npz and NanoVDB's .nvdb."""
+"""Export of density and colour as a voxel volume: numpy's .npz and NanoVDB's .nvdb."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ import warp as wp
 
 from warpnerf.checks import InputError
 from warpnerf.exporting.colour import colours
-from warpnerf.exporting.sight import SEEN, Sight
 from warpnerf.exporting.surface import Crop, checked_crop, density, normals_at, raw_density
-from warpnerf.model.nodes import nodes_of, points_of
+from warpnerf.exporting.visibility import SEEN, Visibility
+from warpnerf.fields.nodes import nodes_of, points_of
 from warpnerf.rendering.field import Field
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Volume:
-    """A block of a field's nodes, at equal distances."""
+    """A voxel volume: a block of a field's nodes, at equal distances."""
 
     density: np.ndarray
     """[X, Y, Z] float32, 1 / scene unit; 0 in what is left out."""
@@ -36,7 +36,7 @@ class Volume:
 
 def volume_of(
     field: Field,
-    sight: Sight | None = None,
+    visibility: Visibility | None = None,
     *,
     unseen: bool = False,
     crop: Crop | None = None,
@@ -45,7 +45,8 @@ def volume_of(
 
     Args:
         field: A trained field.
-        sight: Of the cameras of its training, as for ``extract_surface``: what none sees is empty.
+        visibility: From the cameras of its training, as for ``extract_surface``: what none sees is
+            empty.
         unseen: Keep what no camera sees, too.
         crop: The box; None: the field's.
 
@@ -56,17 +57,19 @@ def volume_of(
         InputError: The crop is no box, or holds no two nodes along an axis; or the field is one in
             normalised device coordinates.
     """
-    grid = field.grid
+    lattice = field.lattice
     first, last = checked_block(field, crop)
     block = tuple(slice(a, b + 1) for a, b in zip(first, last, strict=True))
-    corners = points_of(grid, np.stack([first, last]))
+    corners = points_of(lattice, np.stack([first, last]))
     raw = raw_density(field)
-    seen = np.ones(grid.size, bool) if sight is None else sight.light > SEEN
+    seen = np.ones(lattice.size, bool) if visibility is None else visibility.light > SEEN
     sigma, seen = density(field, raw[block]), seen[block]
     there = np.ones_like(seen) if unseen else seen
-    points = points_of(grid, np.argwhere(there) + first)
+    points = points_of(lattice, np.argwhere(there) + first)
     rgb = np.zeros((*seen.shape, 3), np.uint8)
-    rgb[there] = np.round(255.0 * colours(field, sight, points, normals_at(field, raw, points)))
+    rgb[there] = np.round(
+        255.0 * colours(field, visibility, points, normals_at(field, raw, points))
+    )
     return Volume(
         density=np.where(there, sigma, np.float32(0.0)),
         rgb=rgb,
@@ -82,19 +85,19 @@ def checked_block(field: Field, crop: Crop | None) -> tuple[np.ndarray, np.ndarr
     Raises:
         InputError: As ``volume_of``.
     """
-    grid = field.grid
-    if grid.frustum is not None:
+    lattice = field.lattice
+    if lattice.frustum is not None:
         raise InputError(
             "a volume has voxels of one size, but this field's are those of normalised device "
             "coordinates, which grow with the distance; export a mesh, points or splats."
         )
-    box = np.clip(checked_crop(field, crop), grid.box_min, grid.box_max)
-    low, high = nodes_of(grid, box)
+    box = np.clip(checked_crop(field, crop), lattice.box_min, lattice.box_max)
+    low, high = nodes_of(lattice, box)
     first, last = np.ceil(low - 1e-6).astype(int), np.floor(high + 1e-6).astype(int)
     if (first >= last).any():
         raise InputError(
             "crop holds fewer than two nodes of the grid along an axis, whose voxels have edges of "
-            f"{grid.voxel_size.max():.3g} scene units; choose a larger box inside the field's."
+            f"{lattice.voxel_size.max():.3g} scene units; choose a larger box inside the field's."
         )
     return first, last
 

@@ -10,9 +10,9 @@ from typing import Literal, get_args
 import numpy as np
 
 from warpnerf.checks import InputError, require_one_of, require_positive, require_whole
-from warpnerf.scenes.camera import Camera
-from warpnerf.scenes.fisheye import angle_of
-from warpnerf.scenes.focus import MIN_SHARE_AIMED, find_focus, share_aimed_at, up_direction
+from warpnerf.scenes.cameras.camera import Camera
+from warpnerf.scenes.cameras.fisheye import angle_of
+from warpnerf.scenes.cameras.focus import MIN_SHARE_AIMED, find_focus, share_aimed_at, up_direction
 from warpnerf.scenes.scene import Scene
 
 PathKind = Literal["orbit", "through", "back"]
@@ -48,7 +48,7 @@ def camera_path(
     size: tuple[int, int] | None = None,
     distance: float | None = None,
 ) -> list[Camera]:
-    """Cameras along a smooth path, free of distortion, with the field of view of the photographs.
+    """A camera path: a smooth trajectory without distortion, as wide as the photographs see.
 
     orbit    around what the training cameras look at, as far away and as high as they are; all the
              way round, or to and fro where they leave a side out

@@ -1,4 +1,4 @@
-"""A field on film: colour and depth, through the cameras of a path or of photographs."""
+"""Video and still rendering of a field: colour and depth, along a path or from photographs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from warpnerf.media.camera_path import path_lens
 from warpnerf.media.pictures import colour_and_depth, write_png
 from warpnerf.media.video import write_video
 from warpnerf.rendering.field import Field
-from warpnerf.scenes.camera import Camera
+from warpnerf.scenes.cameras.camera import Camera
 
 N_LOOKS = 9
 """Cameras of a path that a range of depths is taken from."""
@@ -72,7 +72,7 @@ def render_stills(
     depths: tuple[float, float] | None = None,
     on_frame: Callable[[int], None] | None = None,
 ) -> None:
-    """Render pictures of colour and depth, as in a video.
+    """Render still images of colour and depth, as in a video.
 
     Args:
         field: What to look at.

@@ -34,7 +34,7 @@ INK, FAINT = (30, 30, 34), (120, 120, 128)
 
 
 def depth_colours(depth: np.ndarray, near: float, far: float) -> np.ndarray:
-    """Depth as colour: bright yellow is near, dark blue is far.
+    """Depth colour map: bright yellow is near, dark blue is far.
 
     Equal steps of depth look equal; where far > DISPARITY_FROM near > 0, equal steps of 1 / depth.
 

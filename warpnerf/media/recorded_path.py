@@ -23,7 +23,7 @@ import numpy as np
 
 from warpnerf.checks import InputError
 from warpnerf.media.camera_path import MAX_SIDE, spline
-from warpnerf.scenes.camera import Camera
+from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.files import read_json
 
 VERSION = 1
@@ -38,7 +38,7 @@ RIGID = 1e-3
 
 
 class Key(msgspec.Struct, frozen=True, kw_only=True, eq=False):
-    """A place that the camera passes."""
+    """A keyframe: a place that the camera passes."""
 
     seconds: float
     """When, from the beginning."""
@@ -49,7 +49,7 @@ class Key(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
 
 class RecordedPath(msgspec.Struct, frozen=True, kw_only=True, eq=False):
-    """A path as its file has it."""
+    """A camera path with keyframes, as its file has it."""
 
     warpnerf_path: int = VERSION
     """The version of the format."""
@@ -112,7 +112,7 @@ class RecordedPath(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
 
 def read_path(path: str | Path) -> RecordedPath:
-    """Read a path's file.
+    """Read a camera path from its file.
 
     Args:
         path: Of the file; the viewer saves such.

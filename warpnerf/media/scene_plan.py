@@ -8,20 +8,27 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image, ImageDraw
 
-from warpnerf.evaluation.inspection import Inspection
+from warpnerf.inspection.inspection import Inspection
 from warpnerf.media.pictures import FAINT, INK, font
-from warpnerf.scenes.camera import Camera
-from warpnerf.scenes.frustum import HELD
-from warpnerf.scenes.undistort import directions
+from warpnerf.scenes.cameras.camera import Camera
+from warpnerf.scenes.cameras.observations import Observations
+from warpnerf.scenes.cameras.undistort import directions
 
 _FINE = 2  # pixels are drawn twice as large, then averaged
 _PANEL = 640 * _FINE
 _MARGIN = 64 * _FINE
-_HEADER = 92 * _FINE
+_HEADER = 114 * _FINE
 _TRAIN, _TEST = (38, 96, 168), (214, 96, 30)
 _SIGHT, _SIGHT_END = (206, 226, 204), (56, 140, 66)
 _GRID, _BOX = (232, 232, 236), (120, 40, 130)
+_WIDER = (196, 120, 214)
 _POINT = (150, 150, 158)
+_SHARP, _BLURRED = (70, 150, 190), (214, 40, 40)
+"""Places seen at a pixel a voxel or finer, and at ``_RED_AT`` or coarser."""
+_RED_AT = 8.0
+"""Pixels."""
+TWICE = 2.0
+"""As wide as in the box are voxels at the outline that is drawn around it."""
 _FRUSTUM = 0.035
 """Length of a camera's pyramid, in widths of a panel."""
 
@@ -29,7 +36,7 @@ Colour = tuple[int, int, int]
 
 
 def plan_picture(inspection: Inspection) -> np.ndarray:
-    """Draw cameras as pyramids, how far their content is, the box, and points if there are some.
+    """Plot a scene: cameras as pyramids, how far content is, the box, and points if there are any.
 
     Axes are in the scene's units. Points far outside are left out.
 
@@ -47,9 +54,14 @@ def plan_picture(inspection: Inspection) -> np.ndarray:
     right, ahead = (up + 1) % 3, (up + 2) % 3
     if not standing:
         right, ahead = ahead, right
+    space = inspection.space
     box = np.stack([scene.box_min, scene.box_max])
+    if space.frustum is None:
+        box = np.stack([space.box_min, space.box_max])
+    outline = space.where_wider(TWICE)
     ends = [c.position + inspection.content_distance * c.forward for c in scene.training_cameras]
-    points = np.concatenate([box, [c.position for c in scene.cameras], ends])
+    shown = box if outline is None else np.stack(outline)
+    points = np.concatenate([shown, [c.position for c in scene.cameras], ends])
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     extent = 1.08 * float(np.ptp(points, axis=0).max())
 
@@ -66,11 +78,15 @@ def plan_picture(inspection: Inspection) -> np.ndarray:
         left = _MARGIN + number * (_PANEL + _MARGIN)
         panel = _Panel(draw, (left, _HEADER), axes, signs, middle, extent)
         panel.frame(title)
-        if scene.points is not None:
-            panel.points(scene.points)
+        if outline is not None:
+            panel.box(np.stack(outline), _WIDER)
         for camera, end in zip(scene.training_cameras, ends, strict=True):
             panel.line([camera.position, end], _SIGHT)
-        panel.box(box)
+        if scene.observations is not None:
+            panel.observations(scene.observations, inspection.widths)
+        elif scene.points is not None:
+            panel.points(scene.points)
+        panel.box(box, _BOX)
         for split, colour in (("train", _TRAIN), ("test", _TEST)):
             for index in scene.splits[split]:
                 panel.camera(scene.views[index].camera, colour)
@@ -88,15 +104,22 @@ def _header(draw: ImageDraw.ImageDraw, inspection: Inspection) -> None:
         (f"{len(scene.splits['train'])} training cameras", _TRAIN),
         (f"{len(scene.splits['test'])} test cameras", _TEST),
         (f"content distance {inspection.content_distance:.4g} in sight", _SIGHT_END),
-        (f"box, {HELD[inspection.contraction]}", _BOX),
+        (f"box, {inspection.space.kind.words}", _BOX),
     ]
-    if scene.points is not None:
+    if inspection.space.where_wider(TWICE) is not None:
+        legend.append(("voxels outside twice as wide", _WIDER))
+    if scene.observations is not None:
+        legend.append(("seen with voxels 1 pixel wide", _SHARP))
+        legend.append((f"{_RED_AT:.0f} pixels wide", _BLURRED))
+    elif scene.points is not None:
         legend.append(("points", _POINT))
     if inspection.focus is not None:
         legend.append(("+ what the cameras look at", INK))
     x, y = float(_MARGIN), 52.0 * _FINE
     type_face = font(15 * _FINE)
     for text, colour in legend:
+        if x + draw.textlength(text, type_face) + 18 * _FINE > 2 * (_PANEL + _MARGIN):
+            x, y = float(_MARGIN), y + 22.0 * _FINE
         if not text.startswith("+"):
             draw.rectangle((x, y - 6 * _FINE, x + 12 * _FINE, y + 6 * _FINE), fill=colour)
             x += 18 * _FINE
@@ -174,11 +197,23 @@ class _Panel:
             x, y = self._at(point)
             self._draw.rectangle((x, y, x + _FINE - 1, y + _FINE - 1), fill=_POINT)
 
-    def box(self, corners: np.ndarray) -> None:
+    def observations(self, seen: Observations, widths: np.ndarray) -> None:
+        """What cameras see, each as a dot, the wider its voxel is in pixels the redder."""
+        half = 0.5 * self._extent
+        near = (np.abs(seen.positions - self._middle)[:, list(self._axes)] < half).all(axis=1)
+        for place, width in zip(seen.positions[near], widths[near], strict=True):
+            x, y = self._at(place)
+            share = float(np.clip(np.log2(max(width, 1e-6)) / np.log2(_RED_AT), 0.0, 1.0))
+            colour = tuple(
+                round((1.0 - share) * a + share * b) for a, b in zip(_SHARP, _BLURRED, strict=True)
+            )
+            self._draw.rectangle((x - _FINE, y - _FINE, x + _FINE, y + _FINE), fill=colour)
+
+    def box(self, corners: np.ndarray, colour: Colour) -> None:
         """The outline of a box from corners [2, 3]."""
         (x0, y0), (x1, y1) = self._at(corners[0]), self._at(corners[1])
         outline = (min(x0, x1), min(y0, y1), max(x0, x1), max(y0, y1))
-        self._draw.rectangle(outline, None, _BOX, 2 * _FINE)
+        self._draw.rectangle(outline, None, colour, 2 * _FINE)
 
     def camera(self, camera: Camera, colour: Colour) -> None:
         """A pyramid whose base is the image."""

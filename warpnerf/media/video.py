@@ -35,7 +35,7 @@ def video_file(path: str | Path, fps: float) -> tuple[Path, str | None]:
     """Where a video will go, and in which format: .mp4, .gif, or without an ending a folder.
 
     Args:
-        path: As it was asked for.
+        path: As it was requested.
         fps: Frames per second.
 
     Returns:

@@ -8,21 +8,20 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import fields
 from functools import cache
 from types import ModuleType
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
-from warpnerf.checks import InputError
+from warpnerf.model import registry
 
 Load = Callable[[str], ModuleType]
 """A module of the kernels, by its name in the package, in some precision."""
 
 
 class Rates(Protocol):
-    """What ``warpnerf.config.OptimConfig`` says of learning rates and total variation."""
+    """What ``warpnerf.optim_config.OptimConfig`` says of learning rates and total variation."""
 
     @property
     def learning_rate_density(self) -> float: ...  # noqa: D102
@@ -35,10 +34,12 @@ class Rates(Protocol):
 
 
 class Model(ABC):
-    """What a field stores, and how that becomes colour."""
+    """A radiance model: what is read at a sample, and how that becomes colour."""
 
     name: ClassVar[str]
     """What the command and files call it."""
+    by_sample: ClassVar[bool] = False
+    """Whether the head works on samples and not on lanes, and wants raw values so."""
     learning_rate_mlp: float = 0.0
     """Of the weights of the head's MLP, where it has one."""
 
@@ -58,26 +59,21 @@ class Model(ABC):
         Raises:
             InputError: A field whose default is a bool is given something else.
         """
-        for f in fields(self):  # type: ignore[arg-type]
-            value, kind = getattr(self, f.name), type(f.default)
-            if kind is bool and not isinstance(value, bool | np.bool_):
-                raise InputError(f"model.{f.name} must be True or False, not {value!r}.")
-            if kind in (bool, int, float):
-                object.__setattr__(self, f.name, kind(value))
+        registry.keep_plain(self, "model")
 
     @property
     @abstractmethod
     def n_features(self) -> int:
-        """How many raw features a node has, besides its raw density."""
+        """How many raw features a sample has, besides its raw density."""
 
     @property
     def n_floats(self) -> int:
-        """Numbers of a node: density, features, and padding to a power of two, at least 4."""
+        """Numbers of a sample: density, features, and padding to a power of two, at least 4."""
         return max(4, 1 << self.n_features.bit_length())
 
     @abstractmethod
     def parts(self, load: Load) -> Any:
-        """What the model is made of.
+        """What the model is made of, besides the encoding, which is its storage's.
 
         Args:
             load: The kernels' modules, in the precision that is wanted.
@@ -93,12 +89,12 @@ class Model(ABC):
             load: The kernels' modules.
 
         Returns:
-            ``warpnerf_kernels.heads.mlp.Layout``; None: the head has no MLP.
+            ``warpnerf_kernels.networks.mlp.Layout``; None: the head has no MLP.
         """
         return None
 
     def march(self, load: Load, steps: Any, device: Any) -> Any:
-        """The sampler's parameters, from ``warpnerf.rendering.render.Steps``.
+        """The sampler's parameters, from ``warpnerf.rendering.steps.Steps``.
 
         Args:
             load: The kernels' modules.
@@ -121,13 +117,24 @@ class Model(ABC):
         """
         return self.parts(load).losses.on_ray.Params()
 
+    def sample_loss_params(self, load: Load) -> Any:
+        """The numbers of the loss on samples that the model itself has, if it has one.
+
+        Args:
+            load: The kernels' modules.
+
+        Returns:
+            The struct ``Params`` of that loss.
+        """
+        return self.parts(load).losses.on_samples.Params()
+
     def most_steps(self, steps: Any, length: float) -> int:
         """How many steps a ray can take, at most: workers make room for as many.
 
         Args:
-            steps: What is configured, ``warpnerf.rendering.render.Steps``.
+            steps: What is configured, ``warpnerf.rendering.steps.Steps``.
             length: Of the ray's way through the box, in its coordinates; infinite where space is
-                folded.
+                contracted.
 
         Returns:
             That, or more.
@@ -147,7 +154,7 @@ class Model(ABC):
         return np.zeros(0, np.float32) if layout is None else uniform_weights(layout, seed, 1.0)
 
     def learning_rates(self, optim: Rates) -> np.ndarray:
-        """How far an update moves each number of a node, about, at the start.
+        """How far an update moves each number that is read at a sample, about, at the start.
 
         Args:
             optim: What is configured for all models.
@@ -161,7 +168,7 @@ class Model(ABC):
         return rates
 
     def variation(self, optim: Rates) -> np.ndarray:
-        """How much each number of a node is smoothed by total variation.
+        """How much each number that is read at a sample is smoothed by total variation.
 
         Args:
             optim: What is configured for all models.
@@ -179,12 +186,6 @@ def n_weights(model: Model) -> int:
     """Weights of a model's head; 0 without an MLP."""
     layout = model.layout(loader("float32"))
     return 0 if layout is None else int(layout.n_weights)
-
-
-@cache
-def parts_of(model: Model, precision: str) -> Any:
-    """A model's parts in float32 or float64."""
-    return model.parts(loader(precision))
 
 
 @cache

@@ -6,7 +6,7 @@ the command and files know.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -18,12 +18,14 @@ from warpnerf.checks import (
     require_positive,
     require_whole,
 )
+from warpnerf.model import registry
 from warpnerf.model.interface import Load, Model, Rates, loader, uniform_weights
+from warpnerf.renamed import warn_renamed
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rgb(Model):
-    """Density and r, g, b: colour that is the same from all sides."""
+    """Density and diffuse RGB: colour that is the same from all sides."""
 
     name: ClassVar[str] = "rgb"
 
@@ -33,15 +35,13 @@ class Rgb(Model):
         return 3
 
     def parts(self, load: Load) -> Any:
-        """A dense grid, and a sigmoid."""
-        return load("launch.assembly").Parts(
-            encoding=load("fields.dense").dense(self.n_floats), head=load("heads.rgb").rgb()
-        )
+        """A sigmoid."""
+        return load("launch.assembly").Parts(head=load("heads.rgb").rgb())
 
 
 @dataclass(frozen=True, kw_only=True)
 class SphericalHarmonics(Model):
-    """Colour by spherical harmonics of the direction of view, without an MLP."""
+    """View-dependent colour by spherical harmonics, without an MLP."""
 
     name: ClassVar[str] = "sh"
     degree: int = 2
@@ -64,9 +64,8 @@ class SphericalHarmonics(Model):
         return int(3 * (self.degree + 1) ** 2)
 
     def parts(self, load: Load) -> Any:
-        """A dense grid, and the harmonics."""
+        """The harmonics."""
         return load("launch.assembly").Parts(
-            encoding=load("fields.dense").dense(self.n_floats),
             head=load("heads.sh").sh(self.degree),
         )
 
@@ -121,10 +120,12 @@ class _WithMlp(Model):
 
 @dataclass(frozen=True, kw_only=True)
 class Deferred(_WithMlp):
-    """Features added up along the ray, and one small MLP a ray that sees the direction of view."""
+    """Deferred shading: features composited along the ray, then a view-dependent MLP per ray."""
 
     name: ClassVar[str] = "deferred"
-    specular: int = 4
+    width: int = 64
+    """Units of each hidden layer, a multiple of 16 up to 128."""
+    specular: int = 12
     """Features of a node besides its diffuse colour, 1 to 28."""
 
     def __post_init__(self) -> None:
@@ -145,9 +146,8 @@ class Deferred(_WithMlp):
         return 3 + self.specular
 
     def parts(self, load: Load) -> Any:
-        """A dense grid, and a head of rays."""
+        """A head of rays."""
         return load("launch.assembly").Parts(
-            encoding=load("fields.dense").dense(self.n_floats),
             head=load("heads.deferred").deferred(
                 self.n_features, self.frequencies, self.width, self.hidden_layers
             ),
@@ -171,10 +171,11 @@ class Deferred(_WithMlp):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Features(_WithMlp):
-    """Features of each sample and the direction of view through an MLP, as in DVGO."""
+class PerSample(_WithMlp):
+    """A view-dependent MLP per sample, on its features and the direction of view, as in DVGO."""
 
-    name: ClassVar[str] = "features"
+    name: ClassVar[str] = "per_sample"
+    by_sample: ClassVar[bool] = True
     features: int = 12
     """Of a node: 1 to 31, at least 4 with the residual."""
     frequencies: int = 4
@@ -215,10 +216,9 @@ class Features(_WithMlp):
         return max(8, super().n_floats)
 
     def parts(self, load: Load) -> Any:
-        """A dense grid, and a head of samples."""
+        """A head of samples."""
         return load("launch.assembly").Parts(
-            encoding=load("fields.dense").dense(self.n_floats, by_sample=True),
-            head=load("heads.features").features(
+            head=load("heads.per_sample").per_sample(
                 self.features,
                 self.frequencies,
                 self.width,
@@ -230,7 +230,7 @@ class Features(_WithMlp):
 
     def layout(self, load: Load) -> Any:
         """The MLP sees the features that are not colour, and the direction of view."""
-        return load("heads.features").layout_of(
+        return load("heads.per_sample").layout_of(
             self.features, self.frequencies, self.width, self.hidden_layers, self.residual
         )
 
@@ -248,9 +248,15 @@ class Features(_WithMlp):
 
 
 MODELS: dict[str, type[Model]] = {
-    model.name: model for model in (Rgb, SphericalHarmonics, Deferred, Features)
+    model.name: model for model in (Rgb, SphericalHarmonics, Deferred, PerSample)
 }
 """By name."""
+
+FORMER_NAMES = {"features": "per_sample"}
+"""Of models, in files and commands of the version before."""
+
+DEFAULTS_BEFORE: dict[str, dict[str, Any]] = {"deferred": {"specular": 4, "width": 32}}
+"""By name, what was the default where a file does not tell."""
 
 AnyModel = TypeVar("AnyModel", bound=type[Model])
 
@@ -264,16 +270,22 @@ def register(model: AnyModel) -> AnyModel:
     Raises:
         ValueError: Another model has that name.
     """
-    if MODELS.setdefault(model.name, model) is not model:
-        raise ValueError(f"{model.name!r} is the name of another model")
-    return model
+    return registry.add(MODELS, model.name, model, "model")
+
+
+def current_name(name: str) -> str:
+    """The name that a model has now; a DeprecationWarning tells of a former one."""
+    if name in MODELS or name not in FORMER_NAMES:
+        return name
+    warn_renamed(f"the model {name}", FORMER_NAMES[name])
+    return FORMER_NAMES[name]
 
 
 def model_of(name: str) -> Model:
     """The model of a name, as it is configured by default.
 
     Args:
-        name: A key of ``MODELS``.
+        name: A key of ``MODELS``, or a former name.
 
     Returns:
         The model.
@@ -281,36 +293,19 @@ def model_of(name: str) -> Model:
     Raises:
         InputError: There is none.
     """
+    name = current_name(name)
     require_one_of("model", name, tuple(MODELS))
     return MODELS[name]()
 
 
-def to_json(model: Model) -> dict[str, Any]:
-    """Name and configuration."""
-    return {"name": model.name, **asdict(model)}  # type: ignore[call-overload]
-
-
 def from_json(tree: Any) -> Model:
-    """The model that ``to_json`` wrote.
+    """The model that ``to_json`` wrote, also under its former name.
 
     Raises:
         ValueError: It is none that this version knows.
     """
-    if not isinstance(tree, dict) or tree.get("name") not in MODELS:
-        raise ValueError(f"{tree!r} is no model of {', '.join(MODELS)}")
-    kind = MODELS[tree["name"]]
-    given = {name: value for name, value in tree.items() if name != "name"}
-    types = {f.name: type(f.default) for f in fields(kind)}  # type: ignore[arg-type]
-    for name, value in given.items():
-        if type(value) is int and types.get(name) is float:
-            given[name] = float(value)
-        elif name not in types or type(value) is not types[name]:
-            raise ValueError(f"{name!r} of the model {kind.name} cannot be {value!r}")
-    return kind(**given)
-
-
-def decode(kind: type, tree: Any) -> Any:
-    """For msgspec: a model where one is wanted (its argument ``dec_hook``)."""
-    if kind is not Model:
-        raise TypeError(f"{kind} is not read from JSON")
-    return from_json(tree)
+    if isinstance(tree, dict) and isinstance(name := tree.get("name"), str):
+        tree = tree | {"name": name if name in MODELS else FORMER_NAMES.get(name, name)}
+    model = registry.from_json(MODELS, tree, "model", DEFAULTS_BEFORE)
+    assert isinstance(model, Model)
+    return model

@@ -1,20 +1,29 @@
-"""A radiance field that can be looked at: a grid, its free space, and how to march through it."""
+"""A radiance field that can be rendered: its storage, free space, and how to march through it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
 from warpnerf_kernels.base.types import real, vec3
+from warpnerf_kernels.launch import assembly
 
 from warpnerf.checks import require_rays
-from warpnerf.model.grid import FreeCells, VoxelGrid, reach_of_places
+from warpnerf.fields.lattice import Lattice
+from warpnerf.fields.occupancy import FreeCells
+from warpnerf.fields.storage import Storage
 from warpnerf.model.interface import Model
-from warpnerf.rendering.rays import camera_rays
-from warpnerf.rendering.render import RenderedRays, Steps, render_rays
+from warpnerf.rendering.proposal import Intervals, Proposal, Proposer
+from warpnerf.rendering.rays import camera_rays, rays_struct
+from warpnerf.rendering.render import RenderedRays, render_rays
+from warpnerf.rendering.steps import Steps
 from warpnerf.runtime.parallel import Workers
-from warpnerf.scenes.camera import Camera
+from warpnerf.scenes.cameras.camera import Camera
+from warpnerf.scenes.extent.space import reach_of_places
+
+PROPOSED = 1 << 14
+"""Rays that intervals are drawn for at a time: what that takes is not to grow with pictures."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -34,19 +43,44 @@ class Field:
     """A trained scene."""
 
     model: Model
-    """What the grid holds, and how that becomes colour."""
-    grid: VoxelGrid
+    """What it holds, and how that becomes colour."""
+    storage: Storage
     """Densities and features."""
     weights: wp.array
     """[n_weights] of the model's MLP; none without one."""
     free: FreeCells
-    """What of the grid is skipped."""
+    """What of its lattice is skipped."""
     steps: Steps
     """How rays are marched."""
     background: tuple[float, float, float]
     """rgb in [0, 1], seen where rays pass through."""
     workers: Workers
     """The device that it lives on."""
+    proposal: Proposal | None = None
+    """Where to sample rays; None: in steps that are the same for all."""
+
+    @property
+    def lattice(self) -> Lattice:
+        """Its nodes and the space that they fill."""
+        return self.storage.lattice
+
+    def copied_to(self, device: wp.Device) -> Field:
+        """The same with arrays of its own.
+
+        Args:
+            device: Where they lie.
+
+        Returns:
+            A field that is rendered where this one is.
+        """
+        distance = wp.clone(self.free.distance, device=device)
+        return replace(
+            self,
+            storage=self.storage.copied_to(device),
+            weights=wp.clone(self.weights, device=device),
+            free=replace(self.free, distance=distance),
+            proposal=None if self.proposal is None else self.proposal.copied_to(device),
+        )
 
     def render(self, camera: Camera) -> Rendering:
         """Look through a camera.
@@ -88,18 +122,43 @@ class Field:
 
     def _render(self, origins: wp.array, directions: wp.array, places: np.ndarray) -> RenderedRays:
         """Look along rays from some places, [n, 3]."""
-        device = self.workers.device
+        reach = reach_of_places(self.lattice.box_min, self.lattice.box_max, places)
+        steps = self.steps.reaching(reach)
+        if self.proposal is None:
+            return self._walk(steps, origins, directions)
+        n = origins.shape[0]
+        proposer = Proposer(min(n, PROPOSED), self.proposal, steps, self.workers)
+        seen = RenderedRays.room(n, self.workers)
+        for begin in range(0, n, PROPOSED):
+            some = slice(begin, min(begin + PROPOSED, n))
+            rays = origins[some], directions[some]
+            proposer.run(self.free, rays_struct(assembly, *rays, *self._same_for_all))
+            seen.write(begin, self._walk(proposer.intervals, *rays))
+        return seen
+
+    def _walk(
+        self, steps: Steps | Intervals, origins: wp.array, directions: wp.array
+    ) -> RenderedRays:
+        """Look along rays through given steps."""
         return render_rays(
             self.model,
-            self.grid,
+            self.storage,
             self.weights,
             self.free,
-            self.steps.reaching(reach_of_places(self.grid.box_min, self.grid.box_max, places)),
+            steps,
             origins,
             directions,
+            *self._same_for_all,
+            self.workers,
+        )
+
+    @property
+    def _same_for_all(self) -> tuple[wp.array, wp.array]:
+        """Offsets and background of rays: samples sit in the middles of steps."""
+        device = self.workers.device
+        return (
             wp.full(1, 0.5, dtype=real, device=device),
             wp.full(1, vec3(*self.background), dtype=vec3, device=device),
-            self.workers,
         )
 
     @staticmethod

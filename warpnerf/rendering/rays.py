@@ -15,11 +15,12 @@ from warpnerf_kernels.launch import assembly
 from warpnerf_kernels.sampling import coverage
 from warpnerf_kernels.space import camera as kernels
 
-from warpnerf.model.grid import FreeCells, VoxelGrid
+from warpnerf.fields.lattice import Lattice
+from warpnerf.fields.occupancy import FreeCells
 from warpnerf.runtime.parallel import RAYS, LaunchCache, Workers
-from warpnerf.scenes.camera import Camera
-from warpnerf.scenes.fisheye import largest_angle
-from warpnerf.scenes.pixel_file import expect_random_reads
+from warpnerf.scenes.cameras.camera import Camera
+from warpnerf.scenes.cameras.fisheye import largest_angle
+from warpnerf.scenes.images.pixel_file import expect_random_reads
 from warpnerf.scenes.scene import View
 
 MOST_BLOCKS = 2**20
@@ -78,9 +79,9 @@ def rays_struct(
     return rays
 
 
-def view_struct(camera: Camera) -> kernels.View:
+def view_struct(camera: Camera) -> kernels.CameraParams:
     """A camera as kernels take it, without a photograph."""
-    view = kernels.View()
+    view = kernels.CameraParams()
     view.rotation = mat33(*camera.c2w[:, :3].ravel())
     view.position = vec3(*camera.c2w[:, 3])
     view.focal = vec2(camera.fx, camera.fy)
@@ -137,10 +138,13 @@ class PixelSampler:
         """
         self._workers = workers
         self._n_rays = n_rays
-        self._seed = int(np.random.SeedSequence(seed).generate_state(1)[0] >> 1)
-        self._random_background = background is None
-        self._background = vec3(*(background or (0.0, 0.0, 0.0)))
-        self._jitter = jitter
+        self._draw = kernels.Draw()
+        self._draw.seed = int(np.random.SeedSequence(seed).generate_state(1)[0] >> 1)
+        if background is None:
+            self._draw.background_mode = kernels.RANDOM_BACKGROUND
+        else:
+            self._draw.background = vec3(*background)
+        self._draw.jitter = int(jitter)
         # Views of the kernel only point to these.
         self._photographs: list[wp.array] = []
         self._kept: list[np.ndarray] = []
@@ -149,13 +153,15 @@ class PixelSampler:
         self._cameras = [view.camera for view in views]
         self._masks = [view.mask for view in views]
         self._structs = [self._add(view) for view in views]
-        self._views = wp.array(self._structs, dtype=kernels.View, device=workers.device)
+        self._source = source = kernels.PixelSource()
+        source.views = wp.array(self._structs, dtype=kernels.CameraParams, device=workers.device)
+        source.n_pixels = self._n_pixels
+        source.content_distances = wp.array(content_distances, dtype=real, device=workers.device)
         self._draw_anywhere()
-        self._content_distances = wp.array(content_distances, dtype=real, device=workers.device)
         self._batch = _room(n_rays, workers)
         self._launches = LaunchCache()
 
-    def _add(self, view: View) -> kernels.View:
+    def _add(self, view: View) -> kernels.CameraParams:
         """A photograph as the kernel takes it: on the CPU where it lies, on CUDA a copy there."""
         image = np.ascontiguousarray(view.image)
         expect_random_reads(image)
@@ -178,21 +184,21 @@ class PixelSampler:
             self._n_pixels += int(np.count_nonzero(mask))
         return struct
 
-    def keep_to(self, grid: VoxelGrid, free: FreeCells) -> float:
+    def cull_background(self, lattice: Lattice, free: FreeCells) -> float:
         """From now on draw no pixels whose rays, and those of all around them, meet nothing.
 
         Such rays see the background, whatever is trained. Pixels are told apart in square blocks.
         Batches have as many rays as had met something among all, on average.
 
         Args:
-            grid: Without contraction.
-            free: Of this grid.
+            lattice: Without contraction.
+            free: Of this lattice.
 
         Returns:
             The share of the pixels that are drawn from, (0, 1]: all where none shows anything.
         """
         self._draw_anywhere()
-        edge = _block_edge(self._cameras, grid, free)
+        edge = _block_edge(self._cameras, lattice, free)
         counts = [_n_blocks(camera, edge) for camera in self._cameras]
         first = np.cumsum([0, *counts])
         covered = wp.empty(int(first[-1]), dtype=wp.uint8, device=self._workers.device)
@@ -200,7 +206,7 @@ class PixelSampler:
             self._workers.launch(
                 coverage.cover_blocks,
                 count,
-                *(struct, edge, int(before), grid.box, free.struct, covered),
+                *(struct, lattice.box, free.struct, edge, int(before), covered),
                 at_once=RAYS,
             )
         n_pixels = np.concatenate(
@@ -211,9 +217,9 @@ class PixelSampler:
         )
         share = float(n_pixels[covered.numpy() != 0].sum()) / self._n_pixels
         if 0.0 < share < 1.0:
-            self._block, self._covered = edge, covered
+            self._source.block, self._source.covered = edge, covered
             device = self._workers.device
-            self._first_blocks = wp.array(first[:-1], dtype=wp.int32, device=device)
+            self._source.first_blocks = wp.array(first[:-1], dtype=wp.int32, device=device)
         share = share or 1.0
         self._n_drawn = max(1, round(share * self._n_rays))
         return share
@@ -221,15 +227,16 @@ class PixelSampler:
     def _draw_anywhere(self) -> None:
         """No blocks are left out."""
         self._n_drawn = self._n_rays
-        self._block = 1
-        self._first_blocks = wp.empty(0, dtype=wp.int32, device=self._workers.device)
-        self._covered = wp.empty(0, dtype=wp.uint8, device=self._workers.device)
+        self._source.block = 1
+        self._source.first_blocks = wp.empty(0, dtype=wp.int32, device=self._workers.device)
+        self._source.covered = wp.empty(0, dtype=wp.uint8, device=self._workers.device)
 
     def draw(self, step: int, n_steps: int = 1) -> RayBatch:
         """The batches of some steps as one.
 
-        What is drawn is a function of the steps, the seed, and of what ``keep_to`` was given. As
-        long as that has left nothing out, a batch of several steps is made of those of each.
+        What is drawn is a function of the steps, the seed, and of what ``cull_background`` was
+        given. As long as that has left nothing out, a batch of several steps is made of those of
+        each.
 
         Args:
             step: The first.
@@ -242,26 +249,11 @@ class PixelSampler:
         if self._batch.count != n_steps * self._n_drawn:
             self._batch = _room(n_steps * self._n_drawn, self._workers)
         batch = self._batch
+        self._draw.rays_before = (step * self._n_rays) % 2**32
         self._workers.launch(
             kernels.sample_pixels,
             batch.count,
-            self._views,
-            self._n_pixels,
-            self._block,
-            self._first_blocks,
-            self._covered,
-            self._content_distances,
-            self._seed,
-            (step * self._n_rays) % 2**32,
-            self._background,
-            int(self._random_background),
-            int(self._jitter),
-            batch.origins,
-            batch.directions,
-            batch.offsets,
-            batch.background,
-            batch.content_distance,
-            batch.target_rgb,
+            *(self._source, self._draw, batch.struct, batch.target_rgb),
             cache=self._launches,
         )
         return batch
@@ -285,14 +277,14 @@ def _pixels_of_blocks(camera: Camera, mask: np.ndarray | None, edge: int) -> np.
     return np.add.reduceat(of_rows, columns, axis=1).ravel()
 
 
-def _block_edge(cameras: Sequence[Camera], grid: VoxelGrid, free: FreeCells) -> int:
-    """Pixels along the edge of a block: a power of two from 4, which keeps to MOST_BLOCKS.
+def _block_edge(cameras: Sequence[Camera], lattice: Lattice, free: FreeCells) -> int:
+    """Pixels along the edge of a block: a power of two from 4, which stays within MOST_BLOCKS.
 
-    At most as wide as a cell in the middle of the box: cones are held against whole cells, so
+    At most as wide as a cell in the middle of the box: cones are compared with whole cells, so
     smaller blocks would hardly leave out more.
     """
-    cell = float(((grid.box_max - grid.box_min) / np.array(free.size)).min())
-    centre = 0.5 * (grid.box_min + grid.box_max)
+    cell = float(((lattice.box_max - lattice.box_min) / np.array(free.size)).min())
+    centre = 0.5 * (lattice.box_min + lattice.box_max)
     away = [float(np.linalg.norm(camera.position - centre)) for camera in cameras]
     pixels = [cell * c.fx / max(d, cell) for c, d in zip(cameras, away, strict=True)]
     edge = 4

@@ -3,7 +3,9 @@
 Warp compiles a kernel once and reads it from its cache ever after. It does not check what it reads,
 and a flipped bit in machine code ends in a crash or in wrong numbers; so a file SHA256SUMS lies
 beside each compiled module here, in the format of the tool ``sha256sum``. A cache that cannot be
-written, made, or believed is left for a temporary one, once in a process and with a warning.
+written, made, or believed is left by the command for a temporary one, once in a process and with a
+warning. In a process that is not its own (``runtime.process``) an error says so, and Warp stays as
+it is.
 """
 
 from __future__ import annotations
@@ -25,6 +27,7 @@ from pathlib import Path
 import warp as wp
 
 from warpnerf.checks import InputError
+from warpnerf.runtime import process
 
 SUMS = "SHA256SUMS"
 COMPILED = (".o", ".cubin", ".ptx", ".meta")
@@ -33,14 +36,29 @@ CUDA_BLOCK = 64
 ROOM = 16 << 20
 """Bytes that are free where a kernel is compiled: several times what the largest leaves there."""
 NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
-"""In the line that Warp prints where there is no GPU. Who asks for one is told in a sentence."""
+"""In the line that Warp prints where there is no GPU. Who requests one is told in a sentence."""
+
+WAY_OUT = (
+    "make the cache writable, delete what is damaged in it, or set WARP_CACHE_PATH to another "
+    "folder"
+)
 
 _log = logging.getLogger("warpnerf")
 _loading = threading.Lock()
-"""Warp would load a module twice where two threads ask for it, and free the code of one of them."""
+"""Warp would load a module twice where two threads request it, and free the code of one of them."""
 _temporary: Path | None = None
 _said = False
 _started = False
+
+
+def _load_again() -> None:
+    """Nobody loads in a process that was just forked, whoever did in the one that it comes from."""
+    global _loading
+    _loading = threading.Lock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_load_again)
 
 
 class DamagedKernelError(Exception):
@@ -48,16 +66,17 @@ class DamagedKernelError(Exception):
 
 
 def start() -> None:
-    """Start Warp, without a banner.
+    """Start Warp: for the command without a banner.
 
     Raises:
-        InputError: Neither its cache nor a temporary folder can be made.
+        InputError: Its cache cannot be made, nor for the command a temporary folder.
     """
     global _started
-    wp.config.log_level = wp.LOG_ERROR
     if _started:
         return
-    with _without_lines(NO_DRIVER):
+    if process.is_own():
+        wp.config.log_level = wp.LOG_ERROR
+    with _without_lines(NO_DRIVER) if process.is_own() else contextlib.nullcontext():
         try:
             wp.init()
         except OSError as error:
@@ -92,7 +111,7 @@ def load(kernel: wp.Kernel, device: wp.Device) -> None:
     """Compile a kernel's module for a device, or fetch it from the cache. Any thread may ask.
 
     Raises:
-        InputError: The cache cannot be used, nor can a temporary folder be made.
+        InputError: The cache cannot be used, nor for the command a temporary folder be made.
     """
     with _loading:
         try:
@@ -101,9 +120,12 @@ def load(kernel: wp.Kernel, device: wp.Device) -> None:
             mistaken = type(error).__name__.startswith("WarpCodegen")  # the kernel, not the cache
             if mistaken or _temporary is not None:
                 raise
+            told = isinstance(error, OSError | DamagedKernelError)
+            if not told and not process.is_own():
+                raise
             cache = wp.config.kernel_cache_dir
-            _leave_cache(error)
             kernel.module.unload()  # forgets that it failed
+            _leave_cache(error)
             try:
                 _load(kernel.module, device)
             except OSError as again:
@@ -155,9 +177,17 @@ def _say_once() -> None:
 
 
 def _leave_cache(error: Exception) -> None:
-    """Use a temporary folder from now on, which is removed when the process ends."""
+    """Use a temporary folder from now on, which is removed when the process ends.
+
+    Raises:
+        InputError: The process is not the command's own, or no such folder can be made.
+    """
     global _temporary
     cache = wp.config.kernel_cache_dir
+    if not process.is_own():
+        raise InputError(
+            f"the cache of compiled kernels {cache} cannot be used ({error}); {WAY_OUT}."
+        ) from error
     try:
         _temporary = Path(tempfile.mkdtemp(prefix="warpnerf-kernels-"))
     except OSError as again:
@@ -166,8 +196,7 @@ def _leave_cache(error: Exception) -> None:
     wp.config.kernel_cache_dir = str(_temporary)
     warnings.warn(
         f"the cache of compiled kernels {cache} cannot be used ({error}), so kernels are compiled "
-        "into a temporary folder, for this time only; make the cache writable, delete what is "
-        "damaged in it, or set WARP_CACHE_PATH to another folder",
+        f"into a temporary folder, for this time only; {WAY_OUT}",
         RuntimeWarning,
         stacklevel=2,
     )

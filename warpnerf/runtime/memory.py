@@ -1,4 +1,4 @@
-"""What there is of the machine to use: memory, cores."""
+"""Memory and CPU cores that this process may use."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CONTAINER_USES = (
         Path("/sys/fs/cgroup/memory/memory.stat"),
     ),
 )
-"""Likewise, what it uses, and how much of that are files, which make room when it is asked for."""
+"""Likewise, what it uses, and how much of that are files, which make room when it is requested."""
 LARGE_PAGE = 2 << 20
 """Bytes of a large page."""
 MOUNTS = Path("/proc/mounts")
@@ -148,7 +148,7 @@ def _share(files: tuple[Path, ...]) -> int | None:
 
 
 def prefer_large_pages(address: int, n_bytes: int) -> None:
-    """Ask the system for pages of 2 MB, where it has such (Linux), for memory not yet written to.
+    """Request huge pages of 2 MB, where the system has such (Linux), for memory not yet written.
 
     Reading what is scattered over many pages takes less time where they are large: there are fewer
     of them to look up.
@@ -165,7 +165,7 @@ def prefer_large_pages(address: int, n_bytes: int) -> None:
         ctypes.CDLL(None).madvise(ctypes.c_void_p(begin), ctypes.c_size_t(end - begin), advice)
 
 
-def give_back() -> None:
+def release_free_memory() -> None:
     """Return freed memory to the system, where the C library keeps it for itself (glibc)."""
     with contextlib.suppress(OSError, AttributeError, TypeError):
         ctypes.CDLL(None).malloc_trim(0)

@@ -1,4 +1,4 @@
-"""All cores of the CPU: one Warp launch runs on one core, launches from several threads overlap.
+"""Multithreading on the CPU: a Warp launch runs on one core, several threads overlap launches.
 
 Each worker gets a contiguous share of the items that depends on nothing but their number and the
 number of workers. What a worker adds to, it owns; so no two race, and results are the same bits
@@ -7,6 +7,7 @@ whatever else the machine is doing.
 
 from __future__ import annotations
 
+import os
 import threading
 import weakref
 from collections.abc import Callable
@@ -31,7 +32,7 @@ class LaunchCache:
     """What kernels were launched with, in the form that they take: kept for their next launch.
 
     Converting arguments takes several times as long as a launch does, and threads do it one after
-    the other. An argument is converted anew where it is another object than last time; so what may
+    the other. An argument is converted again where it is another object than last time; so what may
     change in place are the contents of arrays and the fields of structs.
     """
 
@@ -43,7 +44,7 @@ class LaunchCache:
         self, worker: int, kernel: wp.Kernel, n: int, arguments: list[Any], device: wp.Device
     ) -> None:
         """Launch a kernel for one of the workers, on the CPU."""
-        # Taken out while it changes: what is interrupted then is converted anew.
+        # Taken out while it changes: what is interrupted then is converted again.
         command, last = self._commands.pop((kernel, worker), (None, []))
         if command is None:
             command = wp.launch(kernel, n, inputs=arguments, device=device, record_cmd=True)
@@ -112,7 +113,7 @@ class Workers:
             threads: CPU threads; None: one per core that this process may use.
 
         Raises:
-            InputError: The device does not exist on this machine.
+            InputError: The device does not exist on this machine, or Warp's cache cannot be made.
         """
         if threads is not None:
             require_threads(threads)
@@ -130,13 +131,18 @@ class Workers:
         self.count = 1 if self.device.is_cuda else (threads or usable_cores())
         self._others: list[Thread] = []
         weakref.finalize(self, _end, self._others)
-        self._others.extend(Thread() for _ in range(1, self.count))
-        self._launching = threading.Lock()
-        self._in_launch = False  # whether somebody may be in one
+        self._begin()
+        _all_workers.add(self)
         self.barrier = wp.zeros(barrier.SIZE, dtype=wp.int32, device="cpu")
         """Where they wait for each other in a launch on the CPU; see cpu.barrier."""
         self._attendance = self.barrier.numpy()
         self._loaded: set[Any] = set()
+
+    def _begin(self) -> None:
+        """No thread is there yet, and nobody launches: also so in a process that was forked."""
+        self._others.clear()
+        self._launching = threading.Lock()
+        self._in_launch = False  # whether somebody may be in one
 
     def launch(
         self,
@@ -206,7 +212,7 @@ class Workers:
             begin, end = (n * w // self.count for w in (worker, worker + 1))
             try:
                 for first in range(begin, end, at_once):
-                    if self._attendance[barrier.CALLED_OFF]:
+                    if self._attendance[barrier.CANCELLED]:
                         return
                     size, inputs = min(at_once, end - first), [first, *arguments(worker)]
                     if cache is not None:
@@ -214,14 +220,15 @@ class Workers:
                     else:
                         wp.launch(kernel, size, inputs=inputs, device=self.device)
             except BaseException:
-                self._attendance[barrier.CALLED_OFF] = 1
+                self._attendance[barrier.CANCELLED] = 1
                 raise
 
         # Workers that wait for each other must all be in the same launch. So there is one at a
         # time, and it ends when none is left in it.
         with self._launching:
             if self._in_launch:  # where an interrupt was interrupted
-                self._call_off()
+                self._cancel()
+            self._others.extend(Thread() for _ in range(1 + len(self._others), self.count))
             self._in_launch = True
             self._attendance[:] = 0
             try:
@@ -230,7 +237,7 @@ class Workers:
                 share(0)
                 errors = [other.wait() for other in self._others]
             except BaseException:
-                self._call_off()
+                self._cancel()
                 raise
             self._in_launch = False
         try:
@@ -239,9 +246,22 @@ class Workers:
         finally:
             del errors  # else what is raised holds this frame, and this frame what is raised
 
-    def _call_off(self) -> None:
+    def _cancel(self) -> None:
         """Let nobody wait for a worker that does not come, and wait until all have left."""
-        self._attendance[barrier.CALLED_OFF] = 1
+        self._attendance[barrier.CANCELLED] = 1
         for other in self._others:
             other.wait()
         self._in_launch = False
+
+
+_all_workers: weakref.WeakSet[Workers] = weakref.WeakSet()
+
+
+def _begin_again() -> None:
+    """Let workers start new threads: a forked process has no thread but the one that forked."""
+    for workers in list(_all_workers):
+        workers._begin()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_begin_again)

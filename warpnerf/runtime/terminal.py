@@ -1,4 +1,4 @@
-"""What is printed: tables, and an output that may be closed while a program goes on."""
+"""What is printed: tables, and an output that may be closed while a program continues."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 class UntilClosed(io.TextIOBase):
     """Standard output that is silent once nobody reads it, as in ``warpnerf train ... | head``.
 
-    A training that nobody listens to goes on, and is saved.
+    A training that nobody listens to continues, and is saved.
     """
 
     def __init__(self, stream: io.TextIOWrapper) -> None:
@@ -31,7 +31,7 @@ class UntilClosed(io.TextIOBase):
             return len(text)
 
     def flush(self) -> None:
-        """Hand on what was written, where somebody reads."""
+        """Pass on what was written, where somebody reads."""
         try:
             self._stream.flush()
         except BrokenPipeError:

@@ -9,8 +9,9 @@ from typing import Protocol, overload
 import numpy as np
 
 from warpnerf.checks import InputError, require_positive
-from warpnerf.config import SceneKind
-from warpnerf.scenes.camera import Camera
+from warpnerf.optim_config import SceneKind
+from warpnerf.scenes.cameras.camera import Camera
+from warpnerf.scenes.cameras.observations import Observations
 
 
 class ImageFile(Protocol):
@@ -73,7 +74,7 @@ class View:
     """One photograph and the camera that took it."""
 
     name: str
-    """Unique within the scene; the image's path relative to the scene's folder, or made up."""
+    """Unique within the scene; the image's path relative to the scene's folder, or generated."""
     camera: Camera
     """Its width and height are those of ``image``."""
     image: _Image = _Image()
@@ -137,7 +138,7 @@ class Scene:
     box_max: np.ndarray
     """[3] float64, upper corner."""
     unbounded: bool
-    """Whether content goes on outside the box (photographs), or not (objects with alpha, rooms)."""
+    """Whether content continues outside the box (photographs), or not (objects, rooms)."""
     content_distance: float
     """Median distance from a camera to what it sees, or to what all look at, scene units. What a
     short training finds takes its place, see ``TrainConfig.coarse_steps``."""
@@ -151,16 +152,18 @@ class Scene:
     """Distance from the cameras within which 1 in 100 of these points lies, scene units."""
     points: np.ndarray | None = None
     """[n, 3] float64, some of these points, scene units."""
+    observations: Observations | None = None
+    """Some of these points, as training cameras see them."""
     bounds: np.ndarray | None = None
     """[n_views, 2] float64, depth of the nearest and of the farthest content that each camera sees,
     scene units, as the file gives them: not checked. None where it gives none."""
     notes: tuple[str, ...] = field(default=())
     """How the scene was understood: its split, what was estimated; a line each."""
     warnings: tuple[str, ...] = field(default=())
-    """What is odd and may be a mistake: missing files, duplicates, unused keys; a line each."""
+    """What may be a mistake: missing files, duplicates, unused keys; a line each."""
     photograph: Callable[[Camera], np.ndarray | None] | None = None
     """What another camera sees, [H, W, 3] uint8 rgb, or None where it cannot stand; for scenes that
-    can be photographed anew."""
+    can be photographed again."""
 
     def __post_init__(self) -> None:
         """Refuse what nothing can be trained on.

@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from warpnerf.checks import InputError, require_extra
-from warpnerf.scenes.contents import NEEDED
+from warpnerf.scenes.formats.contents import NEEDED
 
 if TYPE_CHECKING:
     import av

@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from warpnerf.scenes.camera import Camera
-from warpnerf.scenes.colmap import PARAMETERS
-from warpnerf.scenes.focus import up_direction
+from warpnerf.scenes.cameras.camera import Camera
+from warpnerf.scenes.cameras.focus import up_direction
+from warpnerf.scenes.formats.colmap import PARAMETERS
 
 SEED = 0
 MAX_FEATURES = 4096
@@ -78,6 +78,7 @@ def run(job: dict[str, Any], report: Report) -> dict[str, Any]:
     database = Path(job["work"]) / "database.db"
     n = len(job["photographs"])
     report(stage="features", done=0, of=n)
+    pycolmap.Database.open(database).close()
     _extract(pycolmap, job, database)
     with closing(pycolmap.Database.open(database)) as opened:
         features = {
@@ -119,14 +120,20 @@ def _extract(pycolmap: Any, job: dict[str, Any], database: Path) -> None:
         reader.camera_model = members[0]["camera_model"]
         if job["masks"] is not None:
             reader.mask_path = job["masks"]
+        which = {
+            "image_names": [p["name"] for p in members],
+            "camera_mode": pycolmap.CameraMode.SINGLE,
+        }
+        # Photographs get their numbers here, in the order of their names: extraction would number
+        # them as its threads are done, and what is placed first depends on the numbers.
+        pycolmap.import_images(database, job["images"], options=reader, **which)
         pycolmap.extract_features(
             database,
             job["images"],
-            image_names=[p["name"] for p in members],
-            camera_mode=pycolmap.CameraMode.SINGLE,
             reader_options=reader,
             extraction_options=options,
             device=pycolmap.Device.cpu,
+            **which,
         )
 
 
@@ -158,7 +165,7 @@ def _map(pycolmap: Any, job: dict[str, Any], database: Path, report: Report) -> 
     if job["mapper"] == "global":
         pycolmap.calibrate_view_graph(database)
         options = pycolmap.GlobalPipelineOptions()
-        options.num_threads, options.random_seed = job["threads"], SEED
+        options.num_threads, options.random_seed = 1, SEED
         options.min_model_size = MIN_MODEL
         folder = Path(job["work"]) / "global"
         folder.mkdir()
@@ -177,7 +184,7 @@ def _grow(
     """Models by placing photograph after photograph."""
     n = len(job["photographs"])
     options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads, options.random_seed = job["threads"], SEED
+    options.num_threads, options.random_seed = 1, SEED
     options.min_model_size = MIN_MODEL
     if angle is not None:
         options.mapper.init_min_tri_angle = angle

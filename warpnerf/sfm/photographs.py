@@ -13,15 +13,15 @@ from PIL import ExifTags, Image
 
 from warpnerf.checks import InputError
 from warpnerf.runtime.memory import usable_cores
-from warpnerf.scenes.contents import NEEDED
 from warpnerf.scenes.files import printable
-from warpnerf.scenes.images import (
+from warpnerf.scenes.formats.contents import NEEDED
+from warpnerf.scenes.images.images import (
     exif_orientation,
     image_size,
     read_exif,
     require_whole_image,
 )
-from warpnerf.scenes.masks import Mask, masks_of_folder
+from warpnerf.scenes.images.masks import Mask, masks_of_folder
 from warpnerf.sfm.config import Lenses
 
 UPRIGHT = {
@@ -54,7 +54,7 @@ class UnposedPhotograph:
 
 
 def read_photographs(
-    paths: Sequence[Path], *, lenses: Lenses, masks: Path | None
+    paths: Sequence[Path], *, lenses: Lenses, masks: Path | None, threads: int | None = None
 ) -> list[UnposedPhotograph]:
     """Look at photographs: whether each is whole, and what it says of its lens.
 
@@ -63,13 +63,14 @@ def read_photographs(
         lenses: Which of them share a lens: those of the same size, camera and focal length by
             EXIF (auto), all (one), or none (each).
         masks: Folder of masks, named after the photographs.
+        threads: That look at them; None: one per usable core.
 
     Returns:
         One for each path.
 
     Raises:
         InputError: Too few, one is no whole photograph or has a name that scenes cannot hold, sizes
-            differ where one lens is asked for, or no mask is there.
+            differ where one lens is requested, or no mask is there.
     """
     if len(paths) < NEEDED:
         raise InputError(
@@ -82,8 +83,8 @@ def read_photographs(
                 f"{printable(str(path))}: a scene's file cannot name it; leave out control "
                 "characters and backslashes."
             )
-    # Decoders release the interpreter lock. COLMAP would go on with half a picture.
-    with ThreadPoolExecutor(usable_cores()) as pool:
+    # Decoders release the interpreter lock. COLMAP would continue with half a picture.
+    with ThreadPoolExecutor(threads or usable_cores()) as pool:
         list(pool.map(require_whole_image, paths))
     keys: dict[object, int] = {}
     photographs = []

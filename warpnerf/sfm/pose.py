@@ -1,4 +1,4 @@
-"""From photographs or a video to a scene: what is asked for, what is done, what came of it."""
+"""Pose estimation: from photographs or a video to a scene, by structure from motion."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from PIL import Image
 
 from warpnerf.checks import InputError
 from warpnerf.runtime.memory import usable_cores
-from warpnerf.scenes.camera import Camera
-from warpnerf.scenes.contents import (
+from warpnerf.scenes.cameras.camera import Camera
+from warpnerf.scenes.cameras.lens import FISHEYE
+from warpnerf.scenes.cameras.undistort import COEFFICIENTS
+from warpnerf.scenes.files import exists, printable
+from warpnerf.scenes.formats.contents import (
     NEEDED,
     VIDEOS,
     photographs_in,
     unread_photographs,
     what_is_there,
 )
-from warpnerf.scenes.files import exists, printable
-from warpnerf.scenes.lens import FISHEYE
-from warpnerf.scenes.masks import read_mask
-from warpnerf.scenes.transforms_text import PosedFile, transforms_text
-from warpnerf.scenes.undistort import COEFFICIENTS
+from warpnerf.scenes.formats.transforms_text import PosedFile, transforms_text
+from warpnerf.scenes.images.masks import read_mask
 from warpnerf.sfm import scene_files
 from warpnerf.sfm.config import Lenses, PoseConfig
 from warpnerf.sfm.frames import sharp_frames
@@ -111,7 +111,9 @@ def pose(
         else:
             paths = photographs_in(source)
         lenses: Lenses = "one" if is_video else config.lenses
-        photographs = read_photographs(paths, lenses=lenses, masks=config.masks)
+        photographs = read_photographs(
+            paths, lenses=lenses, masks=config.masks, threads=config.threads
+        )
         in_scene = {
             **_into_scene([p.path for p in photographs], IMAGES, prepared, output),
             **_into_scene([p.mask.path for p in photographs if p.mask], MASKS, prepared, output),

@@ -18,9 +18,9 @@ from typing import Any
 import msgspec
 
 from warpnerf.checks import InputError
-from warpnerf.scenes.assemble import POSED
-from warpnerf.scenes.contents import holds_scene
 from warpnerf.scenes.files import exists, read_json
+from warpnerf.scenes.formats.assemble import POSED
+from warpnerf.scenes.formats.contents import holds_scene
 from warpnerf.sfm.photographs import put_into
 
 TRANSFORMS = "transforms.json"

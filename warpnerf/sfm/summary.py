@@ -1,4 +1,4 @@
-"""What came of estimating poses, in words."""
+"""Summary of pose estimation, in words."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from warpnerf.scenes.contents import NEEDED
+from warpnerf.scenes.cameras.undistort import COEFFICIENTS
 from warpnerf.scenes.files import printable
-from warpnerf.scenes.undistort import COEFFICIENTS
+from warpnerf.scenes.formats.contents import NEEDED
 from warpnerf.sfm.photographs import UnposedPhotograph
 
 WELL_COVERED = 10
@@ -24,7 +24,7 @@ SHOWN = 12
 
 @dataclass(frozen=True, kw_only=True)
 class Posing:
-    """What came of estimating poses."""
+    """The result of pose estimation."""
 
     folder: Path
     """The scene's."""

@@ -1,9 +1,9 @@
-"""Rendering of rays as a torch operation."""
+"""Differentiable volume rendering of rays as a torch operation."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple, get_args
 
 import numpy as np
@@ -13,12 +13,14 @@ from warpnerf.checks import InputError, require_at_least, require_one_of, requir
 from warpnerf.config import Scaling
 from warpnerf.model.interface import Model
 from warpnerf.model.models import model_of
-from warpnerf.rendering.render import MOST_LINEAR, Steps
+from warpnerf.rendering.steps import MOST_LINEAR, Steps
+from warpnerf.torch.arguments import Head, March, accept_old_spelling
 from warpnerf.torch.launches import Call, Render
 from warpnerf.torch.tensors import (
     corner_of,
     flat_head,
     rays_of,
+    require_constant,
     require_dense,
     require_grid,
 )
@@ -28,7 +30,7 @@ MAX_STEPS = {torch.float32: MOST_LINEAR, torch.float64: 10**9}
 
 
 class RenderedRays(NamedTuple):
-    """What rays see."""
+    """Rendered rays: colour, opacity and depth."""
 
     rgb: torch.Tensor
     """[n_rays, 3], with background."""
@@ -38,22 +40,19 @@ class RenderedRays(NamedTuple):
     """[n_rays] sum of weight times t, scene units."""
 
 
+@accept_old_spelling
 def render_rays(
     raw: torch.Tensor,
     origins: torch.Tensor,
     directions: torch.Tensor,
-    box_min: Sequence[float] | torch.Tensor,
-    box_max: Sequence[float] | torch.Tensor,
+    box: tuple[Sequence[float] | torch.Tensor, Sequence[float] | torch.Tensor],
+    step: float | March,
     *,
-    step: float,
-    near: float = 0.0,
-    far: float | None = None,
     density_shift: float = 0.0,
     background: Sequence[float] | torch.Tensor = (1.0, 1.0, 1.0),
     scaling: Scaling = "none",
     content_distance: float | torch.Tensor = 1.0,
-    model: str | Model = "rgb",
-    head: Iterable[torch.Tensor] = (),
+    head: str | Model | Head = "rgb",
 ) -> RenderedRays:
     """Render rays through a grid of raw values, differentiable with respect to these and the head.
 
@@ -65,34 +64,47 @@ def render_rays(
 
     The gradient is warpnerf's hand-written adjoint (kernels/README.md), in which each sample's
     share is multiplied by its distance scaling. It is then the gradient of no loss: see the paper.
+    Only raw and the head's layers have gradients: rays, box, background and content distance that
+    require grad are refused. A background that is trained is added outside, over a black one:
+    rgb + (1 - opacity)[:, None] * background.
 
     Args:
         raw: [X, Y, Z, 1 + n_features] raw density and raw features, of rgb raw r, g, b, at nodes
-            box_min + index (box_max - box_min) / (size - 1); float32 or float64, CPU or CUDA.
+            box[0] + index (box[1] - box[0]) / (size - 1); float32 or float64, CPU or CUDA.
         origins: [n_rays, 3] scene units, on the same device.
         directions: [n_rays, 3] of unit length.
-        box_min: [3] lower corner, scene units.
-        box_max: [3] upper corner.
-        step: Length of a step, scene units.
-        near: Where the first step begins, scene units.
-        far: No sample at or beyond it, scene units; None: where the box ends.
+        box: Its lower and its upper corner, [3] each, scene units.
+        step: Length of a step, scene units; or a March, where rays do not begin at their origins.
         density_shift: Added to raw densities before their activation.
         background: [3] or [n_rays, 3], rgb.
         scaling: none, quadratic or clamped.
         content_distance: Where gradients reach full strength, scene units; a number or [n_rays].
-        model: rgb, sh, deferred, features, or a model from ``warpnerf.model.models``.
-        head: The model's MLP, as torch.nn.Linear holds it: weight [outputs, inputs] and bias
-            [outputs] of each layer, in turn. Inputs are channels or features, then the encoded
-            direction. Its gradient is scaled where it passes samples, so for features.
+        head: The name of a model without an MLP, the model itself, or a Head.
 
     Returns:
         rgb [n_rays, 3], opacity [n_rays] and depth [n_rays], of raw's type and device.
 
     Raises:
-        InputError: A shape, type, device or number does not fit.
+        InputError: A shape, type, device or number does not fit, or a tensor other than raw and
+            layers requires grad.
     """
+    if not isinstance(box, Sequence) or len(box) != 2:
+        raise InputError(f"box must be its lower and its upper corner, not {box!r}.")
+    box_min, box_max = box
+    length, near, far = step if isinstance(step, March) else March(step)
+    model, layers = head if isinstance(head, Head) else Head(head)
+    for field, value in {
+        "origins": origins,
+        "directions": directions,
+        "box_min": box_min,
+        "box_max": box_max,
+        "density_shift": density_shift,
+        "background": background,
+        "content_distance": content_distance,
+    }.items():
+        require_constant(field, value)
     require_one_of("scaling", scaling, get_args(Scaling))
-    require_positive("step", step)
+    require_positive("step", length)
     require_at_least("near", near, 0.0)
     if far is not None and not far > near:
         raise InputError(f"far must lie beyond near, not at {far}.")
@@ -103,7 +115,7 @@ def render_rays(
     if not isinstance(model, Model):
         raise InputError(f"model must be a name or a model, not {model!r}.")
     require_grid(raw, model)
-    weights = flat_head(list(head), model, raw)
+    weights = flat_head(list(layers), model, raw)
     if raw.shape[3] < model.n_floats:
         raw = torch.nn.functional.pad(raw, (0, model.n_floats - raw.shape[3]))
     corners = corner_of("box_min", box_min), corner_of("box_max", box_max)
@@ -116,8 +128,8 @@ def render_rays(
         raise InputError(
             f"origins and directions must be equally many, not {len(rays[0])} and {len(rays[1])}."
         )
-    length = rays[1].norm(dim=1)
-    if len(length) and not bool(((length - 1.0).abs() < 1e-3).all()):
+    norms = rays[1].norm(dim=1)
+    if len(norms) and not bool(((norms - 1.0).abs() < 1e-3).all()):
         raise InputError(
             "directions must be unit vectors, so that t is a distance; divide them by their length."
         )
@@ -127,13 +139,13 @@ def render_rays(
         else 0.0
     )
     reach += float(np.linalg.norm(corners[1] - corners[0]))
-    if reach / step > (most := MAX_STEPS[raw.dtype]):
+    if reach / length > (most := MAX_STEPS[raw.dtype]):
         raise InputError(
-            f"step {step:g} is too short for rays that reach {reach:g} scene units: more than "
+            f"step {length:g} is too short for rays that reach {reach:g} scene units: more than "
             f"{most} steps; use a longer step, or an origin nearer to the box."
         )
-    for field, value in (("background", background), ("content_distance", content_distance)):
-        require_dense(field, value)
+    require_dense("background", background)
+    require_dense("content_distance", content_distance)
     behind = torch.as_tensor(background, dtype=raw.dtype, device=raw.device).detach()
     if behind.shape not in ((3,), (len(rays[0]), 3)) or not bool(behind.isfinite().all()):
         raise InputError(
@@ -145,7 +157,7 @@ def render_rays(
             "content_distance must be above 0: a number or [n_rays], "
             f"not {content.tolist() if content.dim() == 0 else list(content.shape)}."
         )
-    steps = Steps(near=near, far=min(1e30, math.inf if far is None else far), step=step)
+    steps = Steps(near=near, far=min(1e30, math.inf if far is None else far), step=length)
     call = Call(
         corners=corners,
         steps=steps,

@@ -8,7 +8,7 @@ import torch
 
 from warpnerf.checks import InputError, require_one_of, require_positive
 from warpnerf.config import Scaling
-from warpnerf.torch.tensors import require_dense, require_tensor
+from warpnerf.torch.tensors import require_constant, require_dense, require_tensor
 
 
 def scale_gradient(
@@ -21,7 +21,8 @@ def scale_gradient(
     """Scale the gradients of samples by their distance; call it just before integrating them.
 
     Identity forward. Backward, with s = 1 (none), (t / D)^2 (quadratic) or min(1, (t / D)^2)
-    (clamped): dL/dcolor <- s dL/dcolor, dL/dsigma <- s dL/dsigma.
+    (clamped): dL/dcolor <- s dL/dcolor, dL/dsigma <- s dL/dsigma. What reaches t passes as it is,
+    and s itself is a constant.
     Source: Philip & Deschaintre 2023, "Floaters No More", eq. 7.
 
     Args:
@@ -32,12 +33,13 @@ def scale_gradient(
         scaling: none, quadratic or clamped.
 
     Returns:
-        colors, sigmas and distances, unchanged. No gradient flows to distances.
+        colors, sigmas and distances, unchanged.
 
     Raises:
         InputError: Tensors are not dense floating point on one device, shapes do not fit, or
-            content_distance is not above zero.
+            content_distance is not above zero, or requires grad: D has none.
     """
+    require_constant("content_distance", content_distance)
     require_one_of("scaling", scaling, get_args(Scaling))
     for field, value in (("colors", colors), ("sigmas", sigmas), ("distances", distances)):
         require_tensor(field, value, colors)
@@ -66,17 +68,13 @@ def scale_gradient(
     else:
         require_positive("content_distance", content_distance)
     if scaling == "none":
-        return colors, sigmas, distances.detach()
+        return colors, sigmas, distances
     ratio = distances.detach() / content_distance
     scale = ratio * ratio
     if scaling == "clamped":
         scale = scale.clamp(max=1.0)
     of_color = scale if colors.dim() == distances.dim() else scale.unsqueeze(-1)
-    return (
-        _Scaled.apply(colors, of_color),
-        _Scaled.apply(sigmas, scale),
-        distances.detach(),
-    )
+    return _Scaled.apply(colors, of_color), _Scaled.apply(sigmas, scale), distances
 
 
 class _Scaled(torch.autograd.Function):

@@ -59,6 +59,15 @@ def require_dense(field: str, value: Any) -> None:
         raise InputError(f"{field} must be on the CPU or on CUDA, not on {value.device}.")
 
 
+def require_constant(field: str, value: Any) -> None:
+    """Raise InputError for a tensor whose gradient is requested, where there is none."""
+    if isinstance(value, torch.Tensor) and value.requires_grad and torch.is_grad_enabled():
+        raise InputError(
+            f"{field} requires grad, but no gradient with respect to it is computed; call its "
+            "detach."
+        )
+
+
 def corner_of(field: str, value: Sequence[float] | torch.Tensor) -> np.ndarray:
     """A corner of the box, [3] float64."""
     require_dense(field, value)
@@ -81,7 +90,7 @@ def rays_of(field: str, value: torch.Tensor, raw: torch.Tensor) -> torch.Tensor:
 
 
 def flat_head(head: Sequence[torch.Tensor], model: Model, raw: torch.Tensor) -> torch.Tensor:
-    """The layers in one tensor, as kernels take them; see ``warpnerf_kernels.heads.mlp``."""
+    """The layers in one tensor, as kernels take them; see ``warpnerf_kernels.networks.mlp``."""
     layout = model.layout(loader(PRECISIONS[raw.dtype]))
     if layout is None:
         if len(head):

@@ -1,10 +1,10 @@
-"""How far from the cameras content is, and where, from a short training on a small grid.
+"""Estimation of a scene's extent by a short training on a small grid.
 
 Not every capture brings points, and cameras tell little: what they look at is nearer than most of
 what they see, and where they look outward, or in parallel directions, there is no such thing. So
 photographs without points are trained on for a moment, in a box that may be several times too
-small, with all space around it folded in. What half of the light of a ray has met is a point of the
-scene; what points tell, these tell (``warpnerf.scenes.points.seen_extent``).
+small, with all space around it contracted. What half of the light of a ray has met is a point of
+the scene; what points tell, these tell (``warpnerf.scenes.extent.points.observed_extent``).
 
 Where cameras look at a common point, the box stays around that: what lies behind it is seen, too,
 but is not what the box is for. Elsewhere the box is found as well, and a second round begins with
@@ -19,27 +19,30 @@ from dataclasses import replace
 import numpy as np
 
 from warpnerf.checks import InputError
-from warpnerf.config import MIN_COARSE_STEPS, TrainConfig
-from warpnerf.model.grid import VoxelGrid
-from warpnerf.model.nodes import points_of
+from warpnerf.config import MIN_COARSE_STEPS, GridConfig, TrainConfig
+from warpnerf.fields.dense import DenseGrid
+from warpnerf.fields.nodes import points_of
+from warpnerf.model.sampler_kinds import MARCHED
+from warpnerf.model.storage_kinds import DENSE
 from warpnerf.rendering.field import Field
 from warpnerf.rendering.rays import camera_rays
 from warpnerf.runtime.parallel import Workers
-from warpnerf.scenes.camera import Camera
-from warpnerf.scenes.frustum import contraction_of
-from warpnerf.scenes.points import SeenExtent, seen_extent
+from warpnerf.scenes.cameras.camera import Camera
+from warpnerf.scenes.extent.points import ObservedExtent, observed_extent
 from warpnerf.scenes.scene import Scene, View
-from warpnerf.training.extent import require_grid
+from warpnerf.training.growth import require_room
+from warpnerf.training.plan import TrainingPlan, coarse_steps, resolve
 from warpnerf.training.state import Progress, TrainingState
 from warpnerf.training.trainer import Trainer
 
 ROUNDS = 2
 """Where cameras look at no common point; elsewhere one."""
 VOXELS = 48**3
-STEPS_SHARE = 0.1
-"""Of a training's steps, that a round takes at most."""
 TIME_SHARE = 0.12
-"""The same of its time limit, all rounds together."""
+"""Of a training's time limit, that all rounds together take at most."""
+
+QUICK_BORDER, QUICK_GROWTH = 0.2, 0.1
+"""Of the grid of a short training, and of its steps outside its box: as quick as they can be."""
 
 RAYS = 128
 """Of each camera, at most."""
@@ -60,59 +63,46 @@ NOTHING_SEEN = (
 )
 
 
-def begin(
+def prepare_trainer(
     scene: Scene,
-    config: TrainConfig,
+    config: TrainConfig | TrainingPlan,
     resume: TrainingState | None = None,
     on_progress: Callable[[Progress], None] | None = None,
 ) -> Trainer:
-    """A training before its next update, its extent looked for where need be.
+    """Prepare a trainer, its scene's extent estimated first where its plan says so.
 
     Args:
         scene: What is trained on.
-        config: How.
-        resume: Where to go on; what was found then is used again.
+        config: How; a plan where that is resolved already.
+        resume: Where to resume; what was found then is used again.
         on_progress: Called while the extent is looked for, with the share of that.
 
     Raises:
-        InputError: As for ``Trainer``, and for ``find_sight``.
+        InputError: As for ``Trainer``, and for ``extent_by_training``.
     """
-    sight, seconds = None, 0.0
-    if resume is None and is_needed(scene, config):
-        require_grid(scene, config, Workers(config.device, config.threads).device)
-        sight, seconds = find_sight(scene, config, on_progress)
-        if sight is None:
-            scene = replace(scene, notes=(*scene.notes, NOTHING_SEEN))
-    return Trainer(scene, config, resume, sight=sight, seconds=seconds)
+    if resume is not None:
+        return Trainer(scene, config, resume)
+    plan = config if isinstance(config, TrainingPlan) else resolve(scene, config)
+    if not plan.looks_first:
+        return Trainer(scene, plan)
+    config = plan.config
+    require_room(plan, Workers(config.device, config.threads).device)
+    observed, seconds = extent_by_training(scene, plan, on_progress)
+    if observed is None:
+        scene = replace(scene, notes=(*scene.notes, NOTHING_SEEN))
+    return Trainer(scene, config, observed=observed, seconds=seconds)
 
 
-def is_needed(scene: Scene, config: TrainConfig) -> bool:
-    """Whether a better extent than the scene's is of use, and training long enough to look for it.
-
-    Args:
-        scene: Where it brings points, these tell; cameras of an object with alpha stand around it.
-        config: Where it says a content distance, only a box that is a guess is looked for.
-    """
-    if scene.content_distances is not None or _steps(config) < MIN_COARSE_STEPS:
-        return False
-    if config.content_distance == "per-camera":
-        return True
-    if not scene.unbounded:
-        return config.content_distance == "auto" and not scene.has_alpha
-    folded = config.grid.contraction != "none"
-    return folded and (scene.guessed or config.content_distance == "auto")
-
-
-def find_sight(
+def extent_by_training(
     scene: Scene,
-    config: TrainConfig,
+    plan: TrainingPlan,
     on_progress: Callable[[Progress], None] | None = None,
-) -> tuple[SeenExtent | None, float]:
-    """Find out what the cameras of a scene see, by short trainings.
+) -> tuple[ObservedExtent | None, float]:
+    """Estimate a scene's extent, what its cameras see, by short trainings.
 
     Args:
         scene: Its box and content distance are where the first one begins.
-        config: Of the training that it is for.
+        plan: Of the training that it is for.
         on_progress: Called with each report of these, its fraction that of all of them.
 
     Returns:
@@ -123,55 +113,65 @@ def find_sight(
         InputError: No ray has met anything opaque after all steps, and no content distance is
             given.
     """
+    config, space = plan.config, plan.space.kind
     limit, given = config.time_limit, config.content_distance
     rounds = ROUNDS if scene.guessed else 1
-    contraction = contraction_of(scene, config)
+    contracted = not space.bounded
     small = replace(
         config,
-        steps=_steps(config),
+        steps=coarse_steps(config),
         time_limit=None if limit is None else TIME_SHARE * limit / rounds,
         content_distance="auto" if isinstance(given, str) else given,
         scaling="clamped",  # so that trainings with and without have one extent
         grid=replace(
             config.grid,
             voxels=min(VOXELS, config.grid.voxels),
-            contraction="linf" if contraction == "ndc" else contraction,
+            contraction="linf" if space.has_frustum else space.name,
+            planes=GridConfig.planes,
             grow_at=(),
+            shift_at_growth=0.0,
+            box="scene",
+            border=QUICK_BORDER if contracted else "auto",
         ),
+        march=replace(config.march, growth=QUICK_GROWTH if contracted else "auto"),
+        optim=replace(config.optim, restart_at_growth=False),
+        field=DENSE,
+        sampler=MARCHED,
     )
-    sight, seconds, blind = None, 0.0, False
+    observed, seconds, blind = None, 0.0, False
     for done in range(rounds):
 
         def report(progress: Progress, done: int = done) -> None:
             if on_progress is not None:
                 on_progress(replace(progress, fraction=(done + progress.fraction) / rounds))
 
-        trainer = Trainer(scene, small, sight=sight)
-        leave_out_near(trainer.grid, scene.training_cameras, config.march.near)
+        trainer = Trainer(scene, small, observed=observed)
+        assert isinstance(trainer.storage, DenseGrid)
+        leave_out_near(trainer.storage, scene.training_cameras, config.march.near)
         seconds += trainer.run(report).seconds
         n_steps, field = trainer.steps_done, trainer.field()
         del trainer  # its copy of the photographs, before the next one makes its own
         if n_steps < MIN_COARSE_STEPS:
             break
         points = seen_points(scene, field)
-        found = seen_extent(scene.cameras, points, scene.splits["train"], OUTSIDE)
+        found = observed_extent(scene.cameras, points, scene.splits["train"], OUTSIDE)
         if found is None:
             blind = n_steps == config.coarse_steps and not any(map(len, points))
             break
-        sight = found
+        observed = found
         if isinstance(given, str):
             # cameras' own distances are too rough yet for the next round to follow
             small = replace(small, content_distance=found.content_distance)
-    if sight is None and blind and isinstance(given, str):
+    if observed is None and blind and isinstance(given, str):
         raise InputError(
             f"{scene.name}: {config.coarse_steps} steps of a short training met nothing opaque, so "
             "photographs and poses show no common surface; look at them with `warpnerf inspect`, "
             "or give a content distance (--content-distance) to train all the same."
         )
-    return sight, seconds
+    return observed, seconds
 
 
-def leave_out_near(grid: VoxelGrid, cameras: Sequence[Camera], near: float) -> None:
+def leave_out_near(grid: DenseGrid, cameras: Sequence[Camera], near: float) -> None:
     """Empty for good the nodes that lie nearer than the near plane to a camera: it stood there.
 
     Source: DirectVoxGO, Sun et al. 2022. The camera itself samples nothing there, others would.
@@ -183,17 +183,13 @@ def leave_out_near(grid: VoxelGrid, cameras: Sequence[Camera], near: float) -> N
     """
     if near <= 0.0:
         return
-    points = points_of(grid, np.indices(grid.size).reshape(3, -1).T)
+    points = points_of(grid.lattice, np.indices(grid.lattice.size).reshape(3, -1).T)
     within = np.zeros(len(points), bool)
     for camera in cameras:
         within |= np.square(points - camera.position).sum(axis=1) < near * near
     values = grid.values.numpy()
     values[within, 0] = EMPTY
     grid.values.assign(values)
-
-
-def _steps(config: TrainConfig) -> int:
-    return min(config.coarse_steps, int(STEPS_SHARE * config.steps))
 
 
 def seen_points(scene: Scene, field: Field) -> list[np.ndarray]:
@@ -218,7 +214,7 @@ def median_distances(field: Field, origins: np.ndarray, directions: np.ndarray) 
     Returns:
         [n_rays] scene units; NaN where less than half meets anything.
     """
-    edge = float((field.grid.box_max - field.grid.box_min).max())
+    edge = float((field.lattice.box_max - field.lattice.box_min).max())
     begin = max(NEAREST * edge, field.steps.near)
     far = np.geomspace(begin, max(2.0 * begin, min(FARTHEST * edge, field.steps.far)), DISTANCES)
     opacity = np.stack(

@@ -1,85 +1,31 @@
-"""Where a training looks: the warp of space, the first grid, content distances, steps of rays."""
+"""Scene extent of a training: content distances, reach, ray-marching steps. Needs no Warp."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
-import warp as wp
-from warpnerf_kernels.base.types import vector
 
 from warpnerf.checks import InputError
 from warpnerf.config import MarchConfig, TrainConfig
-from warpnerf.model.grid import (
-    VoxelGrid,
-    grid_size,
-    reach_of_places,
-    require_memory,
-    room_for_nodes,
-)
-from warpnerf.model.interface import Model
-from warpnerf.rendering.render import Steps
-from warpnerf.scenes.focus import find_focus
-from warpnerf.scenes.frustum import FARTHEST, contraction_of, fit_frustum
-from warpnerf.scenes.overlap import views_of_content
+from warpnerf.rendering.steps import Steps
+from warpnerf.scenes.cameras.focus import find_focus
+from warpnerf.scenes.cameras.overlap import views_of_content
+from warpnerf.scenes.extent.frustum import FARTHEST
+from warpnerf.scenes.extent.space import Space, reach_of_places
 from warpnerf.scenes.scene import Scene
 
 FAR_BOXES = 64.0
 """How far an unbounded scene is sampled, in half edges of its box; beyond lies the background."""
 
+GROWTH, MOST_GROWTH = 0.02, 0.1
+"""By which steps outside a box grow, times its border: a wider shell has shorter voxels; and at
+most."""
+
 FEW_VIEWS = 7.0
 """Cameras that see the same content, up to which auto scales all the way to its distance."""
 LEAST_SHARE = 0.5
 """Of the way, that auto scales where many more cameras see the same, and look at no one thing."""
-
-
-def require_grid(scene: Scene, config: TrainConfig, device: wp.Device) -> None:
-    """Raise InputError where the final grid has no place in memory, or the scene no frustum."""
-    first_grid(scene, config, 8, device, None)
-
-
-def first_grid(
-    scene: Scene, config: TrainConfig, n_voxels: int, device: wp.Device, resumed: VoxelGrid | None
-) -> VoxelGrid:
-    """The grid before the first update, all raw values 0.
-
-    Args:
-        scene: Its box, or what its frustum is fitted to.
-        config: The rest.
-        n_voxels: Nodes, about; the final grid has ``config.grid.voxels``.
-        device: Where it lies.
-        resumed: The grid of a training to be resumed: a frustum anew might be rounded otherwise.
-
-    Raises:
-        InputError: The final grid would not fit the memory, or the scene has no frustum.
-    """
-    assert isinstance(config.model, Model)
-    contraction, n_floats = contraction_of(scene, config), config.model.n_floats
-    border = config.grid.border if contraction in ("linf", "l2") else 0.0
-    frustum, box = None, (scene.box_min, scene.box_max)
-    if resumed is not None and resumed.frustum is not None:
-        frustum, box = resumed.frustum, (resumed.box_min, resumed.box_max)
-    elif contraction == "ndc":
-        frustum, box = fit_frustum(scene, config.grid.planes, config.grid.voxels)
-    extent = (box[1] - box[0]) * (1.0 + border)
-    final = grid_size(extent, config.grid.voxels)
-    require_memory(final, n_floats, device)
-    size = grid_size(extent, n_voxels)
-    voxel = float((extent / (np.array(final) - 1)).min())
-    values = room_for_nodes(math.prod(size), vector(n_floats), device)
-    values.zero_()
-    return VoxelGrid(
-        values=values,
-        size=size,
-        box_min=box[0],
-        box_max=box[1],
-        contraction=contraction,
-        border=border,
-        # softplus(shift) is the optical depth of a voxel of the final grid.
-        density_shift=math.log(math.expm1(-math.log1p(-config.grid.alpha_init))),
-        density_scale=1.0 / voxel,
-        frustum=frustum,
-    )
 
 
 def content_distances(scene: Scene, config: TrainConfig) -> tuple[float, list[float]]:
@@ -119,21 +65,26 @@ def content_distances(scene: Scene, config: TrainConfig) -> tuple[float, list[fl
     return one, [one] * len(train)
 
 
-def require_samples(scene: Scene, config: TrainConfig) -> None:
-    """Raise InputError where march.near and march.far leave no sample inside the box to any ray."""
+def require_samples(scene: Scene, space: Space, march: MarchConfig) -> None:
+    """Raise InputError where march.near and march.far leave no sample inside the box to any ray.
+
+    Args:
+        scene: Whose training cameras are asked about.
+        space: That the grid fills.
+        march: How rays are stepped.
+    """
+    low, high = _box_in_scene(scene, space)
     positions = np.array([camera.position for camera in scene.training_cameras])
-    outside = np.maximum(0.0, np.maximum(scene.box_min - positions, positions - scene.box_max))
-    across = np.maximum(np.abs(scene.box_min - positions), np.abs(scene.box_max - positions))
+    outside = np.maximum(0.0, np.maximum(low - positions, positions - high))
+    across = np.maximum(np.abs(low - positions), np.abs(high - positions))
     begin = float(np.linalg.norm(outside, axis=1).min())
     end = float(np.linalg.norm(across, axis=1).max())
-    march = config.march
-    contraction, what = contraction_of(scene, config), "box"
-    if contraction == "ndc":
-        frustum, _ = fit_frustum(scene, config.grid.planes, config.grid.voxels)
-        depths, what = frustum.depths(positions), "frustum"
-        begin = frustum.near - float(depths.max())
-        end = FARTHEST * frustum.near - float(depths.min())
-    elif contraction != "none":
+    what = "box"
+    if space.frustum is not None:
+        depths, what = space.frustum.depths(positions), "frustum"
+        begin = space.frustum.near - float(depths.max())
+        end = FARTHEST * space.frustum.near - float(depths.min())
+    elif space.kind.contracts:
         begin = 0.0  # space outside the box is sampled too
     if march.near >= end:
         raise InputError(
@@ -147,32 +98,48 @@ def require_samples(scene: Scene, config: TrainConfig) -> None:
         )
 
 
-def reach(scene: Scene) -> float:
+def reach(scene: Scene, space: Space) -> float:
     """Distance from the outermost training camera to the farthest corner of the box."""
     places = np.array([scene.views[i].camera.position for i in scene.splits["train"]])
-    return reach_of_places(scene.box_min, scene.box_max, places)
+    return reach_of_places(*_box_in_scene(scene, space), places)
 
 
-def march_steps(march: MarchConfig, grid: VoxelGrid, reach: float) -> Steps:
+def _box_in_scene(scene: Scene, space: Space) -> tuple[np.ndarray, np.ndarray]:
+    """The box of a space; where that is a frustum's, the scene's."""
+    if space.frustum is not None:
+        return scene.box_min, scene.box_max
+    return space.box_min, space.box_max
+
+
+def march_steps(
+    march: MarchConfig, space: Space, size: tuple[int, int, int], reach: float
+) -> Steps:
     """How rays are marched through a grid.
 
     Args:
         march: What is configured.
-        grid: As it stands.
-        reach: See there, scene units: how far steps have one length where space is folded.
+        space: That the grid fills.
+        size: Its nodes along each axis.
+        reach: See there, scene units: how far steps have one length where space is contracted.
     """
-    step = march.step_voxels * float(grid.voxel_size.min())
-    half = float(0.5 * (grid.box_max - grid.box_min).max())
+    step = march.step_voxels * float(space.voxel_edges(size).min())
+    half = float(0.5 * (space.box_max - space.box_min).max())
     far = march.far
     if far is None:
-        far = march.near + FAR_BOXES * half + reach if grid.folded else math.inf
+        far = march.near + FAR_BOXES * half + reach if space.contracted else math.inf
     n_linear = max(0, math.ceil((reach - march.near) / step))
     return Steps(
         near=march.near,
         far=min(far, 1e30),
         step=step,
-        n_linear=n_linear if grid.folded else 0,
-        growth=march.growth if grid.folded else 0.0,
+        n_linear=n_linear if space.contracted else 0,
+        growth=_growth(march, space) if space.contracted else 0.0,
         transmittance_min=march.transmittance_min,
-        in_ndc=grid.frustum is not None,
+        in_ndc=space.frustum is not None,
     )
+
+
+def _growth(march: MarchConfig, space: Space) -> float:
+    if isinstance(march.growth, str):
+        return min(GROWTH / space.border, MOST_GROWTH)
+    return march.growth

@@ -1,28 +1,99 @@
-"""The optimiser: a rule for each kind of parameter, and total variation that joins the gradient."""
+"""The optimiser, Adam: a rule for each kind of parameter."""
 
 from __future__ import annotations
 
-import math
-from typing import Any, ClassVar
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar, Protocol, TypeVar
 
-import numpy as np
 import warp as wp
 from warpnerf_kernels.base import tiles
 from warpnerf_kernels.base.types import vector
-from warpnerf_kernels.optim import adam, total_variation
+from warpnerf_kernels.optim import adam
 
-from warpnerf.config import OptimConfig
-from warpnerf.model.grid import VoxelGrid
-from warpnerf.model.parameters import Parameter
-from warpnerf.rendering.adjoint import Gradients
+from warpnerf.fields.gradients import Gradients
+from warpnerf.fields.parameters import Parameter
+from warpnerf.fields.storage import Storage
+from warpnerf.fields.total_variation import thread_spans
+from warpnerf.model import registry
+from warpnerf.optim_config import OptimConfig
 from warpnerf.runtime.parallel import NODES, Workers
 
 
-class NodesRule:
-    """Adam over the nodes of a grid: where no ray has been, nothing changes."""
+@dataclass(frozen=True)
+class Update:
+    """An update of all parameters."""
+
+    number: int
+    """Counts from 1."""
+    factor: float
+    """On the learning rates."""
+    config: OptimConfig
+    """The rest."""
+
+
+class Rule(Protocol):
+    """How a kind of parameter is updated, and what is kept for that."""
+
+    state_names: ClassVar[tuple[str, ...]]
+    """What ``state`` holds, and checkpoints after the parameter's name."""
+
+    @staticmethod
+    def first_state(parameter: Parameter, workers: Workers) -> dict[str, wp.array]:
+        """What is kept before the first update: by name, of float32, or uint32 as moments are."""
+
+    @staticmethod
+    def resized(
+        name: str, state: dict[str, wp.array], storage: Storage, other: Storage, workers: Workers
+    ) -> dict[str, wp.array]:
+        """The state on another lattice.
+
+        Args:
+            name: Of the parameter.
+            state: On the first lattice.
+            storage: Over the first.
+            other: Over the other one, from ``Storage.resized``.
+            workers: Where to work.
+        """
+
+    @staticmethod
+    def step(
+        parameter: Parameter,
+        state: dict[str, wp.array],
+        gradients: Gradients,
+        update: Update,
+        workers: Workers,
+    ) -> None:
+        """Update a parameter and its state; its gradient is zeroed.
+
+        Args:
+            parameter: Which one.
+            state: Of it.
+            gradients: With its own, by the names that it gives.
+            update: Which one it is, and how far it moves.
+            workers: Where to work.
+        """
+
+
+def adam_struct(update: Update, epsilon: float | None = None) -> adam.Adam:
+    """The numbers of an update that are the same for all entries, as kernels take them.
+
+    Args:
+        update: Which one.
+        epsilon: Of the parameter, if it has one of its own.
+    """
+    config, numbers = update.config, adam.Adam()
+    numbers.beta1, numbers.beta2 = config.beta1, config.beta2
+    numbers.epsilon = config.epsilon if epsilon is None else epsilon
+    numbers.correction1 = 1.0 / (1.0 - config.beta1**update.number)
+    numbers.correction2 = 1.0 / (1.0 - config.beta2**update.number)
+    return numbers
+
+
+class GridAdam:
+    """Lazy Adam over the nodes of a grid: where no ray has been, nothing changes."""
 
     state_names: ClassVar[tuple[str, ...]] = ("moments",)
-    """What ``state`` holds, and checkpoints after the parameter's name."""
 
     @staticmethod
     def first_state(parameter: Parameter, workers: Workers) -> dict[str, wp.array]:
@@ -32,50 +103,38 @@ class NodesRule:
 
     @staticmethod
     def resized(
-        state: dict[str, wp.array], grid: VoxelGrid, other: VoxelGrid, workers: Workers
+        name: str, state: dict[str, wp.array], storage: Storage, other: Storage, workers: Workers
     ) -> dict[str, wp.array]:
-        """The state on another grid, trilinearly read off a first one.
-
-        Args:
-            state: Of the first.
-            grid: The first.
-            other: The other one, from ``VoxelGrid.resized``.
-            workers: Where to work.
-        """
-        moments = state["moments"]
-        out = wp.empty(math.prod(other.size), dtype=moments.dtype, device=workers.device)
-        kernel = adam.resample_moments_kernel(grid.n_floats)
-        grid.resample(kernel, moments, other, out, workers)
-        return {"moments": out}
+        """Moments are read off those of the first lattice."""
+        moments = storage.resized_moments(name, state["moments"], other, workers)
+        return {"moments": moments}
 
     @staticmethod
     def step(
         parameter: Parameter,
         state: dict[str, wp.array],
         gradients: Gradients,
-        update: int,
-        factor: float,
-        config: OptimConfig,
+        update: Update,
         workers: Workers,
     ) -> None:
         """Update nodes from their gradients, which are zeroed."""
         n_floats = len(parameter.learning_rates)
         workers.launch(
             adam.adam_kernel(n_floats),
-            *_stretches(parameter.values, workers),
-            update,
-            vector(n_floats)(*(factor * parameter.learning_rates)),
-            *_adam_arguments(update, config),
-            gradients.struct,
+            *thread_spans(parameter.values, workers),
+            update.number,
+            vector(n_floats)(*(update.factor * parameter.learning_rates)),
+            adam_struct(update, parameter.epsilon),
+            gradients.entries(*parameter.gradient),
             parameter.values,
             state["moments"],
-            at_once=NODES // tiles.STRETCH,
+            at_once=NODES // tiles.NODES_PER_THREAD,
             cache=gradients.launches,
         )
-        gradients.touched.zero_()
+        gradients.arrays[parameter.gradient[1]].zero_()
 
 
-class WeightsRule:
+class WeightsAdam:
     """Adam over weights that all rays share."""
 
     state_names: ClassVar[tuple[str, ...]] = ("mean", "square")
@@ -83,13 +142,13 @@ class WeightsRule:
     @staticmethod
     def first_state(parameter: Parameter, workers: Workers) -> dict[str, wp.array]:
         """Running moments before the first update: [n_weights] each."""
-        return {name: wp.zeros_like(parameter.values) for name in WeightsRule.state_names}
+        return {name: wp.zeros_like(parameter.values) for name in WeightsAdam.state_names}
 
     @staticmethod
     def resized(
-        state: dict[str, wp.array], grid: VoxelGrid, other: VoxelGrid, workers: Workers
+        name: str, state: dict[str, wp.array], storage: Storage, other: Storage, workers: Workers
     ) -> dict[str, wp.array]:
-        """The same: weights do not depend on the grid."""
+        """The same: weights do not depend on the lattice."""
         return state
 
     @staticmethod
@@ -97,18 +156,16 @@ class WeightsRule:
         parameter: Parameter,
         state: dict[str, wp.array],
         gradients: Gradients,
-        update: int,
-        factor: float,
-        config: OptimConfig,
+        update: Update,
         workers: Workers,
     ) -> None:
         """Update weights from the workers' gradients, which are zeroed."""
         workers.launch(
             adam.adam_weights,
             parameter.values.shape[0],
-            factor * float(parameter.learning_rates[0]),
-            *_adam_arguments(update, config),
-            gradients.weights,
+            update.factor * float(parameter.learning_rates[0]),
+            adam_struct(update, parameter.epsilon),
+            gradients.arrays[parameter.gradient[0]],
             parameter.values,
             state["mean"],
             state["square"],
@@ -116,15 +173,49 @@ class WeightsRule:
         )
 
 
-RULES: dict[str, Any] = {"nodes": NodesRule, "weights": WeightsRule}
-"""By kind of parameter."""
+class LinesRule(WeightsAdam):
+    """The same over lines of nodes, which all rays share, but depend on the lattice."""
+
+    @staticmethod
+    def resized(
+        name: str, state: dict[str, wp.array], storage: Storage, other: Storage, workers: Workers
+    ) -> dict[str, wp.array]:
+        """Moments are read off those of the first lattice."""
+        return {
+            key: storage.resized_moments(name, moments, other, workers)
+            for key, moments in state.items()
+        }
+
+
+OPTIMISERS: dict[str, type[Rule]] = {"nodes": GridAdam, "weights": WeightsAdam, "lines": LinesRule}
+"""By name, which a parameter gives."""
+
+AnyRule = TypeVar("AnyRule", bound=type[Rule])
+
+
+def register_rule(name: str) -> Callable[[AnyRule], AnyRule]:
+    """Make a rule known by its name, to parameters and files; a decorator.
+
+    Args:
+        name: Of the rule.
+
+    Raises:
+        ValueError: Another rule has that name.
+    """
+
+    return lambda rule: registry.add(OPTIMISERS, name, rule, "rule")
 
 
 def first_states(
     parameters: tuple[Parameter, ...], workers: Workers
 ) -> dict[str, dict[str, wp.array]]:
-    """What the optimiser keeps of each parameter before the first update, by its name."""
-    return {p.name: RULES[p.kind].first_state(p, workers) for p in parameters}
+    """Initial optimiser state of each parameter, by its name.
+
+    Raises:
+        ValueError: A parameter names a rule that there is not.
+    """
+    rules = {p.name: registry.find(OPTIMISERS, p.rule, "rule") for p in parameters}
+    return {p.name: rules[p.name].first_state(p, workers) for p in parameters}
 
 
 def adam_step(
@@ -136,7 +227,7 @@ def adam_step(
     config: OptimConfig,
     workers: Workers,
 ) -> None:
-    """Update what a model has learned. Source: Kingma & Ba 2015, algorithm 1.
+    """Adam over all parameters of a model. Source: Kingma & Ba 2015, algorithm 1.
 
     Args:
         parameters: Updated; an entry whose gradient is exactly zero is left alone.
@@ -147,67 +238,7 @@ def adam_step(
         config: The rest.
         workers: Where to work.
     """
+    this = Update(update, factor, config)
     for parameter in parameters:
-        RULES[parameter.kind].step(
-            parameter, states[parameter.name], gradients, update, factor, config, workers
-        )
-
-
-def add_total_variation(
-    parameters: tuple[Parameter, ...],
-    grid: VoxelGrid,
-    gradients: Gradients,
-    n_asked: int,
-    n_steps: int,
-    strength: wp.array,
-    config: OptimConfig,
-    workers: Workers,
-) -> None:
-    """Add the gradient of total variation at the nodes that have one already.
-
-    What is added to the gradients of several steps grows with the root of their number: as their
-    noise does at nodes that every step touches, by which Adam divides both.
-
-    Args:
-        parameters: Those that are nodes have weights of it.
-        grid: Where these lie.
-        gradients: Added to.
-        n_asked: Nodes of the grid that the weights are meant for: the final one, or about so.
-        n_steps: Training steps that the gradients are the sum of.
-        strength: Of nodes in a row, see ``warpnerf.training.smoothing``.
-        config: How many updates this one gradient stands for.
-        workers: Where to work.
-    """
-    face = (n_asked / math.prod(grid.size)) ** (2.0 / 3.0)
-    factor = face * config.tv_every * math.sqrt(n_steps)
-    for parameter in parameters:
-        if not np.any(parameter.variation):
-            continue
-        n_floats = len(parameter.variation)
-        workers.launch(
-            total_variation.total_variation_backward_kernel(n_floats),
-            *_stretches(parameter.values, workers),
-            parameter.values,
-            wp.vec3i(*grid.size),
-            vector(n_floats)(*(factor * parameter.variation)),
-            strength,
-            gradients.struct,
-            at_once=NODES // tiles.STRETCH,
-            cache=gradients.launches,
-        )
-
-
-def _adam_arguments(update: int, config: OptimConfig) -> tuple[float, ...]:
-    return (
-        config.beta1,
-        config.beta2,
-        config.epsilon,
-        1.0 / (1.0 - config.beta1**update),
-        1.0 / (1.0 - config.beta2**update),
-    )
-
-
-def _stretches(values: wp.array, workers: Workers) -> tuple[int, int]:
-    """How many threads work on the nodes, and on how many each: a core takes a stretch."""
-    span = 1 if workers.device.is_cuda else tiles.STRETCH
-    return -(-values.shape[0] // span), span
+        state = states[parameter.name]
+        OPTIMISERS[parameter.rule].step(parameter, state, gradients, this, workers)

@@ -1,10 +1,10 @@
-"""A training between two updates, as a value: all that it takes to go on exactly as before."""
+"""A training between two updates, as a value: all that it takes to resume exactly as before."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,9 +13,12 @@ import warp as wp
 from warpnerf.checks import InputError
 from warpnerf.config import TrainConfig
 from warpnerf.model.interface import Model
+from warpnerf.model.sampler_kinds import SamplerKind
+from warpnerf.model.storage_kinds import StorageKind
 from warpnerf.rendering.field import Field
-from warpnerf.scenes.focus import find_focus
+from warpnerf.scenes.cameras.focus import find_focus
 from warpnerf.scenes.scene import Scene
+from warpnerf.training.plan import OlderPlan, TrainingPlan
 
 MAY_CHANGE = ("device", "threads", "checkpoint_every")
 """Fields of TrainConfig that a resumed training may change: what is computed stays the same. The
@@ -24,7 +27,7 @@ first two change how sums are rounded, and so the last bits."""
 
 @dataclass(frozen=True, kw_only=True)
 class Progress:
-    """Where training stands."""
+    """Training progress."""
 
     step: int
     """Steps done."""
@@ -51,22 +54,16 @@ class Progress:
 class TrainingState:
     """A training between two updates. Batches are functions of seed and step: no random state."""
 
-    config: TrainConfig
-    """How it trains; on the CPU with the number of threads that it used."""
+    plan: TrainingPlan | OlderPlan
+    """What it goes by; on the CPU with the number of threads that it used."""
     scene_digest: str
     """``scene_digest`` of what it trains on."""
-    content_distance: float
-    """The one in use, scene units."""
-    content_distances: list[float] | None = None
-    """Those of the training views, scene units; None: they are all that one."""
-    reach: float
-    """From the outermost camera to the farthest corner of the first box, scene units."""
     grown: int
     """How often the grid has grown."""
     updates: int
     """How often the optimiser has updated the grid."""
     restarted: int = 0
-    """Updates before the optimiser last began anew, see ``OptimConfig.restart_at_growth``."""
+    """Updates before the optimiser last restarted, see ``OptimConfig.restart_at_growth``."""
     progress: Progress
     """Where it stands: steps done, seconds, loss."""
     field: Field
@@ -74,12 +71,47 @@ class TrainingState:
     optimiser: dict[str, dict[str, wp.array]]
     """What the optimiser keeps of each parameter, by its name."""
 
+    @property
+    def config(self) -> TrainConfig:
+        """How it trains."""
+        return self.plan.config
+
+    def copied_to(self, device: wp.Device) -> TrainingState:
+        """The same with arrays of its own.
+
+        Args:
+            device: Where they lie.
+
+        Returns:
+            A state that no trainer changes.
+        """
+        optimiser = {
+            name: {key: wp.clone(array, device=device) for key, array in arrays.items()}
+            for name, arrays in self.optimiser.items()
+        }
+        return replace(self, field=self.field.copied_to(device), optimiser=optimiser)
+
+    def plan_of(self, scene: Scene, config: TrainConfig) -> TrainingPlan:
+        """The plan to continue by: the one that it began with.
+
+        Args:
+            scene: What it trains on.
+            config: Its own, but for what may change, see MAY_CHANGE.
+
+        Returns:
+            That plan, with this configuration.
+        """
+        plan = self.plan
+        if isinstance(plan, OlderPlan):
+            plan = plan.completed(scene, self.field.lattice.space)
+        return replace(plan, config=config)
+
     def require_same(self, scene: Scene, config: TrainConfig) -> None:
-        """Raise InputError unless a training of this scene and configuration would go on as begun.
+        """Raise InputError unless this scene and configuration would continue as begun.
 
         Args:
             scene: Photographs and cameras.
-            config: How to go on.
+            config: How to resume.
 
         Raises:
             InputError: A field that decides the result differs, or the photographs do.
@@ -92,10 +124,10 @@ class TrainingState:
             )
 
     def require_same_config(self, config: TrainConfig) -> None:
-        """Raise InputError unless a configuration would go on as begun; see MAY_CHANGE.
+        """Raise InputError unless a configuration would continue as begun; see MAY_CHANGE.
 
         Args:
-            config: How to go on.
+            config: How to resume.
 
         Raises:
             InputError: A field that decides the result differs.
@@ -119,10 +151,25 @@ def _pairs(prefix: str, ours: Any, theirs: Any) -> Iterator[tuple[str, Any, Any]
         name, value, other = field.name, getattr(ours, field.name), getattr(theirs, field.name)
         if is_dataclass(value) and type(value) is type(other):
             yield from _pairs(f"{prefix}{name}.", value, other)
-        elif isinstance(value, Model):
+        elif isinstance(value, Model | StorageKind | SamplerKind):
             yield f"{prefix}{name}", value.name, other.name
         else:
             yield f"{prefix}{name}", value, other
+
+
+def not_finite(what: str, plan: TrainingPlan, step: int) -> FloatingPointError:
+    """The error of a training whose numbers have run away, with what helps against that.
+
+    Args:
+        what: Is not finite: "... is", or "... are".
+        plan: Of the training.
+        step: After which it was seen.
+    """
+    smaller = "smaller weights of losses, " if plan.losses.kinds else ""
+    return FloatingPointError(
+        f"{what} not finite after step {step}; choose a content distance that fits "
+        f"the scene, the clamped scaling, {smaller}or lower learning rates."
+    )
 
 
 def scene_digest(scene: Scene) -> str:

@@ -1,4 +1,4 @@
-"""A whole training, by one call. No files, no terminal."""
+"""Train a voxel radiance field, by one call. No files, no terminal."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from warpnerf.config import TrainConfig
 from warpnerf.presets import PRESETS
 from warpnerf.rendering.field import Field
 from warpnerf.scenes.scene import Scene
-from warpnerf.training.coarse import begin
+from warpnerf.training.coarse import prepare_trainer
 from warpnerf.training.state import Progress, TrainingState
 
 
@@ -48,7 +48,7 @@ def train(
         on_progress: Called every ``trainer.REPORT_EVERY`` steps and at the end.
         on_checkpoint: Called every ``config.checkpoint_every`` seconds and at the end with what
             ``save_checkpoint`` takes, whose arrays the next update changes.
-        resume: Where to go on, from ``load_checkpoint``. On the CPU and with the same number of
+        resume: Where to resume, from ``load_checkpoint``. On the CPU and with the same number of
             threads, the result is that of a training that was never interrupted, bit for bit.
 
     Returns:
@@ -66,11 +66,11 @@ def train(
         require_kind(config, TrainConfig, "train wants a configuration", way_out)
     if config is None:
         config = PRESETS["fast"] if resume is None else resume.config
-    trainer = begin(scene, config, resume)
+    trainer = prepare_trainer(scene, config, resume)
     progress = trainer.run(on_progress, on_checkpoint)
     return TrainResult(
         field=trainer.field(),
-        content_distance=trainer.content_distance,
+        content_distance=trainer.plan.content_distance,
         progress=progress,
         scene=trainer.scene,
     )

@@ -10,24 +10,36 @@ from dataclasses import replace
 import numpy as np
 import warp as wp
 
-from warpnerf.checks import InputError
 from warpnerf.config import TrainConfig
-from warpnerf.model.grid import FreeCells, grid_size
-from warpnerf.model.interface import Model, parts_of
-from warpnerf.model.parameters import Parameter, first_weights, parameters_of
+from warpnerf.fields.gradients import Gradients
+from warpnerf.fields.lattice import Lattice
+from warpnerf.fields.occupancy import FreeCells
+from warpnerf.fields.parameters import Parameter, first_weights, head_parameters
+from warpnerf.fields.storage import Regulariser, TrainedOn
+from warpnerf.model.interface import Model
+from warpnerf.model.storage_kinds import parts_of
 from warpnerf.rendering.field import Field
-from warpnerf.rendering.losses import Minimised
-from warpnerf.rendering.rays import PixelSampler
-from warpnerf.rendering.render import Steps, TrainingPass, march_struct
-from warpnerf.runtime.memory import give_back
+from warpnerf.rendering.losses import Objective
+from warpnerf.rendering.rays import PixelSampler, RayBatch
+from warpnerf.rendering.render import TrainingPass
+from warpnerf.rendering.steps import Steps
+from warpnerf.rendering.structs import march_struct
+from warpnerf.runtime.memory import release_free_memory
 from warpnerf.runtime.parallel import Workers
-from warpnerf.scenes.points import SeenExtent, seen_scene
+from warpnerf.scenes.extent.points import ObservedExtent, with_extent
 from warpnerf.scenes.scene import Scene
-from warpnerf.training import extent
-from warpnerf.training.optim import RULES, adam_step, add_total_variation, first_states
-from warpnerf.training.schedule import Schedule
-from warpnerf.training.smoothing import strengths
-from warpnerf.training.state import Progress, TrainingState, scene_digest
+from warpnerf.training.extent import march_steps, require_samples
+from warpnerf.training.growth import (
+    first_storage,
+    grown_states,
+    grown_storage,
+    occupied_box,
+    require_room,
+)
+from warpnerf.training.optim import adam_step, first_states
+from warpnerf.training.plan import TrainingPlan, resolve
+from warpnerf.training.resampling import first_proposal, grown_proposal, resampling_of
+from warpnerf.training.state import Progress, TrainingState, not_finite, scene_digest
 from warpnerf.training.warmup import training_kernels
 
 REPORT_EVERY = 25
@@ -38,114 +50,105 @@ FIRST_LOOK = 200
 so densities must have had time to show."""
 
 
+Reduce = Callable[[Gradients], None]
+"""Changes the gradients of an update in place, before they are regularised; flags are then those of
+all tiles that hold any."""
+
+
+def no_reduction(gradients: Gradients) -> None:
+    """Leave gradients as they are: one process draws all rays."""
+
+
 class Trainer:
     """A training run between two updates: the grid, its optimiser, and what comes next."""
 
     def __init__(
         self,
         scene: Scene,
-        config: TrainConfig,
+        config: TrainConfig | TrainingPlan,
         resume: TrainingState | None = None,
         *,
-        sight: SeenExtent | None = None,
+        observed: ObservedExtent | None = None,
         seconds: float = 0.0,
+        reduce: Reduce = no_reduction,
     ) -> None:
         """Set up the first update, or the next one of a training to be resumed.
 
         Args:
             scene: What is trained on.
-            config: How.
-            resume: Where to go on.
-            sight: Gives content distances in place of the scene's, and its box where the scene's is
-                a guess, for a new training.
+            config: How; a plan where that is resolved already. A resumed training goes by its own
+                plan, and of this takes what may change (``state.MAY_CHANGE``).
+            resume: Where to resume.
+            observed: Gives content distances in place of the scene's, and its box where the scene's
+                is a guess, for a new training; a plan has been resolved with it.
             seconds: Spent on it so far.
+            reduce: Called with the gradients of each update, once all its rays are through and
+                before total variation: where several processes train, each on rays of its own, it
+                adds theirs.
 
         Raises:
             InputError: The device is missing, the grid would not fit the memory, or scene or
-                configuration are not those of the training to be resumed.
+                configuration are not those of the training to be resumed, or scene and sight not
+                those of the plan.
         """
-        if resume is not None:
-            resume.require_same(scene, config)
-        self.config = config
-        self.workers = Workers(config.device, config.threads)
-        self.steps_done = 0
         self._given = scene
         self._scene_digest = None if resume is None else resume.scene_digest
-        self.sight = sight
+        self.observed = observed
         """What a short training has found; None: the scene's own extent is used."""
-        if sight is not None:
-            scene = seen_scene(scene, sight)
+        if observed is not None:
+            scene = with_extent(scene, observed)
         self.scene = scene
         """What it trains on, with the extent that a new training begins with."""
-        extent.require_samples(scene, config)
+        if resume is not None:
+            asked = config.config if isinstance(config, TrainingPlan) else config
+            resume.require_same(self._given, asked)
+            plan = resume.plan_of(scene, asked)
+        elif isinstance(config, TrainingPlan):
+            plan = config
+        else:
+            plan = resolve(scene, config, looked=True)
+        plan.require_fits(scene)
+        self.plan = plan
+        """What it goes by; nothing is resolved after it."""
+        self.config = config = plan.config
+        self.workers = Workers(config.device, config.threads)
+        require_room(plan, self.workers.device)
         if resume is None:
-            self.content_distance, distances = extent.content_distances(scene, config)
-            self._reach = extent.reach(scene)
-        else:  # estimates anew may be rounded otherwise
-            self.content_distance, self._reach = resume.content_distance, resume.reach
-            n_views = len(scene.splits["train"])
-            distances = resume.content_distances or [resume.content_distance] * n_views
-            if len(distances) != n_views:
-                raise InputError(
-                    f"the training to be resumed has {len(distances)} content distances, but "
-                    f"{scene.name} {n_views} training views; train anew."
-                )
-        self.content_distances = distances
-        """Of the training views, scene units."""
-        self._losses = config.losses_for(scene.kind)
-        if scene.kind == "object" and self._losses.opacity != 0.0:
-            raise InputError(
-                f"loss.opacity is above 0, but photographs of {scene.name} have alpha, and where "
-                "they show nothing, nothing should be; set it to 0 or auto."
-            )
-        views = [scene.views[i] for i in scene.splits["train"]]
-        behind = config.background
-        if behind == "auto":
-            behind = "white" if scene.has_alpha else "black"
-        self._background = _COLOURS[behind] if isinstance(behind, str) else behind
+            require_samples(scene, plan.space, config.march)
+        self.steps_done = 0
         self._sampler = PixelSampler(
-            views,
-            np.array(distances),
-            None if behind == "random" else self._background,
+            [scene.views[i] for i in scene.splits["train"]],
+            np.array(plan.content_distances),
+            None if plan.random_background else plan.background,
             config.rays_per_step,
             config.march.jitter,
             config.seed,
             self.workers,
         )
-        self.schedule = Schedule(config=config, kind=scene.kind)
+        self.schedule = plan.schedule
         self._grown = 0
         self._updates = 0
         self._restarted = 0
         assert isinstance(config.model, Model)
         self.model = config.model
-        self.grid = extent.first_grid(
-            scene,
-            config,
-            config.grid.nodes_after(0, scene.kind),
-            self.workers.device,
-            None if resume is None else resume.field.grid,
-        )
-        idle = config.scaling == "none" or not self.grid.folded
-        if resume is None and idle and config.jacobian != "none":
-            raise InputError(
-                f"jacobian {config.jacobian} does nothing where gradients are not scaled or space "
-                f"is not folded: here scaling is {config.scaling} and grid.contraction "
-                f"{self.grid.contraction}; set it to none."
-            )
-        self.weights = first_weights(self.model, config.seed, self.workers)
-        self.optimiser = first_states(self.parameters(), self.workers)
+        self.reduce = reduce
         self.free = FreeCells.none(self.workers)
         self._report_due = False
         self._started: float | None = None
         self._seconds = seconds
         self._progress: Progress | None = None
-        if resume is not None:
+        if resume is None:
+            self.storage = first_storage(plan, self.workers.device)
+            self.proposal = first_proposal(plan, self.workers.device)
+            self.weights = first_weights(self.model, config.seed, self.workers)
+            self.optimiser = first_states(self.parameters(), self.workers)
+        else:
             self._restore(resume)
         self._occupied = self.free.share()
         self._seen = 1.0
         if resume is not None:
             self._keep_to_what_is_seen()
-        self._pass, self._strength = self._training_pass(), self._smoothing()
+        self._pass, self.regulariser = self._training_pass(), self._regulariser()
 
     def run(
         self,
@@ -198,44 +201,51 @@ class Trainer:
 
         When due, the grid grows and free space is looked for before.
         """
-        config = self.config
         if self._started is None:  # compiling is not training
             for kernel in self._kernels():
                 self.workers.load(kernel)
         fraction = self.fraction
         self._grow(fraction)
-        if self._updates % config.occupancy_every == 0:
+        if self._updates % self.config.occupancy_every == 0:
             self._look_for_free_space()
         before = self.steps_done
-        n_steps = min(self.schedule.steps_an_update(fraction), config.steps - before)
-        batch = self._sampler.draw(before, n_steps)
-        self._pass.run(self.free, batch, n_steps, self._seen)
-        if self._updates % config.optim.tv_every == 0 and fraction < config.optim.tv_until:
-            add_total_variation(
-                self.parameters(),
-                self.grid,
-                self._pass.gradients,
-                config.grid.voxels,
-                n_steps,
-                self._strength,
-                config.optim,
-                self.workers,
-            )
-        self.steps_done += n_steps
-        self._updates += 1
-        adam_step(
-            self.parameters(),
-            self.optimiser,
-            self._pass.gradients,
-            self._updates - self._restarted,
-            self.schedule.rate(fraction, self._grown, n_steps),
-            config.optim,
-            self.workers,
-        )
+        n_steps = min(self.schedule.steps_an_update(fraction), self.config.steps - before)
+        self._differentiate(self._draw(n_steps), n_steps)
+        self.reduce(self._pass.gradients)
+        self._regularise(fraction, n_steps)
+        self._step(fraction, n_steps)
         self._report_due = self.steps_done // REPORT_EVERY > before // REPORT_EVERY
         if self._started is None:  # nor is the first update, in which memory is first touched
             self._started = time.perf_counter() - self._seconds
         self._seconds = time.perf_counter() - self._started
+
+    def _draw(self, n_steps: int) -> RayBatch:
+        """The rays of the next steps, put together."""
+        return self._sampler.draw(self.steps_done, n_steps)
+
+    def _differentiate(self, batch: RayBatch, n_steps: int) -> None:
+        """Add the gradient of a batch's losses to that of the update."""
+        if self._resampling is not None:
+            self._resampling.propose(self.free, batch, self.fraction)
+        self._pass.run(self.free, batch, n_steps, self._seen)
+        if self._resampling is not None:
+            share = n_steps * self._seen
+            self._resampling.learn(batch, share, self._updates, self.fraction)
+
+    def _regularise(self, fraction: float, n_steps: int) -> None:
+        """Add the gradient of the storage's regulariser, where it has one."""
+        if self.regulariser is not None:
+            self.regulariser(self._pass.gradients, self._updates, fraction, n_steps)
+
+    def _step(self, fraction: float, n_steps: int) -> None:
+        """Update what is trained by its gradients, which are zeroed."""
+        self.steps_done += n_steps
+        self._updates += 1
+        rate = self.schedule.rate(fraction, self._grown, n_steps)
+        how = self._updates - self._restarted, rate, self.config.optim
+        adam_step(self._of_field(), self.optimiser, self._pass.gradients, *how, self.workers)
+        if self._resampling is not None:
+            self._resampling.step(self.optimiser, *how)
 
     def report(self) -> Progress:
         """Where training stands.
@@ -249,7 +259,7 @@ class Trainer:
         error = float(self._pass.error.numpy()[:n_rays].mean())
         loss = float(self._pass.loss.numpy()[:n_rays].mean())
         if not math.isfinite(loss):
-            raise self._not_finite("the loss is")
+            raise not_finite("the loss is", self.plan, self.steps_done)
         self._progress = Progress(
             step=self.steps_done,
             fraction=self.fraction,
@@ -257,34 +267,30 @@ class Trainer:
             loss=loss,
             psnr=-10.0 * math.log10(max(error / 3.0, 1e-12)),
             samples_per_ray=float(self._pass.n_samples.numpy()[:n_rays].mean()),
-            size=self.grid.size,
+            size=self.lattice.size,
             occupied=self._occupied,
             seen=self._seen,
         )
         return self._progress
 
     def state(self) -> TrainingState:
-        """All that it takes to go on, in the trainer's own arrays, which the next update changes.
+        """All that it takes to resume, in the trainer's own arrays, which the next update changes.
 
         Raises:
-            FloatingPointError: The loss, or a value in the grid, is not finite: nothing to go on
+            FloatingPointError: The loss, or a value in the grid, is not finite: nothing to resume
                 from.
         """
         progress = self.report()
         for parameter in self.parameters():
             if not np.isfinite(parameter.values.numpy()).all():
-                raise self._not_finite(f"{parameter.name} of the model are")
+                what = f"{parameter.name} of the model are"
+                raise not_finite(what, self.plan, self.steps_done)
         if self._scene_digest is None:  # not before: it takes as long as reading all photographs
             self._scene_digest = scene_digest(self._given)
         threads = self.config.threads if self.workers.device.is_cuda else self.workers.count
         return TrainingState(
-            config=replace(self.config, threads=threads),
+            plan=replace(self.plan, config=replace(self.config, threads=threads)),
             scene_digest=self._scene_digest,
-            content_distance=self.content_distance,
-            content_distances=(
-                self.content_distances if isinstance(self.config.content_distance, str) else None
-            ),
-            reach=self._reach,
             grown=self._grown,
             updates=self._updates,
             restarted=self._restarted,
@@ -293,27 +299,13 @@ class Trainer:
             optimiser=self.optimiser,
         )
 
-    def _not_finite(self, what: str) -> FloatingPointError:
-        smaller = "smaller weights of losses, " if self._losses.kinds else ""
-        return FloatingPointError(
-            f"{what} not finite after step {self.steps_done}; choose a content distance that fits "
-            f"the scene, the clamped scaling, {smaller}or lower learning rates."
-        )
-
     def _restore(self, state: TrainingState) -> None:
         """Take over copies of a state's arrays, and where it stands."""
-
-        def copy(array: wp.array) -> wp.array:
-            return wp.clone(array, device=self.workers.device)
-
+        state = state.copied_to(self.workers.device)
         field = state.field
-        self.grid = field.grid.copied_to(self.workers.device)
-        self.free = replace(field.free, distance=copy(field.free.distance))
-        self.weights = copy(field.weights)
-        self.optimiser = {
-            name: {key: copy(array) for key, array in arrays.items()}
-            for name, arrays in state.optimiser.items()
-        }
+        self.storage, self.weights = field.storage, field.weights
+        self.proposal, self.free = field.proposal, field.free
+        self.optimiser = state.optimiser
         self._grown = state.grown
         self._updates = state.updates
         self._restarted = state.restarted
@@ -321,95 +313,111 @@ class Trainer:
         self.steps_done = state.progress.step
         self._seconds = state.progress.seconds
 
+    @property
+    def lattice(self) -> Lattice:
+        """The nodes over the space that is trained, as they stand."""
+        return self.storage.lattice
+
     def field(self) -> Field:
         """The scene as it stands."""
         return Field(
             model=self.model,
-            grid=self.grid,
+            storage=self.storage,
             weights=self.weights,
             free=self.free,
             steps=self.march_steps(),
-            background=self._background,
+            background=self.plan.background,
             workers=self.workers,
+            proposal=self.proposal,
         )
 
     def march_steps(self) -> Steps:
         """How rays are marched through the grid as it stands."""
-        return extent.march_steps(self.config.march, self.grid, self._reach)
+        return march_steps(self.config.march, self.lattice, self.lattice.size, self.plan.reach)
 
     def parameters(self) -> tuple[Parameter, ...]:
         """What is trained."""
-        return parameters_of(self.model, self.grid, self.weights, self.config.optim)
+        of_proposal = () if self.proposal is None else self.proposal.parameters(self.config.optim)
+        return self._of_field() + of_proposal
+
+    def _of_field(self) -> tuple[Parameter, ...]:
+        of_storage = self.storage.parameters(self.model, self.config.optim)
+        return of_storage + head_parameters(self.model, self.weights)
 
     def _training_pass(self) -> TrainingPass:
+        n_rays = self.config.rays_per_step * self.schedule.most_steps_an_update
+        steps = self.march_steps()
+        self._resampling = resampling_of(n_rays, self.proposal, steps, self.workers)
         return TrainingPass(
-            self.config.rays_per_step * self.schedule.most_steps_an_update,
+            n_rays,
             self.model,
-            self.grid,
+            self.storage,
             self.weights,
-            self.march_steps(),
+            steps if self._resampling is None else self._resampling.intervals,
             self.config.scaling,
             self.config.jacobian,
             self.workers,
-            Minimised(config=self._losses, content_distance=self.content_distance),
+            Objective(config=self.plan.losses, content_distance=self.plan.content_distance),
         )
 
     def _kernels(self) -> list[wp.Kernel]:
         return training_kernels(
             self.model,
-            self.grid.contraction,
+            self.lattice.contraction,
             self.config.scaling,
             self.config.jacobian,
             self.workers.device,
-            self._losses,
+            self.plan.losses,
+            self.config.field,
+            self.config.sampler,
         )
 
     def _grow(self, fraction: float) -> None:
-        """Carry grid and optimiser over to more voxels, once the schedule says so."""
+        """Carry field and optimiser over to more voxels, once the schedule says so."""
         grown = self.schedule.growths(fraction)
         if grown == self._grown or self.steps_done < FIRST_LOOK:
             return
-        box, nodes = self._tight_box(), self.config.grid.nodes_after(grown, self.scene.kind)
-        size = grid_size((box[1] - box[0]) * (1.0 + self.grid.border), nodes)
-        del self._pass  # gives its memory back before more is asked for
-        grid = self.grid.resized(self.workers, size, box)
-        anew = self.config.optim.restart_at_growth
-        if not anew:
-            for parameter in self.parameters():
-                state = self.optimiser[parameter.name]
-                resized = RULES[parameter.kind].resized(state, self.grid, grid, self.workers)
-                self.optimiser[parameter.name] = resized
-        shift = (grown - self._grown) * self.config.grid.shift_at_growth
-        self.grid = replace(grid, density_shift=grid.density_shift - shift)
+        config, box, nodes = self.config, self._tight_box(), self.plan.stages[grown].nodes
+        # What holds the old arrays gives their memory back before more is requested.
+        del self._pass, self._resampling, self.regulariser
+        before, shift = self.storage, (grown - self._grown) * config.grid.shift_at_growth
+        storage = grown_storage(before, box, nodes, shift, self.workers)
+        restarts = config.optim.restart_at_growth
+        if not restarts:
+            of_field = self._of_field()
+            self.optimiser |= grown_states(self.optimiser, of_field, before, storage, self.workers)
+        if self.proposal is not None:
+            self.proposal = grown_proposal(
+                self.proposal, storage.lattice, self.optimiser, config.optim, self.workers
+            )
+        self.storage = storage
         self._grown = grown
-        if anew:
+        if restarts:
             self.optimiser = first_states(self.parameters(), self.workers)
             self._restarted = self._updates
-        give_back()
-        self._pass, self._strength = self._training_pass(), self._smoothing()
+        del before, storage
+        release_free_memory()
+        self._pass, self.regulariser = self._training_pass(), self._regulariser()
         self._look_for_free_space()
 
-    def _smoothing(self) -> wp.array:
-        return strengths(
-            self.grid,
-            self.scene.training_cameras,
-            self.content_distances,
-            self.config.march.near,
-            self.config.scaling if any(np.any(p.variation) for p in self.parameters()) else "none",
-            self.workers,
+    def _regulariser(self) -> Regulariser | None:
+        training = TrainedOn(
+            model=self.model,
+            optim=self.config.optim,
+            voxels=self.config.grid.voxels,
+            cameras=self.scene.training_cameras,
+            distances=self.plan.content_distances,
+            near=self.config.march.near,
+            scaling=self.config.scaling,
         )
+        return self.storage.regulariser(training, self.workers)
 
     def _tight_box(self) -> tuple[np.ndarray, np.ndarray]:
         """The box around what is occupied, where space is bounded; never larger than before."""
-        box_min, box_max = self.grid.box_min, self.grid.box_max
-        if self.grid.folded:
-            return box_min, box_max
+        if self.lattice.contracted or self.config.field.box_is_fixed:
+            return self.lattice.box_min, self.lattice.box_max
         self._find_free_space()
-        occupied = self.free.occupied_range()
-        if occupied is None:
-            return box_min, box_max
-        edges = box_max - box_min
-        return box_min + occupied[0] * edges, box_min + occupied[1] * edges
+        return occupied_box(self.lattice, self.free)
 
     def _look_for_free_space(self) -> None:
         """Find what need not be sampled, nor drawn.
@@ -422,19 +430,18 @@ class Trainer:
         self._keep_to_what_is_seen()
 
     def _keep_to_what_is_seen(self) -> None:
-        """Draw no pixels whose rays meet free space only; in folded space all see something.
+        """Cull the background: draw no pixels whose rays meet free space only.
+
+        In contracted space all see something.
 
         A single cell tells nothing: it is what there is before the first look, too.
         """
         looked = self.free.size != (1, 1, 1)
-        if looked and self.config.skip_empty_rays and self.grid.contraction == "none":
-            self._seen = self._sampler.keep_to(self.grid, self.free)
+        if looked and self.config.skip_empty_rays and self.lattice.kind.bounded:
+            self._seen = self._sampler.cull_background(self.lattice, self.free)
 
     def _find_free_space(self) -> None:
         march = march_struct(self.model, "float32", self.march_steps(), self.workers)
-        sampler = parts_of(self.model, "float32").sampler
-        self.free = FreeCells.of(self.grid, self.workers, march, self.config.alpha_min, sampler)
+        sampler = parts_of(self.model, "float32", self.config.field).sampler
+        self.free = FreeCells.of(self.storage, self.workers, march, self.config.alpha_min, sampler)
         self._occupied = self.free.share()
-
-
-_COLOURS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "random": (1.0, 1.0, 1.0)}

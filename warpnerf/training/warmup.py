@@ -1,4 +1,4 @@
-"""Which kernels a training needs, and having them compiled before anyone waits for them."""
+"""Kernel warm-up: compiling what a training needs before anyone waits for it."""
 
 from __future__ import annotations
 
@@ -9,31 +9,30 @@ from itertools import product
 from typing import get_args
 
 import warp as wp
-from warpnerf_kernels.fields import dense, dense_bound
+from warpnerf_kernels.fields import dense_bound
 from warpnerf_kernels.launch import assembly
-from warpnerf_kernels.optim import adam, total_variation
+from warpnerf_kernels.optim import adam
 from warpnerf_kernels.sampling import coverage, occupancy
 from warpnerf_kernels.space import camera
 
-from warpnerf.config import (
-    Contraction,
-    Jacobian,
-    LossConfig,
-    Scaling,
-    SceneKind,
-    TrainConfig,
-)
+from warpnerf.config import Contraction, Jacobian, LossConfig, Scaling, TrainConfig
+from warpnerf.fields.storages import class_of
 from warpnerf.model.interface import Model
-from warpnerf.presets import EVERYDAY, PRESETS
-from warpnerf.rendering.losses import PLAIN
-from warpnerf.rendering.render import variant_of
+from warpnerf.model.sampler_kinds import MARCHED, ProposedDensity, SamplerKind
+from warpnerf.model.spaces import SPACES
+from warpnerf.model.storage_kinds import DENSE, StorageKind
+from warpnerf.optim_config import SceneKind
+from warpnerf.presets import DEFAULT_PRESETS, PRESETS
+from warpnerf.rendering.losses import PHOTOMETRIC_ONLY, parts_with
+from warpnerf.rendering.proposal import proposing_kernels
+from warpnerf.rendering.structs import variant_of
 from warpnerf.runtime import kernel_cache
 from warpnerf.runtime.parallel import Workers
 
 
 @dataclass(frozen=True, kw_only=True)
-class Warmed:
-    """A kernel that is ready."""
+class CompiledKernel:
+    """A compiled kernel, ready to launch."""
 
     name: str
     """What it is, in words."""
@@ -50,42 +49,77 @@ def training_kernels(
     jacobian: Jacobian,
     device: wp.Device,
     losses: LossConfig,
+    stored: StorageKind = DENSE,
+    sampler: SamplerKind = MARCHED,
 ) -> list[wp.Kernel]:
     """The kernels of a training from its first step to its last; at least one for each module.
 
     Kernels that share a module with one of these are compiled along with it.
     """
-    n_floats, packed = model.n_floats, not device.is_cuda
-    variant = variant_of(model, "float32", contraction, scaling, jacobian, packed, losses)
+    packed = not device.is_cuda
+    variant = variant_of(
+        model, "float32", contraction, scaling, jacobian, packed, losses, stored, sampler
+    )
     return [
         camera.sample_pixels,
         assembly.render_train_kernel(variant),
-        total_variation.total_variation_backward_kernel(n_floats),
-        adam.adam_kernel(n_floats),
+        *class_of(stored).kernels(stored, model),
         adam.adam_weights,
-        adam.resample_moments_kernel(n_floats),
-        dense_bound.find_highest_kernel(n_floats),
         dense_bound.join_highest,
-        occupancy.mark_occupied_kernel(variant.parts.sampler),
+        occupancy.mark_occupied_kernel(
+            parts_with(model, "float32", losses, stored).sampler, variant.space
+        ),
         occupancy.spread_distance,
         coverage.cover_blocks,
-        dense.resample_kernel(n_floats),
+        *proposal_kernels(sampler, contraction, device, learns=True),
     ]
 
 
-def rendering_kernels(model: Model, contraction: Contraction, device: wp.Device) -> list[wp.Kernel]:
+def rendering_kernels(
+    model: Model,
+    contraction: Contraction,
+    device: wp.Device,
+    stored: StorageKind = DENSE,
+    sampler: SamplerKind = MARCHED,
+) -> list[wp.Kernel]:
     """The kernels that render a field; at least one for each module."""
     packed = not device.is_cuda
-    variant = variant_of(model, "float32", contraction, "none", "none", packed)
-    return [camera.camera_rays, assembly.render_forward_kernel(variant)]
+    variant = variant_of(
+        model, "float32", contraction, "none", "none", packed, stored=stored, sampler=sampler
+    )
+    return [
+        camera.camera_rays,
+        assembly.render_forward_kernel(variant),
+        *proposal_kernels(sampler, contraction, device),
+    ]
+
+
+def proposal_kernels(
+    sampler: SamplerKind, contraction: Contraction, device: wp.Device, learns: bool = False
+) -> list[wp.Kernel]:
+    """Those that draw intervals where a sampler has a proposal.
+
+    Args:
+        sampler: Which one.
+        contraction: The space.
+        device: Where they run.
+        learns: Whether the proposal does, and grows.
+    """
+    if sampler == MARCHED or SPACES[contraction].has_frustum:
+        return []
+    made = proposing_kernels(contraction, device)
+    if not learns:
+        return [made.propose_forward]
+    own = class_of(DENSE).kernels(DENSE, ProposedDensity())
+    return [made.propose_forward, made.propose_backward, made.add_bins, *own]
 
 
 def warm_up(
     device: str = "cpu",
-    on_kernel: Callable[[Warmed], None] = lambda kernel: None,
+    on_kernel: Callable[[CompiledKernel], None] = lambda kernel: None,
     configs: Collection[TrainConfig] | None = None,
-) -> list[Warmed]:
-    """Compile whatever trainings and rendering need, in every scaling.
+) -> list[CompiledKernel]:
+    """Warm up the kernel cache: compile all that training and rendering need, in every scaling.
 
     Args:
         device: Where they are to run: cpu, cuda, cuda:1, ...
@@ -99,7 +133,7 @@ def warm_up(
         InputError: The device does not exist, or kernels can be kept nowhere.
     """
     workers = Workers(device, 1)
-    configs = [PRESETS[name] for name in EVERYDAY] if configs is None else configs
+    configs = [PRESETS[name] for name in DEFAULT_PRESETS] if configs is None else configs
     first = next(iter(configs), None)
     wanted: dict[wp.Module, tuple[str, wp.Kernel]] = {}
     for config in configs:
@@ -107,12 +141,21 @@ def warm_up(
         # What is compiled for the first model as well needs no name of its own.
         of_model = "" if first is None or model == first.model else f", {_options_of(model)}"
         for contraction in _contractions(config):
-            for kernel in rendering_kernels(model, contraction, workers.device):
+            for kernel in rendering_kernels(
+                model, contraction, workers.device, config.field, config.sampler
+            ):
                 words = _words(kernel, contraction) + of_model
                 wanted.setdefault(kernel.module, (words, kernel))
             for scaling, losses in product(get_args(Scaling), _losses(config, contraction)):
                 for kernel in training_kernels(
-                    model, contraction, scaling, config.jacobian, workers.device, losses
+                    model,
+                    contraction,
+                    scaling,
+                    config.jacobian,
+                    workers.device,
+                    losses,
+                    config.field,
+                    config.sampler,
                 ):
                     words = _words(kernel, contraction, scaling, losses) + of_model
                     wanted.setdefault(kernel.module, (words, kernel))
@@ -122,20 +165,26 @@ def warm_up(
         start = time.perf_counter()
         workers.load(kernel)
         seconds = time.perf_counter() - start
-        done.append(Warmed(name=name, compiled=compiled, seconds=seconds))
+        done.append(CompiledKernel(name=name, compiled=compiled, seconds=seconds))
         on_kernel(done[-1])
     return done
 
 
 def _contractions(config: TrainConfig) -> tuple[Contraction, ...]:
-    """Those of a configuration; "auto" is none for bounded scenes, and linf or ndc for others."""
+    """Those of a configuration; "auto" is none for bounded scenes, and linf or ndc for others.
+
+    In ndc rays are marched only.
+    """
     chosen = config.grid.contraction
-    return ("none", "linf", "ndc") if chosen == "auto" else (chosen,)
+    if chosen != "auto":
+        return (chosen,)
+    return ("none", "linf", "ndc") if config.sampler == MARCHED else ("none", "linf")
 
 
 def _losses(config: TrainConfig, contraction: Contraction) -> list[LossConfig]:
     """Those of the kinds of scenes that there are in such a space."""
-    kinds: list[SceneKind] = ["object", "bounded"] if contraction == "none" else ["unbounded"]
+    bounded = SPACES[contraction].bounded
+    kinds: list[SceneKind] = ["object", "bounded"] if bounded else ["unbounded"]
     return list(dict.fromkeys(config.losses_for(kind) for kind in kinds))
 
 
@@ -153,12 +202,13 @@ def _words(
     kernel: wp.Kernel,
     contraction: Contraction,
     scaling: Scaling | None = None,
-    losses: LossConfig = PLAIN.config,
+    losses: LossConfig = PHOTOMETRIC_ONLY.config,
 ) -> str:
     """A kernel's name, and what it is compiled for where it has a module to itself."""
     name = str(kernel.key).rpartition("__")[2].replace("_", " ")
+    kind = SPACES[contraction]
+    space = "" if kind.bounded else ", contracted space" if kind.contracts else ", in NDC"
     if not name.startswith("render"):
-        return name
-    space = {"none": "", "ndc": ", in NDC"}.get(contraction, ", space folded in")
+        return name + space if name == "mark occupied" else name
     kinds = "".join(f", {kind}" for kind in losses.kinds)
     return name + space + (f", scaling {scaling}" if scaling else "") + kinds

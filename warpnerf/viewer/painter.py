@@ -8,10 +8,11 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from warpnerf.fields.nodes import cells_within
+from warpnerf.fields.occupancy import FreeCells
 from warpnerf.media.pictures import depth_colours, depth_picture, to_bytes
-from warpnerf.model.grid import FreeCells
 from warpnerf.rendering.field import Field
-from warpnerf.scenes.camera import Camera
+from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.viewer.viewpoint import Viewpoint
 
 Kind = Literal["colour", "depth", "opacity", "near field"]
@@ -118,7 +119,7 @@ class Painter:
             field = replace(field, free=self._crop(index, field, settings.crop))
         if settings.kind == "near field":
             steps = replace(field.steps, far=settings.within, transmittance_min=0.0)
-            opacity = replace(field, steps=steps).render(camera).opacity
+            opacity = replace(field, steps=steps, proposal=None).render(camera).opacity
             # The root, so that a thin veil shows: bright is dense.
             return to_bytes(depth_colours(1.0 - np.sqrt(opacity), 0.0, 1.0))
         rendering = field.render(camera)
@@ -133,7 +134,9 @@ class Painter:
         free, box, cropped = self._cropped.get(index, (None, None, None))
         if cropped is None or free is not field.free or box != crop:
             low, high = np.array(crop)
-            cropped = field.free.cropped(field.grid, low, high, field.workers)
+            cropped = field.free.cropped(
+                field.lattice, cells_within(field.lattice, low, high), field.workers
+            )
             self._cropped[index] = field.free, crop, cropped
         return cropped
 

@@ -35,7 +35,7 @@ class Recorder:
 
         Args:
             viewpoint: Where a page looks from.
-            seconds: Of no matter for the first key.
+            seconds: Ignored for the first key.
         """
         if len(self._keys) >= MOST_KEYS:
             return

@@ -1,8 +1,8 @@
 """What one page shows: coarse while something changes, then fine, piece by piece.
 
 A page is told nothing that it need not know: while its camera moves it gets small pictures, as
-large as the machine can make them in time. When it has come to rest the picture is made anew at
-the resolution of its canvas, in bands of rows, and given up as soon as the camera moves again.
+large as the machine can make them in time. When it has come to rest the picture is rendered again
+at the resolution of its canvas, in bands of rows, and given up as soon as the camera moves again.
 """
 
 from __future__ import annotations

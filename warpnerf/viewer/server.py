@@ -1,7 +1,7 @@
-"""The door to the page: viser's server, told whom to let in.
+"""The web server of the viewer: viser's, with checks of who connects.
 
 A server on 127.0.0.1 can be reached by every page in the browsers of this machine. So whoever
-connects must have asked for this machine by a name of its own, and a page must come from here.
+connects must have requested this machine by a name of its own, and a page must come from here.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ def may_enter(headers: Any, names: set[str]) -> bool:
 
 
 def _guard(host: str, inner: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-    """Turn strangers away before anything else is looked at."""
+    """Refuse unknown hosts and origins before anything else."""
     names = {host.lower(), "localhost", socket.gethostname().lower(), socket.getfqdn().lower()}
 
     def guard(connection: Any, request: Any) -> Any:
@@ -125,7 +125,7 @@ def _guard(host: str, inner: Callable[[Any, Any], Any]) -> Callable[[Any, Any], 
             welcome = False
         if not welcome:
             return connection.respond(
-                HTTPStatus.FORBIDDEN, "Ask for this page by an address of the machine it is on.\n"
+                HTTPStatus.FORBIDDEN, "Open this page by an address of the machine it is on.\n"
             )
         return inner(connection, request)
 

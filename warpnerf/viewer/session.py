@@ -1,4 +1,4 @@
-"""A page being served: its clients, whose turn it is, and how much time pictures get.
+"""A viewer session: its clients, whose turn it is, and how much time pictures get.
 
 All rendering happens in the thread that calls ``work`` or ``serve``: in a training that is the
 training's own, between two updates, so that nothing changes under a picture, and pictures change
@@ -103,8 +103,7 @@ class Session:
         self._world = world
         near, far = depths or (0.0, 2.5 * content_distance)
         settings = Settings(near=near, far=far, within=NEAR_SHARE * content_distance)
-        grid = subjects[0].field().grid
-        box = grid.surroundings
+        box = subjects[0].field().lattice.surroundings
         look = _before(box) if scene is None else first_look(scene.training_cameras)
         require_extra("viser", "viewer", "the viewer")
         self._warm_up(Viewpoint(c2w=look.c2w, fov=look.fov, width=4, height=3), settings)
@@ -147,7 +146,7 @@ class Session:
         close_server(self.server)
 
     def serve(self) -> None:
-        """Draw what pages ask for, until something is raised: by a signal, as a rule."""
+        """Draw what pages request, until something is raised: by a signal, as a rule."""
         while True:
             self._news.clear()
             page, due = self._next()
@@ -174,7 +173,9 @@ class Session:
         except Exception as error:  # whatever is wrong with a page: the training is worth more
             self._pages.clear()
             close_server(self.server)
-            warnings.warn(f"the page failed ({error!r}); training goes on without it", stacklevel=2)
+            warnings.warn(
+                f"the page failed ({error!r}); training continues without it", stacklevel=2
+            )
         self._last = monotonic()
 
     def _spend(self) -> None:

@@ -16,7 +16,7 @@ from PIL import Image
 from warpnerf.checks import InputError
 from warpnerf.media.camera_path import path_lens
 from warpnerf.media.contact_sheet import spread
-from warpnerf.scenes.camera import Camera
+from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.scene import Scene, View
 from warpnerf.viewer.viewpoint import DISTANCE, World, fov_to_see
 

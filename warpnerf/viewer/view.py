@@ -1,4 +1,4 @@
-"""Look at trained fields: one, or two beside each other."""
+"""Interactive viewer of trained fields: one, or two beside each other."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import numpy as np
 from warpnerf.checks import InputError, require_extra
 from warpnerf.media.filming import depth_range
 from warpnerf.rendering.field import Field
+from warpnerf.runs.config import RunConfig
+from warpnerf.runs.run import Run
+from warpnerf.runs.scene import load_run_scene
 from warpnerf.scenes.scene import Scene
-from warpnerf.training.run import Run
-from warpnerf.training.run_config import RunConfig
-from warpnerf.training.run_scene import load_run_scene
 from warpnerf.viewer.painter import Subject
 from warpnerf.viewer.session import Session
 
@@ -26,7 +26,7 @@ def view(
     device: str = "cpu",
     threads: int | None = None,
 ) -> None:
-    """Serve a page in which fields are looked at, until interrupted; print its address.
+    """Serve an interactive viewer of fields in the browser, until interrupted; print its address.
 
     Args:
         shown: A field or the folder of a run; or two, in the same coordinates, to be compared.
@@ -37,8 +37,8 @@ def view(
         threads: For runs, CPU threads; None: one per usable core.
 
     Raises:
-        InputError: viser is missing, a folder holds no field, or host and port cannot be listened
-            at.
+        InputError: viser is missing, a folder holds no field, the scene is none, or host and port
+            cannot be listened at.
     """
     with open_view(
         shown, scene=scene, host=host, port=port, device=device, threads=threads
@@ -78,13 +78,16 @@ def open_view(
         if distance is None:
             distance = config.content_distance
             if not isinstance(scene, Scene):
-                scene = _scene_of(config, scene)
-    assert not isinstance(scene, str)
+                scene = _scene_of(config, scene, threads)
+    if scene is not None and not isinstance(scene, Scene):  # without a run, nothing is read
+        raise InputError(
+            f"scene of the view must be a Scene, not {scene!r}; load_scene gives that of a folder."
+        )
     first = subjects[0].field()
     if scene is not None:
         distance = distance or scene.content_distance
     depths = None if scene is None else depth_range(first, scene.training_cameras)
-    low, high = first.grid.surroundings
+    low, high = first.lattice.surroundings
     half = 0.5 * float(np.linalg.norm(high - low))
     return Session(
         subjects,
@@ -100,10 +103,10 @@ def _subject(name: str, field: Field) -> Subject:
     return Subject(name=name, field=lambda: field)
 
 
-def _scene_of(config: RunConfig, moved: str | None) -> Scene | None:
+def _scene_of(config: RunConfig, moved: str | None, threads: int | None) -> Scene | None:
     print(f"reading {moved or config.scene}", flush=True)
     try:
-        return load_run_scene(config, moved)
+        return load_run_scene(config, moved, threads)
     except InputError as error:
         if moved is not None:
             raise

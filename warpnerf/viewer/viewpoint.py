@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from warpnerf.media.camera_path import MAX_SIDE, path_lens
-from warpnerf.scenes.camera import Camera
-from warpnerf.scenes.focus import up_direction
+from warpnerf.scenes.cameras.camera import Camera
+from warpnerf.scenes.cameras.focus import up_direction
 
 if TYPE_CHECKING:
     import viser
@@ -33,7 +33,7 @@ ASPECT = 4.0 / 3.0
 """Of a window that has not said its own yet."""
 
 NARROWEST, WIDEST = math.radians(1.0), math.radians(170.0)
-"""Fields of view that a page may ask for."""
+"""Fields of view that a page may request."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

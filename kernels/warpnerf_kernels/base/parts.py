@@ -3,21 +3,76 @@
 Each part has a scalar form, which runs on CUDA, in float64 and wherever a vector form is missing,
 and may have a vector form for the CPU: sixteen samples, or the rows of a batch, at a time. Adjoints
 stand directly below. Parts are values that Python can hash, so that kernels made of them are kept.
-A part that differs from another in some functions is ``other.but(name=function)``: it has no vector
-form, unless it is given one too, since that of the other would not do the same.
+A part that differs from another in some functions is ``other.replace(name=function)``: it has no
+vector form, unless it is given one too, since that of the other would not do the same.
 
 Names of arguments in the signatures below:
 
     params      what the part reads, a Warp struct of its own
-    position    of a sample, folded coordinates c (base.types)
+    q, c        normalised and contracted coordinates, see base.types
+    position    of a sample, contracted coordinates c
     raw         what a field holds at a sample, ``vector(n_floats)``: raw density first
-    channels    what is added up along a ray, ``vector(n_channels)``
-    gradient    ``base.types.gradient_type``: added to
+    channels    what is accumulated along a ray, ``vector(n_channels)``
+    gradient    the encoding's ``Gradient``: added to
     packs, slot scratch of a CPU worker: sixteen steps, see volume.pack
     rows, row   scratch of a CPU worker: what belongs to a ray, see volume.walk_packs
 """
 
 from typing import Any, NamedTuple
+
+
+class SpaceVectors(NamedTuple):
+    """The vector form of a space: C++ statements on sixteen steps, with the functions of base.simd.
+
+    sampling.traversal puts them into functions of its own, in which ``box`` and ``ray`` are known.
+    """
+
+    locate: str
+    """Of contract and det_jacobian: changes qx, qy, qz to c, and det_jacobian, which is 1; takes
+    the lanes out of ``active`` that lie outside."""
+    distance: str = ""
+    """Of distance_of and ends: changes t, and takes lanes out of ``active``."""
+    length: str = ""
+    """Of length_of: changes ``length``, the pack's dt, where its t are distances."""
+
+
+class Space(NamedTuple):
+    """In which coordinates rays are straight, and what of space outside the box becomes.
+
+    Steps are placed on q(t) = ray.q_origin + t ray.q_direction, with the box at [-1, 1]^3.
+    """
+
+    contracts: bool
+    """Whether all space outside the box is contracted into a shell around it. If not, nothing is
+    sampled outside, and c is q."""
+    enter: Any
+    """(box, ray, origin, interval of t) -> the ray, which has its direction, with q_origin and
+    q_direction; what of the interval may hold samples."""
+    contract: Any
+    """(box, q) -> c."""
+    det_jacobian: Any
+    """(box, q) -> |det dc/dq|."""
+    boxes_out: Any
+    """(box, c) -> how many half boxes from the middle a place is: 0 in the box, and where c is that
+    of infinity, INFINITELY_FAR."""
+    distance_of: Any
+    """(ray, t) -> how far from its origin a ray is at t, scene units."""
+    length_of: Any
+    """(ray, distance, dt) -> how long a step dt at a distance is, scene units."""
+    ends: Any
+    """(box, distance) -> whether nothing is sampled at a distance and beyond it."""
+    stretch: float = 1.0
+    """contract makes no displacement longer than this: largest component out, length in."""
+    vectors: SpaceVectors | None = None
+    """The vector form, if it has one."""
+
+    def replace(self, **changes: Any) -> "Space":
+        """The same with other functions; see above."""
+        return self._replace(**{"vectors": None, **changes})
+
+
+INFINITELY_FAR = 1.0e30
+"""In half boxes."""
 
 
 class Sampler(NamedTuple):
@@ -35,14 +90,19 @@ class Sampler(NamedTuple):
     step_after: Any
     """(params, ray, t, step) -> the first step after `step` whose sample may lie at t or beyond."""
     longest: Any
-    """(params, box, c, contraction) -> the longest step whose sample can lie where no folded
-    coordinate is larger than c: cells that are free have to be so for it."""
+    """(params, boxes_out) -> the longest step whose sample can lie at most so many half boxes from
+    the middle, as Space.boxes_out says: cells that are free have to be so for it."""
+    keep: Any = None
+    """(params, ray, step, weight) is told what each sample weighs, when a ray is composited; None:
+    nobody asks."""
     place_pack: Any = None
     """Vector form of interval: (params, ray, step, packs, slot) places sixteen steps."""
+    keep_pack: Any = None
+    """Vector form of keep: (params, ray, packs, slot)."""
 
-    def but(self, **changes: Any) -> "Sampler":
+    def replace(self, **changes: Any) -> "Sampler":
         """The same with other functions; see above."""
-        return self._replace(**{"place_pack": None, **changes})
+        return self._replace(**{"place_pack": None, "keep_pack": None, **changes})
 
 
 class EncodingVectors(NamedTuple):
@@ -53,9 +113,9 @@ class EncodingVectors(NamedTuple):
     adj_read_pack: Any
     """Of adj_read: (params, packs, slot, later, worker, sink) adds a pack's adj_raw where the
     worker owns what it was read from, and leaves a record of the rest."""
-    fetch_pack: Any
-    """(params, packs, slot, worker, sink) asks for the memory that adj_read_pack will change, of a
-    ray's first packs; adj_read_pack asks for that of later ones."""
+    prefetch_gradient: Any
+    """(params, packs, slot, worker, sink) prefetches the memory that adj_read_pack will change, of
+    a ray's first packs; adj_read_pack prefetches that of later ones."""
     add_records: Any
     """(params, worker, sender, sink) adds what a sender has left for a worker."""
     Record: Any
@@ -66,6 +126,11 @@ class EncodingVectors(NamedTuple):
     after the first four in ``adj_by_sample``, zeros where there is none."""
     pack_fields: tuple[tuple[str, Any], ...] = ()
     """Fields of a pack that are its own: names and types."""
+    record_bytes: int | None = None
+    """What a record counts for where there is room for so many; None: all that it takes."""
+    begin: Any = None
+    """(params, worker) before a worker's first ray of a launch that ends in a gradient, such as to
+    lay out a decoder again; None: nothing."""
 
 
 class Encoding(NamedTuple):
@@ -74,18 +139,22 @@ class Encoding(NamedTuple):
     n_floats: int
     """Numbers read at a position: raw density, features, and padding that nothing looks at."""
     Params: Any
-    """Struct of the stored values."""
+    """Struct of the stored values, in as many arrays as there are."""
+    Gradient: Any
+    """Struct of their gradient: what ``adj_read`` adds to, and ``weights``, [n_workers, n] with a
+    copy for each worker, which a head's adjoints add to. ``base.types.gradient_type`` where all is
+    in one array."""
     read: Any
     """(params, position) -> raw."""
     adj_read: Any
-    """(params, position, adj_raw, gradient) hands adj_raw to what it was read from."""
+    """(params, position, adj_raw, gradient) scatters adj_raw to what raw was interpolated from."""
     place: Any
     """(params, position) -> where it lies in the field, [0, 1]^3; workers own parts along the first
     axis, and take rays by it."""
     vectors: EncodingVectors | None = None
     """The vector form, if it has one."""
 
-    def but(self, **changes: Any) -> "Encoding":
+    def replace(self, **changes: Any) -> "Encoding":
         """The same with other functions; see above."""
         return self._replace(**{"vectors": None, **changes})
 
@@ -103,12 +172,14 @@ class HeadVectors(NamedTuple):
     """Of decode: (params, rows, row, packs, slot, n) for n packs of a ray, from raw and weight to
     channel."""
     adj_decode_pack: Any
-    """Of adj_decode: (params, rows, row, packs, slot, n, worker, gradient) from weight, scale and
-    the row's adj_channels to adj_raw, but for the density's."""
+    """(by_sample) -> of adj_decode: (params, rows, row, packs, slot, n, worker, gradient) from
+    weight, scale and what flows back to channels to adj_raw, but for the density's. What flows
+    back is the row's adj.channels or, ``by_sample``, the pack's adj_channel, each sample's own.
+    ``heads.rgb.decoding`` makes it of C++."""
     shade_rows: Any
     """Of shade: (params, rows, row, n) for n rays, from channels and transmittance to rgb."""
     adj_shade_rows: Any
-    """Of adj_shade: (params, rows, row, n, worker, gradient) from adj_rgb to adj_channels and
+    """Of adj_shade: (params, rows, row, n, worker, gradient) from adj_rgb to adj.channels and
     adj_opacity."""
     pack_fields: tuple[tuple[str, Any], ...] = ()
     """Fields of a pack that are its own: names and types."""
@@ -118,41 +189,31 @@ class HeadVectors(NamedTuple):
     """Packs of a ray that are decoded together, at most."""
     batch: int = 1
     """Rays whose rows are shaded together."""
-    adj_decode_pack_with_colours: Any = None
-    """adj_decode_pack where the loss is on samples as well: what flows back to a sample's colour is
-    the row's adj_channels, and its sample_slope times the colour's difference from target_rgb. For
-    heads of samples; with such a loss, one without it runs in the scalar form."""
-
-    def but(self, **changes: Any) -> "HeadVectors":
-        """The same with other functions. ``adj_decode_pack_with_colours`` has to be given, too:
-        that of the other would not do the same.
-        """
-        return self._replace(**{"adj_decode_pack_with_colours": None, **changes})
 
 
 class Head(NamedTuple):
-    """From features of samples to channels that are added up along the ray, and on to colour.
+    """From features of samples to channels that are composited along the ray, and on to colour.
 
-    A head of samples decodes each one's features to red, green and blue, and hands on what was
-    added up as it is. A head of rays adds up features, and shades each ray once.
+    A head of samples decodes each one's features to red, green and blue, and passes their sum on as
+    it is. A head of rays accumulates features, and shades each ray once.
     """
 
     n_channels: int
-    """Channels added up along a ray."""
+    """Channels accumulated (alpha-composited) along a ray."""
     Params: Any
     """Struct of what the head reads besides features: the weights of an MLP, or Nothing."""
-    View: Any
-    """Vector type of what depends on the direction of view, worked out once a ray."""
+    ViewFeatures: Any
+    """Vector type of what depends on the direction of view, computed once a ray."""
     prepare: Any
     """(params, direction) -> view."""
     adj_prepare: Any
     """(params, direction, adj_view, gradient) once a ray, after its samples."""
     decode: Any
     """(params, view, raw) -> channels of a sample, each of which lies in [0, 1]: what lies behind a
-    sample is bounded by that, see volume.walk.behind_limit."""
+    sample is bounded by that, see volume.walk.suffix_limit."""
     adj_decode: Any
-    """(params, view, raw, channels, adj_channels, gradient) -> adj_raw, whose first entry, that of
-    the density, is 0, and adj_view."""
+    """(params, view, raw, channels, adj_channels, gradient) -> adj_raw, as long as raw, whose
+    first entry, that of the density, is 0, and adj_view, as long as view."""
     shade: Any
     """(params, direction, channels, opacity) -> rgb before the background, once a ray."""
     adj_shade: Any
@@ -162,7 +223,7 @@ class Head(NamedTuple):
     vectors: HeadVectors | None = None
     """The vector form, if it has one."""
 
-    def but(self, **changes: Any) -> "Head":
+    def replace(self, **changes: Any) -> "Head":
         """The same with other functions; see above."""
         return self._replace(**{"vectors": None, **changes})
 
@@ -205,17 +266,56 @@ class RayLoss(NamedTuple):
     adj_transmittance: Any = None
     """(params, transmittance) -> dL/dtransmittance of what passes all samples; None: 0."""
     adj_density: Any = None
-    """(params, t) -> dL/draw density of a sample, besides what its weight hands on; None: 0."""
+    """(params, t) -> dL/draw density of a sample, besides what its weight passes on; None: 0."""
     vectors: RayLossVectors | None = None
     """The vector form. Without one, packs call the scalar functions, one sample after the other."""
 
-    def but(self, **changes: Any) -> "RayLoss":
+    def replace(self, **changes: Any) -> "RayLoss":
+        """The same with other functions; see above."""
+        return self._replace(**{"vectors": None, **changes})
+
+
+class SampleLossVectors(NamedTuple):
+    """The vector form of a loss on samples: sixteen at a time."""
+
+    add_pack: Any
+    """Of add: (params, state, target_rgb, packs, slot) -> state with a pack's samples, whose
+    weights are in its colour_weight: 0 where a sample has no colour."""
+    adj_add_pack: Any
+    """Of adj_channels: (params, adj_value, target_rgb, packs, slot) adds to the pack's adj_channel.
+    What it adds for samples that have no colour is not looked at."""
+    pack_fields: tuple[tuple[str, Any], ...] = ()
+    """Fields of a pack that are its own: names and types."""
+
+
+class SampleLoss(NamedTuple):
+    """A loss over the colours of a ray's samples, each times the sample's weight, which counts as a
+    constant: it reaches colours only. For heads of samples, whose channels are colours. Samples
+    that have none, as they weigh no more than the head's ``weight_min``, do not count.
+    """
+
+    Params: Any
+    """Struct of numbers that are known when kernels run."""
+    State: Any
+    """Struct of sums over the samples so far, zeros before the first."""
+    add: Any
+    """(params, state, weight, channels, target_rgb) -> state with one more sample."""
+    value: Any
+    """(params, state, channels, target_rgb) -> the loss, from all samples; here channels are the
+    ray's, sums of weight times channel."""
+    adj_channels: Any
+    """(params, channels, target_rgb, adj_value) -> what flows back to a sample's channels, over its
+    weight."""
+    vectors: SampleLossVectors | None = None
+    """The vector form. Without one, packs call the scalar functions, one sample after the other."""
+
+    def replace(self, **changes: Any) -> "SampleLoss":
         """The same with other functions; see above."""
         return self._replace(**{"vectors": None, **changes})
 
 
 class Photometric(NamedTuple):
-    """What a rendered ray's colour is held against its pixel by."""
+    """A photometric loss: it compares a rendered ray's colour with its pixel."""
 
     Params: Any
     """Struct of numbers that are known when kernels run."""
@@ -232,6 +332,5 @@ class Losses(NamedTuple):
     """Of the ray's colour."""
     on_ray: RayLoss
     """Of its samples' weights; several are one by ``volume.ray_loss.sum_of``."""
-    on_samples: bool = False
-    """Whether colours of single samples are held against the pixel as well: volume.sample_loss.
-    For heads of samples, whose channels are colours."""
+    on_samples: SampleLoss
+    """Of its samples' colours."""

@@ -1,9 +1,10 @@
-"""Tiles: runs of nodes along z, flagged where gradient was added; the rest is passed over.
+"""Tiles: runs of nodes along z, flagged where gradient was added; the rest is skipped.
 
 A pair of nodes along z flags the tile that its lower node lies in. So a tile may hold gradient if
 it is flagged itself, or if the one before is, whose last pair may reach into it.
 """
 
+from functools import cache
 from typing import Any
 
 import warp as wp
@@ -11,7 +12,7 @@ import warp as wp
 TILE = 4
 """Nodes in a tile: in float32, a cache line for every four numbers of a node."""
 
-STRETCH = 256
+NODES_PER_THREAD = 256
 """Nodes that a thread on the CPU works on."""
 
 GROUP = 8
@@ -86,7 +87,7 @@ def first_of(tiles: wp.uint64) -> int:
 
 
 @wp.func
-def but_first(tiles: wp.uint64) -> wp.uint64:
+def without_first(tiles: wp.uint64) -> wp.uint64:
     """The same tiles without the first."""
     return tiles & (tiles - wp.uint64(1))
 
@@ -103,3 +104,38 @@ for (size_t at = 0; at < TILE * sizeof(*values.data); at += 64) __builtin_prefet
 def prefetch(values: wp.array(dtype=Any), node: int):
     """Bring a tile's cache lines in, ahead of its use; CUDA has other ways to wait."""
     ...
+
+
+@cache
+def tile_loop(prefetch_tile: Any, work: Any) -> wp.Function:
+    """The function over_tiles(on, touched, start, end): work on tiles that may hold gradient.
+
+    Args:
+        prefetch_tile: (on, node) prefetches, on the CPU, a tile that is worked on later.
+        work: (on, node, begin, end) works on nodes begin to end - 1, of the tile that node begins.
+    """
+
+    @wp.func
+    def over_tiles(
+        on: Any,  # struct of what both functions take
+        touched: wp.array(dtype=wp.uint8),  # [n_tiles]
+        start: int,  # node to begin with
+        end: int,  # one past the last
+    ):
+        last = tile_of(end - 1) + 1
+        for group in range(tile_of(start), last, wp.static(GROUP)):
+            # In turns: requests for all tiles at once would hold up what the work has to read.
+            ahead = tiles_ahead(touched, group, last)
+            tiles = touched_tiles(touched, group, last)
+            while tiles != wp.uint64(0) or ahead != wp.uint64(0):
+                if ahead != wp.uint64(0):
+                    prefetch_tile(
+                        on, (group + wp.static(AHEAD) + first_of(ahead)) * wp.static(TILE)
+                    )
+                    ahead = without_first(ahead)
+                if tiles != wp.uint64(0):
+                    node = (group + first_of(tiles)) * wp.static(TILE)
+                    work(on, node, wp.max(start, node), wp.min(end, node + wp.static(TILE)))
+                    tiles = without_first(tiles)
+
+    return over_tiles

@@ -62,7 +62,7 @@ class Frustum:
 
 @wp.struct
 class Box:
-    """The region that is trained, and how space outside of it is folded into a shell around it.
+    """The region that is trained, and how space outside of it is contracted into a shell around it.
 
     Its coordinates are those of the scene, or those of the frustum.
     """
@@ -75,11 +75,11 @@ class Box:
 
 @wp.struct
 class FreeSpace:
-    """Where nothing needs sampling: over the folded box, cells of their own size."""
+    """Where nothing needs sampling: over the contracted box, cells of their own size."""
 
     distance: wp.array(dtype=wp.uint8)  # [MX * MY * MZ] cells to the nearest occupied one, 0 there
     size: wp.vec3i  # MX, MY, MZ
-    to_cells: vec3  # folded coordinates to cells: m = c to_cells + size / 2
+    to_cells: vec3  # contracted coordinates to cells: m = c to_cells + size / 2
 
 
 @cache
@@ -93,6 +93,17 @@ def gradient_type(n_floats: int) -> type:
         weights: wp.array2d(dtype=real)  # [n_workers, n_weights] a copy for each worker
 
     return Gradient
+
+
+@wp.struct
+class Rays:
+    """Rays of a launch."""
+
+    origins: wp.array(dtype=vec3)  # [n_rays] scene units
+    directions: wp.array(dtype=vec3)  # [n_rays] unit vectors
+    offsets: wp.array(dtype=real)  # [n_rays] or [1], in [0, 1)
+    background: wp.array(dtype=vec3)  # [n_rays] or [1], rgb in [0, 1]
+    content_distance: wp.array(dtype=real)  # [n_rays] or [1], scene units; for gradients
 
 
 @wp.struct
@@ -130,4 +141,4 @@ class Sample:
     t: real  # distance from the ray's origin, scene units
     dt: real  # step length, in the coordinates of the box
     det_jacobian: real  # |det J| of the contraction, 1 without
-    position: vec3  # folded coordinates c
+    position: vec3  # contracted coordinates c

@@ -1,4 +1,4 @@
-"""Deferred scatter: how gradients of samples get into a field on a CPU with several workers.
+"""Deferred scatter-add: how gradients of samples get into a field on a CPU with several workers.
 
 Rays cross the field in every direction; adding as they go, threads would race for its entries. So
 each worker owns a part, and is the only one to add to it. What its rays have for its own part it
@@ -16,7 +16,6 @@ from typing import Any
 import warp as wp
 
 from ..base.parts import Encoding
-from ..base.types import gradient_type
 from .barrier import wait_for_all
 from .schedule import Chunk
 
@@ -30,34 +29,34 @@ def sink_type(encoding: Encoding) -> type:
     @wp.struct
     class Sink:
         records: wp.array2d(dtype=encoding.vectors.Record)  # [n_workers, n_packs] by sender
-        addressed: wp.array3d(dtype=wp.int32)  # [n_workers, n_workers, n_packs] by sender and
+        recipients: wp.array3d(dtype=wp.int32)  # [n_workers, n_workers, n_packs] by sender and
         # receiver: which of the records are for whom
         # How many there are of both, by sender, in rows of whole cache lines, which no two workers
         # share:
         n_records: wp.array2d(dtype=wp.int32)  # [n_workers, row] in the first column
-        n_addressed: wp.array2d(dtype=wp.int32)  # [n_workers, row] by receiver
-        gradient: gradient_type(encoding.n_floats)  # where it all goes
+        n_recipients: wp.array2d(dtype=wp.int32)  # [n_workers, row] by receiver
+        gradient: encoding.Gradient  # where it all goes
         chunk: Chunk  # whose rays they are from
 
     return Sink
 
 
 @wp.func
-def leave_none(worker: int, sink: Any):
-    """Forget what a worker left in the last chunk."""
+def clear_records(worker: int, sink: Any):
+    """Clear the records that a worker left in the last chunk."""
     sink.n_records[worker, 0] = 0
     for receiver in range(sink.records.shape[0]):
-        sink.n_addressed[worker, receiver] = 0
+        sink.n_recipients[worker, receiver] = 0
 
 
 @cache
-def delivery(encoding: Encoding) -> wp.Function:
-    """The function that ends a chunk: deliver(params, worker, sink)."""
+def record_applier(encoding: Encoding) -> wp.Function:
+    """The function that ends a chunk: apply_records(params, worker, sink)."""
     Params, Sink = encoding.Params, sink_type(encoding)
     add_records = encoding.vectors.add_records
 
     @wp.func
-    def deliver(params: Params, worker: int, sink: Sink):
+    def apply_records(params: Params, worker: int, sink: Sink):
         """Once the rays of all workers are through, add what is left in records for a worker."""
         n_workers = sink.records.shape[0]
         if n_workers > 1:
@@ -65,4 +64,4 @@ def delivery(encoding: Encoding) -> wp.Function:
                 for sender in range(n_workers):
                     add_records(params, worker, sender, sink)
 
-    return deliver
+    return apply_records

@@ -1,4 +1,4 @@
-"""Which worker of a CPU takes which rays, and in which order.
+"""Ray scheduling on the CPU: which worker takes which rays, and in which order.
 
 A batch's rays are random. Walked as they come, each finds the memory that it needs in no cache; so
 rays whose middles lie close together follow each other. And the more of a ray goes through the part
@@ -11,12 +11,11 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from ..base.parts import Encoding, Sampler
+from ..base.parts import Encoding, Sampler, Space
 from ..base.simd import LANES
 from ..base.types import Box, real, vec3
 from ..cpu.barrier import wait_for_all
 from ..sampling.traversal import traversal
-from ..space.contraction import contract
 
 wp.set_module_options({"enable_backward": False})
 
@@ -35,7 +34,7 @@ CELLS = ACROSS**3
 
 @wp.struct
 class Chunk:
-    """The rays of a batch that are put through together: as many as there is room for."""
+    """The rays of a batch that are processed together: as many as there is room for."""
 
     begin: int  # ray to begin with
     end: int  # after the last one of the batch
@@ -46,7 +45,7 @@ class Chunk:
     # In a row for each worker:
     work_before: wp.array2d(dtype=wp.int64)  # [n_workers, ACROSS] scratch
     rays_before: wp.array2d(dtype=wp.int32)  # [n_workers, CELLS] scratch
-    drawn: wp.array2d(dtype=wp.int32)  # [n_workers, n_rays] scratch: its rays as they come
+    candidates: wp.array2d(dtype=wp.int32)  # [n_workers, n_rays] scratch: its rays as they come
     rays: wp.array2d(dtype=wp.int32)  # [n_workers, n_rays] its rays by cell
     barrier: wp.array(dtype=wp.int32)  # of the workers
 
@@ -76,7 +75,7 @@ def slab_of(cell: int) -> int:
 
 
 @wp.func
-def pick_out(worker: int, chunk: Chunk) -> int:
+def select_rays(worker: int, chunk: Chunk) -> int:
     """Put a worker's rays of the chunk into its row, in the order of cells; how many they are.
 
     The chunk's are the next ones, as many as there is room for, but one at least. One slab after
@@ -105,7 +104,7 @@ def pick_out(worker: int, chunk: Chunk) -> int:
         before += here
     for cell in range(wp.static(CELLS)):
         chunk.rays_before[worker, cell] = 0
-    n_drawn = int(0)
+    n_candidates = int(0)
     for i in range(chunk.begin, last):
         cell = chunk.cells[i]
         slab = slab_of(cell)
@@ -114,33 +113,34 @@ def pick_out(worker: int, chunk: Chunk) -> int:
         # A ray is that of worker n_workers * before // total.
         beyond = wp.int64(n_workers) * before - wp.int64(worker) * total
         if beyond >= wp.int64(0) and beyond < total:
-            chunk.drawn[worker, n_drawn] = i
-            n_drawn += 1
+            chunk.candidates[worker, n_candidates] = i
+            n_candidates += 1
             chunk.rays_before[worker, cell] += 1
     place = int(0)
     for cell in range(wp.static(CELLS)):  # from the rays of a cell to where they begin
         n = chunk.rays_before[worker, cell]
         chunk.rays_before[worker, cell] = place
         place += n
-    for k in range(n_drawn):
-        i = chunk.drawn[worker, k]
+    for k in range(n_candidates):
+        i = chunk.candidates[worker, k]
         place = chunk.rays_before[worker, chunk.cells[i]]
         chunk.rays_before[worker, chunk.cells[i]] = place + 1
         chunk.rays[worker, place] = i
-    return n_drawn
+    return n_candidates
 
 
 @cache
-def ray_schedule(sampler: Sampler, encoding: Encoding) -> SimpleNamespace:
-    """The functions that look at rays: measure_ray, and take_share that uses it.
+def ray_schedule(sampler: Sampler, encoding: Encoding, space: Space) -> SimpleNamespace:
+    """The functions that look at rays: measure_ray, and assign_rays that uses it.
 
     Args:
         sampler: Where steps lie.
         encoding: Which place of the field a position has.
+        space: What position a place has.
     """
     Steps, Field = sampler.Params, encoding.Params
     edge, place_in_field = sampler.edge, encoding.place
-    prepare_ray = traversal(sampler).prepare_ray
+    prepare_ray, contract = traversal(sampler, space).prepare_ray, space.contract
 
     @wp.func
     def measure_ray(
@@ -150,20 +150,19 @@ def ray_schedule(sampler: Sampler, encoding: Encoding) -> SimpleNamespace:
         field: Field,
         origins: wp.array(dtype=vec3),  # [n_rays] scene units
         directions: wp.array(dtype=vec3),  # [n_rays] unit vectors
-        contraction: int,
         chunk: Chunk,  # its work and cells are written
     ):
         """How much work a ray is, and where its middle step lies."""
-        ray = prepare_ray(box, march, i, origins[i], directions[i], real(0.0), contraction)
+        ray = prepare_ray(box, march, i, origins[i], directions[i], real(0.0))
         t = wp.min(edge(march, ray, (ray.begin + ray.end) // 2), march.far)
-        c = contract(ray.q_origin + t * ray.q_direction, box.border, contraction)
-        # A pack more where the last one is full: a step more or less is a matter of rounding.
+        c = contract(box, ray.q_origin + t * ray.q_direction)
+        # A pack more where the last one is full: a step more or less depends on rounding.
         n_packs = (ray.end - ray.begin) // wp.static(LANES) + 1
         chunk.work[i] = n_packs * wp.static(LANES) + wp.static(RAY)
         chunk.cells[i] = cell_at(place_in_field(field, c))
 
     @wp.func
-    def take_share(
+    def assign_rays(
         worker: int,
         chunk: Chunk,
         box: Box,
@@ -171,9 +170,8 @@ def ray_schedule(sampler: Sampler, encoding: Encoding) -> SimpleNamespace:
         field: Field,
         origins: wp.array(dtype=vec3),  # [n_rays] scene units
         directions: wp.array(dtype=vec3),  # [n_rays] unit vectors
-        contraction: int,
     ) -> int:
-        """pick_out, once all rays are measured; 0 where a worker never came.
+        """select_rays, once all rays are measured; 0 where a worker never came.
 
         All workers call it at the same time. A batch's rays are measured in its first chunk.
         """
@@ -182,9 +180,9 @@ def ray_schedule(sampler: Sampler, encoding: Encoding) -> SimpleNamespace:
             n = wp.int64(chunk.end)
             until = int(n * wp.int64(worker + 1) // wp.int64(n_workers))
             for i in range(int(n * wp.int64(worker) // wp.int64(n_workers)), until):
-                measure_ray(i, box, march, field, origins, directions, contraction, chunk)
+                measure_ray(i, box, march, field, origins, directions, chunk)
             if not wait_for_all(chunk.barrier, n_workers):
                 return 0
-        return pick_out(worker, chunk)
+        return select_rays(worker, chunk)
 
-    return SimpleNamespace(measure_ray=measure_ray, take_share=take_share)
+    return SimpleNamespace(measure_ray=measure_ray, assign_rays=assign_rays)

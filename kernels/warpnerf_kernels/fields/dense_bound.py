@@ -1,4 +1,4 @@
-"""How dense a grid can be in each cell of free space, whose cells are not the grid's own."""
+"""Density bound of a dense grid in each cell of the occupancy grid, whose cells are its own."""
 
 from functools import cache
 
@@ -29,10 +29,14 @@ def find_highest_kernel(n_floats: int) -> wp.Kernel:
 
     @wp.kernel(module="unique", enable_backward=False)
     def find_highest(
+        # launch
         first: int,
         span: int,  # cells per thread, in one row along z
+        # scene
         grid: Grid,
+        # choices
         n_cells: int,  # MZ, along z
+        # out
         out_highest: wp.array(dtype=real),  # [X * Y * MZ]
     ):
         """The highest raw density in and next to a cell, in one of its columns of nodes along z.
@@ -57,12 +61,16 @@ def find_highest_kernel(n_floats: int) -> wp.Kernel:
 
 @wp.kernel
 def join_highest(
+    # launch
     first: int,
     span: int,  # cells per thread, in one row along z
+    # scene
+    highest: wp.array(dtype=real),  # [... * n_nodes * stride]
+    # choices
     n_nodes: int,  # along the axis
     n_cells: int,  # along the axis
     stride: int,  # along the axis, a multiple of span
-    highest: wp.array(dtype=real),  # [... * n_nodes * stride]
+    # out
     out_highest: wp.array(dtype=real),  # [... * n_cells * stride]
 ):
     """Of what was found for nodes along one axis, the highest in and next to a cell."""

@@ -33,7 +33,7 @@ def gather(
     base: int,  # flat index of the lowest node
     fraction: vec3,  # [0, 1]
 ):
-    """Weighted mean of the eight nodes around a point."""
+    """Trilinear interpolation: weighted mean of the eight nodes around a point."""
     stride_y = size[2]
     stride_x = size[1] * size[2]
     fx = fraction[0]
@@ -63,7 +63,7 @@ def adj_gather(
     adj_value: Any,
     gradient: Any,  # added to
 ):
-    """Transpose of gather: hands adj_value to the eight nodes with the weights it was made with.
+    """Transpose of gather (scatter-add): adj_value to the eight nodes, by the same weights.
 
     Additions are atomic on CUDA; on the CPU only one thread may call this at a time.
     """
@@ -116,3 +116,13 @@ def place_in(size: wp.vec3i, scale: vec3, offset: vec3, n: int, other_size: wp.v
     node = lowest_node(u, size)
     fraction = u - vec3(real(node[0]), real(node[1]), real(node[2]))
     return flat_index(node[0], node[1], node[2], size), fraction
+
+
+@wp.func
+def place_along(size: int, inner: int, scale: real, offset: real, out_size: int, n: int):
+    """Where entry n of a resampled array lies: the lower of the two around, and how far up."""
+    last = real(size - 1)
+    u = wp.clamp(real((n // inner) % out_size) * scale + offset, real(0.0), last)
+    k = wp.min(int(u), size - 2)
+    low = ((n // (inner * out_size)) * size + k) * inner + n % inner
+    return low, u - real(k)

@@ -1,4 +1,4 @@
-"""Deferred shading: features are added up along the ray like colours, and shaded once a ray.
+"""Deferred shading: features are composited along the ray like colours, and shaded once a ray.
 
     F = sum_i w_i sigmoid(f_i)                        3 diffuse and K specular channels
     rgb = F_diffuse + opacity MLP(F, encoded direction)
@@ -14,9 +14,9 @@ import warp as wp
 
 from ..base.parts import Head
 from ..base.types import real, vec3, vector
+from ..networks.mlp import Layout, Weights, mlp
 from . import rgb as plain
 from . import view as views
-from .mlp import Layout, Weights, mlp
 
 wp.set_module_options({"enable_backward": False})
 
@@ -76,7 +76,7 @@ backward(n, weights.transposed.data + (size_t)worker * n_transposed, g,
 for (int r = 0; r < n; ++r) {
     for (int c = 0; c < CHANNELS; ++c) {
         const float diffuse = c < 3 ? batch[r].adj_rgb.c[c] : 0.0f;
-        batch[r].adj_channels.c[c] = batch[r].adj_inputs.c[c] + diffuse;
+        batch[r].adj.channels.c[c] = batch[r].adj_inputs.c[c] + diffuse;
     }
 }
 """
@@ -98,7 +98,7 @@ def deferred(n_channels: int, n_frequencies: int, width: int, n_hidden: int) -> 
     first, adj_first = network.first, network.adj_first
     add_inputs, adj_add_inputs = network.add_inputs, network.adj_add_inputs
     outputs, adj_outputs = network.outputs, network.adj_outputs
-    words = network.words + (
+    prelude = network.prelude + (
         f"constexpr int CHANNELS = {n_channels}, FREQUENCIES = {n_frequencies};"
     )
     Channels = vector(n_channels)
@@ -136,13 +136,13 @@ def deferred(n_channels: int, n_frequencies: int, width: int, n_hidden: int) -> 
             adj_channels[c] += adj_rgb[c]
         return adj_channels, adj_opacity
 
-    @wp.func_native(words + PREPARE_ROW)
+    @wp.func_native(prelude + PREPARE_ROW)
     def prepare_row(weights: Weights, rows: wp.array(dtype=Any), row: int): ...
 
-    @wp.func_native(words + SHADE_ROWS)
+    @wp.func_native(prelude + SHADE_ROWS)
     def shade_rows(weights: Weights, rows: wp.array(dtype=Any), row: int, n: int): ...
 
-    @wp.func_native(words + ADJ_SHADE_ROWS)
+    @wp.func_native(prelude + ADJ_SHADE_ROWS)
     def adj_shade_rows(
         weights: Weights,
         rows: wp.array(dtype=Any),
@@ -155,14 +155,14 @@ def deferred(n_channels: int, n_frequencies: int, width: int, n_hidden: int) -> 
     decode, adj_decode = plain.decode_of(n_channels)
     padded = wp.types.vector(layout.n_padded, wp.float32)
     head = plain.rgb()
-    return head.but(
+    return head.replace(
         n_channels=n_channels,
         Params=Weights,
         decode=decode,
         adj_decode=adj_decode,
         shade=shade,
         adj_shade=adj_shade,
-        vectors=head.vectors.but(
+        vectors=head.vectors._replace(
             begin_rows=network.begin_rows,
             prepare_row=prepare_row,
             shade_rows=shade_rows,

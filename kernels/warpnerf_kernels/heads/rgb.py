@@ -1,5 +1,6 @@
 """The head without parameters: each channel is the sigmoid of one raw feature."""
 
+from collections.abc import Callable
 from functools import cache
 from typing import Any
 
@@ -52,21 +53,60 @@ def decode_of(n_channels: int) -> tuple[wp.Function, wp.Function]:
     return decode, adj_decode
 
 
-TO_CHANNEL = "rows.data[row].adj_channels.c[c]"
-TO_COLOUR = (
-    f"({TO_CHANNEL} + rows.data[row].sample_slope * (channel - rows.data[row].target_rgb.c[c]))"
+OF_RAY, OF_SAMPLE = "rows.data[row].adj.channels.c[c]", "load(pack.adj_channel.data[c])"
+"""What flows back to channel c of a sample: as to the ray's, or to each sample its own."""
+
+
+def decoding(decode: str, adj_decode: str) -> tuple[wp.Function, Callable[[bool], wp.Function]]:
+    """decode_pack and adj_decode_pack of a head's vector form, see base.parts.HeadVectors.
+
+    Args:
+        decode: C++ of the former.
+        adj_decode: Of the latter; what it calls ADJ_CHANNEL flows back to a sample's channel c.
+    """
+
+    @wp.func_native(decode)
+    def decode_pack(
+        params: Any,
+        rows: wp.array(dtype=Any),
+        row: int,
+        packs: wp.array(dtype=Any),
+        slot: int,
+        n: int,
+    ): ...
+
+    @cache
+    def adj_decode_pack(by_sample: bool) -> wp.Function:
+        @wp.func_native(adj_decode.replace("ADJ_CHANNEL", OF_SAMPLE if by_sample else OF_RAY))
+        def adj_decode_packs(
+            params: Any,
+            rows: wp.array(dtype=Any),
+            row: int,
+            packs: wp.array(dtype=Any),
+            slot: int,
+            n: int,
+            worker: int,
+            gradient: Any,
+        ): ...
+
+        return adj_decode_packs
+
+    return decode_pack, adj_decode_pack
+
+
+DECODE_PACK = (
+    VECTORS
+    + r"""
+auto& pack = packs.data[slot];
+constexpr int CHANNELS = sizeof(pack.channel) / sizeof(vec);
+#pragma clang loop unroll(full)
+for (int c = 0; c < CHANNELS; ++c) {
+    store(pack.channel.data[c], sigmoid(load(pack.raw.data[1 + c])));
+}
+"""
 )
 
-
-def with_colours(text: str) -> tuple[str, str]:
-    """An adjoint of decode_pack in C++, without and with a loss on colours of samples.
-
-    What the text calls ADJ_CHANNEL flows back to a sample's channel c, whose value is `channel`.
-    """
-    return text.replace("ADJ_CHANNEL", TO_CHANNEL), text.replace("ADJ_CHANNEL", TO_COLOUR)
-
-
-ADJ_DECODE, ADJ_DECODE_COLOURS = with_colours(
+ADJ_DECODE_PACK = (
     VECTORS
     + r"""
 auto& pack = packs.data[slot];
@@ -79,62 +119,14 @@ for (int c = 0; c < CHANNELS; ++c) {
     const vec adj_channel = scale * (weight * ADJ_CHANNEL);
     store(pack.adj_raw.data[1 + c], channel * (1.0f - channel) * adj_channel);
 }
-for (int f = 1 + CHANNELS; f < FLOATS; ++f) store(pack.adj_raw.data[f], all(0.0f));
+for (int f = 1 + CHANNELS; f < FLOATS; ++f) store(pack.adj_raw.data[f], splat(0.0f));
 """
 )
-
-
-@wp.func_native(
-    VECTORS
-    + r"""
-auto& pack = packs.data[slot];
-constexpr int CHANNELS = sizeof(pack.channel) / sizeof(vec);
-#pragma clang loop unroll(full)
-for (int c = 0; c < CHANNELS; ++c) {
-    store(pack.channel.data[c], sigmoid(load(pack.raw.data[1 + c])));
-}
-"""
-)
-def decode_pack(
-    params: Any, rows: wp.array(dtype=Any), row: int, packs: wp.array(dtype=Any), slot: int, n: int
-):
-    """decode for the samples of a pack."""
-    ...
-
-
-@wp.func_native(ADJ_DECODE)
-def adj_decode_pack(
-    params: Any,
-    rows: wp.array(dtype=Any),
-    row: int,
-    packs: wp.array(dtype=Any),
-    slot: int,
-    n: int,  # 1
-    worker: int,
-    gradient: Any,
-):
-    """adj_decode for the samples of a pack."""
-    ...
-
-
-@wp.func_native(ADJ_DECODE_COLOURS)
-def adj_decode_pack_with_colours(
-    params: Any,
-    rows: wp.array(dtype=Any),
-    row: int,
-    packs: wp.array(dtype=Any),
-    slot: int,
-    n: int,  # 1
-    worker: int,
-    gradient: Any,
-):
-    """adj_decode for the samples of a pack, with a loss on their colours."""
-    ...
 
 
 @wp.func
 def shade(params: Any, direction: vec3, channels: vec3, opacity: real) -> vec3:
-    """What was added up is the colour."""
+    """The accumulated channels are the colour."""
     return channels
 
 
@@ -159,7 +151,7 @@ def adj_shade_rows(
 ):
     """adj_shade for the rays of a batch."""
     for r in range(row, row + n):
-        rows[r].adj_channels = rows[r].adj_rgb
+        rows[r].adj.channels = rows[r].adj_rgb
         rows[r].adj_opacity = real(0.0)
 
 
@@ -182,10 +174,11 @@ def adj_prepare_row(params: Any, rows: wp.array(dtype=Any), row: int, worker: in
 def rgb() -> Head:
     """Density and r, g, b: colour that is the same from all sides."""
     decode, adj_decode = decode_of(3)
+    decode_pack, adj_decode_pack = decoding(DECODE_PACK, ADJ_DECODE_PACK)
     return Head(
         n_channels=3,
         Params=Nothing,
-        View=vector(1),
+        ViewFeatures=vector(1),
         prepare=no_view,
         adj_prepare=adj_no_view,
         decode=decode,
@@ -200,6 +193,5 @@ def rgb() -> Head:
             adj_decode_pack=adj_decode_pack,
             shade_rows=shade_rows,
             adj_shade_rows=adj_shade_rows,
-            adj_decode_pack_with_colours=adj_decode_pack_with_colours,
         ),
     )

@@ -1,4 +1,4 @@
-"""Spherical harmonics per node: colour as a function of the direction of view, without an MLP.
+"""Spherical harmonics per node: view-dependent colour without an MLP.
 
 c = sigmoid(sum_k Y_k(d) f_k),   f_k = raw features 3k, 3k + 1, 3k + 2 (red, green, blue)
 """
@@ -89,7 +89,23 @@ def adj_decode(params: Any, view: Any, raw: Any, channels: vec3, adj_channels: v
     return adj_raw, view - view
 
 
-ADJ_DECODE, ADJ_DECODE_COLOURS = plain.with_colours(
+DECODE_PACK = (
+    VECTORS
+    + r"""
+auto& pack = packs.data[slot];
+const auto& view = rows.data[row].view;
+constexpr int BASIS = sizeof(view) / sizeof(float);
+vec total[3] = {splat(0.0f), splat(0.0f), splat(0.0f)};
+for (int k = 0; k < BASIS; ++k) {
+    for (int c = 0; c < 3; ++c) {
+        total[c] = fma(splat(view.c[k]), load(pack.raw.data[1 + 3 * k + c]), total[c]);
+    }
+}
+for (int c = 0; c < 3; ++c) store(pack.channel.data[c], sigmoid(total[c]));
+"""
+)
+
+ADJ_DECODE_PACK = (
     VECTORS
     + r"""
 auto& pack = packs.data[slot];
@@ -102,84 +118,32 @@ for (int c = 0; c < 3; ++c) {
     const vec adj = channel * (1.0f - channel) * (share * ADJ_CHANNEL);
     for (int k = 0; k < BASIS; ++k) store(pack.adj_raw.data[1 + 3 * k + c], view.c[k] * adj);
 }
-for (int f = 1 + 3 * BASIS; f < FLOATS; ++f) store(pack.adj_raw.data[f], all(0.0f));
+for (int f = 1 + 3 * BASIS; f < FLOATS; ++f) store(pack.adj_raw.data[f], splat(0.0f));
 """
 )
-
-
-@wp.func_native(
-    VECTORS
-    + r"""
-auto& pack = packs.data[slot];
-const auto& view = rows.data[row].view;
-constexpr int BASIS = sizeof(view) / sizeof(float);
-vec total[3] = {all(0.0f), all(0.0f), all(0.0f)};
-for (int k = 0; k < BASIS; ++k) {
-    for (int c = 0; c < 3; ++c) {
-        total[c] = fma(all(view.c[k]), load(pack.raw.data[1 + 3 * k + c]), total[c]);
-    }
-}
-for (int c = 0; c < 3; ++c) store(pack.channel.data[c], sigmoid(total[c]));
-"""
-)
-def decode_pack(
-    params: Any, rows: wp.array(dtype=Any), row: int, packs: wp.array(dtype=Any), slot: int, n: int
-):
-    """decode for the samples of a pack."""
-    ...
-
-
-@wp.func_native(ADJ_DECODE)
-def adj_decode_pack(
-    params: Any,
-    rows: wp.array(dtype=Any),
-    row: int,
-    packs: wp.array(dtype=Any),
-    slot: int,
-    n: int,  # 1
-    worker: int,
-    gradient: Any,
-):
-    """adj_decode for the samples of a pack."""
-    ...
-
-
-@wp.func_native(ADJ_DECODE_COLOURS)
-def adj_decode_pack_with_colours(
-    params: Any,
-    rows: wp.array(dtype=Any),
-    row: int,
-    packs: wp.array(dtype=Any),
-    slot: int,
-    n: int,  # 1
-    worker: int,
-    gradient: Any,
-):
-    """adj_decode for the samples of a pack, with a loss on their colours."""
-    ...
 
 
 @cache
 def sh(degree: int) -> Head:
     """Spherical harmonics of a degree from 0 to 3, 3 (degree + 1)^2 features."""
-    View = vector((degree + 1) ** 2)
+    ViewFeatures = vector((degree + 1) ** 2)
     harmonics = basis(degree)
+    decode_pack, adj_decode_pack = plain.decoding(DECODE_PACK, ADJ_DECODE_PACK)
 
     @wp.func
     def prepare_row(params: Any, rows: wp.array(dtype=Any), row: int):
         rows[row].view = harmonics(params, rows[row].ray.direction)
 
     head = plain.rgb()
-    return head.but(
-        View=View,
+    return head.replace(
+        ViewFeatures=ViewFeatures,
         prepare=harmonics,
         decode=decode,
         adj_decode=adj_decode,
-        vectors=head.vectors.but(
+        vectors=head.vectors._replace(
             prepare_row=prepare_row,
             decode_pack=decode_pack,
             adj_decode_pack=adj_decode_pack,
-            adj_decode_pack_with_colours=adj_decode_pack_with_colours,
-            row_fields=(("view", View),),
+            row_fields=(("view", ViewFeatures),),
         ),
     )

@@ -1,4 +1,4 @@
-"""What an MLP is told of the direction of view."""
+"""Positional encoding of the direction of view, for an MLP."""
 
 from functools import cache
 
@@ -44,19 +44,19 @@ auto encode_direction = [&](const auto& direction, int n_frequencies, float* out
     for (int axis = 0; axis < 3; ++axis) out[axis] = direction.c[axis];
     const int n_angles = 3 * n_frequencies;
     for (int begin = 0; begin < n_angles; begin += LANES) {
-        vec x = all(0.0f);
+        vec x = splat(0.0f);
         for (int n = 0; n < LANES && begin + n < n_angles; ++n) {
             x[n] = direction.c[(begin + n) % 3] * (float)(1 << (begin + n) / 3);
         }
         const vec n = __builtin_elementwise_rint(x * 0.636619772f);
-        vec r = fma(n, all(-1.5703125f), x);
-        r = fma(n, all(-4.83751297e-4f), r);
-        r = fma(n, all(-7.54978942e-8f), r);
+        vec r = fma(n, splat(-1.5703125f), x);
+        r = fma(n, splat(-4.83751297e-4f), r);
+        r = fma(n, splat(-7.54978942e-8f), r);
         const vec r2 = r * r;
-        vec s = fma(all(-1.95152959e-4f), r2, all(8.33216087e-3f));
-        s = fma(fma(s, r2, all(-1.66666546e-1f)), r2 * r, r);
-        vec c = fma(all(2.44331571e-5f), r2, all(-1.38873162e-3f));
-        c = fma(fma(c, r2, all(4.16666457e-2f)), r2 * r2, fma(all(-0.5f), r2, all(1.0f)));
+        vec s = fma(splat(-1.95152959e-4f), r2, splat(8.33216087e-3f));
+        s = fma(fma(s, r2, splat(-1.66666546e-1f)), r2 * r, r);
+        vec c = fma(splat(2.44331571e-5f), r2, splat(-1.38873162e-3f));
+        c = fma(fma(c, r2, splat(4.16666457e-2f)), r2 * r2, fma(splat(-0.5f), r2, splat(1.0f)));
         const ivec quarter = truncate(n);
         const ivec swapped = (quarter & 1) != 0;
         const vec sine = swapped ? c : s, cosine = swapped ? s : c;

@@ -1,38 +1,74 @@
-"""Reading a dense grid at points of one's choice, and its transpose: for checking the two."""
+"""Interpolation of an encoding at given points, and its transpose.
+
+For checking the two, and for whatever wants densities at the nodes of a grid.
+"""
 
 from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
-from ..base.types import gradient_type, vec3, vector
-from ..fields.dense import adj_read, grid_type, read
+from ..base.parts import Encoding
+from ..base.types import real, vec3, vector
 
 
 @cache
-def probe(n_floats: int) -> SimpleNamespace:
-    """The kernels read_forward and read_backward, for nodes of so many floats."""
-    Grid, Node, Gradient = grid_type(n_floats), vector(n_floats), gradient_type(n_floats)
+def probe(encoding: Encoding) -> SimpleNamespace:
+    """The kernels read_forward, read_backward and read_densities of an encoding."""
+    Params, Raw, Gradient = encoding.Params, vector(encoding.n_floats), encoding.Gradient
+    read, adj_read, Density = encoding.read, encoding.adj_read, vector(1)
 
     @wp.kernel(module="unique", enable_backward=False)
     def read_forward(
+        # launch
         first: int,
-        grid: Grid,
-        points: wp.array(dtype=vec3),  # [n] folded coordinates
-        out: wp.array(dtype=Node),  # [n]
+        # scene
+        params: Params,
+        # rays
+        points: wp.array(dtype=vec3),  # [n] contracted coordinates
+        # out
+        out: wp.array(dtype=Raw),  # [n]
     ):
         i = first + wp.tid()
-        out[i] = read(grid, points[i])
+        out[i] = read(params, points[i])
 
     @wp.kernel(module="unique", enable_backward=False)
     def read_backward(
+        # launch
         first: int,
-        grid: Grid,
-        points: wp.array(dtype=vec3),  # [n] folded coordinates
-        adj_out: wp.array(dtype=Node),  # [n]
+        # scene
+        params: Params,
+        # rays
+        points: wp.array(dtype=vec3),  # [n] contracted coordinates
+        adj_out: wp.array(dtype=Raw),  # [n]
+        # out
         gradient: Gradient,  # added to
     ):
         i = first + wp.tid()
-        adj_read(grid, points[i], adj_out[i], gradient)
+        adj_read(params, points[i], adj_out[i], gradient)
 
-    return SimpleNamespace(read_forward=read_forward, read_backward=read_backward)
+    @wp.kernel(module="unique", enable_backward=False)
+    def read_densities(
+        # launch
+        first: int,
+        # scene
+        params: Params,
+        # choices
+        size: wp.vec3i,  # X, Y, Z of a grid over the whole field
+        reach: real,  # contracted coordinates lie in [-reach, reach]
+        # out
+        out: wp.array(dtype=Density),  # [X * Y * Z]
+    ):
+        """Raw densities at the nodes of a grid."""
+        n = first + wp.tid()
+        k = n % size[2]
+        j = (n // size[2]) % size[1]
+        i = n // (size[2] * size[1])
+        last = vec3(real(size[0] - 1), real(size[1] - 1), real(size[2] - 1))
+        share = wp.cw_div(vec3(real(i), real(j), real(k)), last)
+        raw = read(params, reach * (real(2.0) * share - vec3(real(1.0))))
+        out[n] = Density(raw[0])
+
+    return SimpleNamespace(
+        read_forward=read_forward, read_backward=read_backward, read_densities=read_densities
+    )

@@ -1,4 +1,4 @@
-"""The update of the grid. Kingma & Ba 2015, algorithm 1; entries without a gradient are left alone.
+"""Adam over the grid (Kingma & Ba 2015, algorithm 1), lazy: entries without a gradient stay.
 
 It waits for memory, so both moments of an entry share 32 bits: in the upper 16 the mean as a
 bfloat16 (sign, 8 bits of exponent, 7 of fraction), in the lower 16 the square, which has no sign (8
@@ -13,19 +13,9 @@ from typing import Any
 
 import warp as wp
 
-from ..base.tiles import (
-    AHEAD,
-    GROUP,
-    TILE,
-    but_first,
-    first_of,
-    prefetch,
-    tile_of,
-    tiles_ahead,
-    touched_tiles,
-)
+from ..base.tiles import TILE, prefetch, tile_loop
 from ..base.types import gradient_type, real, vec3, vector
-from ..fields.interp import place_in
+from ..fields.interp import place_along, place_in
 
 wp.set_module_options({"enable_backward": False})
 
@@ -36,7 +26,18 @@ def moments_type(n_floats: int) -> type:
     return wp.types.vector(n_floats, wp.uint32)
 
 
-WORDS = r"""
+@wp.struct
+class Adam:
+    """The numbers of an update that are the same for all entries."""
+
+    beta1: real
+    beta2: real
+    epsilon: real
+    correction1: real  # 1 / (1 - beta1^update)
+    correction2: real  # 1 / (1 - beta2^update)
+
+
+PRELUDE = r"""
 #if defined(__CUDA_ARCH__)
 constexpr int AT_ONCE = 1;
 typedef float number;
@@ -55,13 +56,16 @@ auto join = [&](number mean, number square, bits noise) -> bits {
     return ((as_bits(mean) + (noise >> 16)) & 0xffff0000u) |
         ((as_bits(square) + (noise & 0x7fffu)) >> 15);
 };
+auto nearest = [&](number mean, number square) -> bits {
+    return join(mean, square, 0u * as_bits(mean) + 0x80004000u);
+};
 """
 """What the native functions begin with; on the CPU they work on so many CHANNELS at once."""
 
 
 @wp.func_native(
     f"constexpr int CHANNELS = {4 * TILE}, TILE = {TILE};"
-    + WORDS
+    + PRELUDE
     + r"""
 #if defined(__CUDA_ARCH__)
 auto root = [](number x) -> number { return sqrtf(x); };
@@ -90,9 +94,10 @@ for (int c = 0; c < FLOATS * TILE && c < FLOATS * count; c += AT_ONCE) {
     const bits old = as_bits(load(moments.data));
     number rate;
     for (int n = 0; n < AT_ONCE; ++n) ((float*)&rate)[n] = learning_rate.c[(c + n) % FLOATS];
-    const number m = beta1 * mean_of(old) + (1.0f - beta1) * g;
-    const number v = beta2 * square_of(old) + (1.0f - beta2) * (g * g);
-    const number moved = value - rate * (correction1 * m) / (root(correction2 * v) + epsilon);
+    const number m = adam.beta1 * mean_of(old) + (1.0f - adam.beta1) * g;
+    const number v = adam.beta2 * square_of(old) + (1.0f - adam.beta2) * (g * g);
+    const number root_v = root(adam.correction2 * v);
+    const number moved = value - rate * (adam.correction1 * m) / (root_v + adam.epsilon);
     const bits noise = (as_bits(g) + update * 0x9e3779b9u) * 0x9e3779b9u;  // 2^32 / golden ratio
     const bits joined = join(m, v, noise);
     store(values.data, g != 0.0f ? moved : value);
@@ -106,11 +111,7 @@ def update_nodes(
     count: int,  # up to TILE
     update: wp.uint32,
     learning_rate: Any,
-    beta1: float,
-    beta2: float,
-    epsilon: float,
-    correction1: float,
-    correction2: float,
+    adam: Adam,
     gradient: Any,
     values: wp.array(dtype=Any),
     moments: wp.array(dtype=Any),
@@ -124,20 +125,49 @@ def update_nodes(
 
 @cache
 def adam_kernel(n_floats: int) -> wp.Kernel:
-    """The update of a field whose nodes hold so many floats."""
+    """Adam over a field whose nodes hold so many floats."""
     Node, Moments, Gradient = vector(n_floats), moments_type(n_floats), gradient_type(n_floats)
+
+    @wp.struct
+    class Entries:
+        update: wp.uint32
+        learning_rate: Node
+        adam: Adam
+        gradient: Gradient
+        values: wp.array(dtype=Node)
+        moments: wp.array(dtype=Moments)
+
+    @wp.func
+    def prefetch_tile(on: Entries, node: int):
+        prefetch(on.gradient.values, node)
+        prefetch(on.values, node)
+        prefetch(on.moments, node)
+
+    @wp.func
+    def work(on: Entries, node: int, begin: int, end: int):
+        update_nodes(
+            begin,
+            end - begin,
+            on.update,
+            on.learning_rate,
+            on.adam,
+            on.gradient,
+            on.values,
+            on.moments,
+        )
+
+    over_tiles = tile_loop(prefetch_tile, work)
 
     @wp.kernel(module="unique", enable_backward=False)
     def adam_step(
+        # launch
         first: int,
         span: int,  # nodes per thread
+        # choices
         update: wp.uint32,  # counts from 1
         learning_rate: Node,  # per channel
-        beta1: float,
-        beta2: float,
-        epsilon: float,
-        correction1: float,  # 1 / (1 - beta1^update)
-        correction2: float,  # 1 / (1 - beta2^update)
+        adam: Adam,
+        # out
         gradient: Gradient,  # zeroed
         values: wp.array(dtype=Node),  # [n_nodes] updated
         moments: wp.array(dtype=Moments),  # [n_nodes] updated
@@ -145,46 +175,24 @@ def adam_kernel(n_floats: int) -> wp.Kernel:
         """One update. An entry whose gradient is exactly zero keeps its value and its moments."""
         n_nodes = values.shape[0]
         start = (first + wp.tid()) * span
-        end = start + wp.min(span, n_nodes - start)  # start + span might be beyond int
-        last = tile_of(end - 1) + 1
-        for group in range(tile_of(start), last, wp.static(GROUP)):
-            # In turns: requests for all tiles at once would hold up what the update has to read.
-            ahead = tiles_ahead(gradient.touched, group, last)
-            tiles = touched_tiles(gradient.touched, group, last)
-            while tiles != wp.uint64(0) or ahead != wp.uint64(0):
-                if ahead != wp.uint64(0):
-                    node = (group + wp.static(AHEAD) + first_of(ahead)) * wp.static(TILE)
-                    prefetch(gradient.values, node)
-                    prefetch(values, node)
-                    prefetch(moments, node)
-                    ahead = but_first(ahead)
-                if tiles != wp.uint64(0):
-                    node = (group + first_of(tiles)) * wp.static(TILE)
-                    begin = wp.max(start, node)
-                    update_nodes(
-                        begin,
-                        wp.min(end, node + wp.static(TILE)) - begin,
-                        update,
-                        learning_rate,
-                        beta1,
-                        beta2,
-                        epsilon,
-                        correction1,
-                        correction2,
-                        gradient,
-                        values,
-                        moments,
-                    )
-                    tiles = but_first(tiles)
+        on = Entries()
+        on.update = update
+        on.learning_rate = learning_rate
+        on.adam = adam
+        on.gradient = gradient
+        on.values = values
+        on.moments = moments
+        # start + span might be beyond int
+        over_tiles(on, gradient.touched, start, start + wp.min(span, n_nodes - start))
 
     return adam_step
 
 
 @wp.func_native(
-    "constexpr int CHANNELS = 4;"
-    + WORDS
+    "constexpr int FLOATS = sizeof(*moments.data) / sizeof(unsigned);"
+    "constexpr int CHANNELS = FLOATS < 4 ? 1 : 4;"
+    + PRELUDE
     + r"""
-constexpr int FLOATS = sizeof(*moments.data) / sizeof(unsigned);
 const int stride_y = size.c[2], stride_x = stride_y * size.c[1];
 for (int c = 0; c < FLOATS; c += AT_ONCE) {
     number mean = 0.0f, square = 0.0f;
@@ -197,8 +205,7 @@ for (int c = 0; c < FLOATS; c += AT_ONCE) {
         mean += share * mean_of(old);
         square += share * square_of(old);
     }
-    const bits half = 0u * as_bits(mean) + 0x80004000u;
-    *(bits*)&out_moments.data[n].c[c] = join(mean, square, half);
+    *(bits*)&out_moments.data[n].c[c] = nearest(mean, square);
 }
 """
 )
@@ -221,11 +228,15 @@ def resample_moments_kernel(n_floats: int) -> wp.Kernel:
 
     @wp.kernel(module="unique", enable_backward=False)
     def resample_moments(
+        # launch
         first: int,
+        # scene
         moments: wp.array(dtype=Moments),  # [X * Y * Z]
         size: wp.vec3i,
+        # choices
         scale: vec3,
         offset: vec3,
+        # out
         out_size: wp.vec3i,
         out_moments: wp.array(dtype=Moments),  # [X' * Y' * Z']
     ):
@@ -236,15 +247,67 @@ def resample_moments_kernel(n_floats: int) -> wp.Kernel:
     return resample_moments
 
 
+@wp.func_native(
+    "constexpr int CHANNELS = 4;"
+    + PRELUDE
+    + r"""
+constexpr int FLOATS = sizeof(*moments.data) / sizeof(unsigned);
+for (int c = 0; c < FLOATS; c += AT_ONCE) {
+    const bits a = *(const bits*)&moments.data[low].c[c];
+    const bits b = *(const bits*)&moments.data[high].c[c];
+    const number mean = (1.0f - share) * mean_of(a) + share * mean_of(b);
+    const number square = (1.0f - share) * square_of(a) + share * square_of(b);
+    *(bits*)&out_moments.data[n].c[c] = nearest(mean, square);
+}
+"""
+)
+def blend_moments(
+    moments: wp.array(dtype=Any),
+    low: int,
+    high: int,
+    share: real,  # of the entry `high`
+    out_moments: wp.array(dtype=Any),
+    n: int,
+):
+    """Moments between those of two entries, rounded to the nearest."""
+    ...
+
+
+@cache
+def resample_moments_along_kernel(n_floats: int) -> wp.Kernel:
+    """factors.resample_kernel for moments."""
+    Moments = moments_type(n_floats)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def resample_moments_along(
+        # launch
+        first: int,
+        # scene
+        moments: wp.array(dtype=Moments),  # [outer * size * inner]
+        # choices
+        size: int,  # of the axis
+        inner: int,  # how far neighbours along the axis lie apart
+        scale: real,  # u on the old axis = u on the new one * scale + offset
+        offset: real,
+        # out
+        out_size: int,  # of the axis
+        out_moments: wp.array(dtype=Moments),  # [outer * out_size * inner]
+    ):
+        n = first + wp.tid()
+        low, share = place_along(size, inner, scale, offset, out_size, n)
+        blend_moments(moments, low, low + inner, share, out_moments, n)
+
+    return resample_moments_along
+
+
 @wp.kernel(enable_backward=False)
 def adam_weights(
+    # launch
     first: int,
+    # choices
     learning_rate: real,
-    beta1: real,
-    beta2: real,
-    epsilon: real,
-    correction1: real,  # 1 / (1 - beta1^update)
-    correction2: real,  # 1 / (1 - beta2^update)
+    adam: Adam,
+    # out
     gradient: wp.array2d(dtype=real),  # [n_workers, n_weights] of each worker, zeroed
     values: wp.array(dtype=real),  # [n_weights] updated
     means: wp.array(dtype=real),  # [n_weights] updated
@@ -260,10 +323,9 @@ def adam_weights(
         total += gradient[worker, n]
         gradient[worker, n] = real(0.0)
     if total != real(0.0):
-        mean = beta1 * means[n] + (real(1.0) - beta1) * total
-        square = beta2 * squares[n] + (real(1.0) - beta2) * (total * total)
+        mean = adam.beta1 * means[n] + (real(1.0) - adam.beta1) * total
+        square = adam.beta2 * squares[n] + (real(1.0) - adam.beta2) * (total * total)
         means[n] = mean
         squares[n] = square
-        values[n] -= (
-            learning_rate * (correction1 * mean) / (wp.sqrt(correction2 * square) + epsilon)
-        )
+        root = wp.sqrt(adam.correction2 * square)
+        values[n] -= learning_rate * (adam.correction1 * mean) / (root + adam.epsilon)

@@ -3,7 +3,7 @@
 TV(x) = sum_c weight_c sum_{neighbouring nodes a, b} huber(x_a,c - x_b,c),
 huber(d) = d^2 / 2 for |d| <= 1, |d| - 1/2 beyond: an edge costs its height, not its square.
 
-On the CPU the adjoint is worked out for all channels of a tile at once, in Clang's vector types;
+On the CPU the adjoint is computed for all channels of a tile at once, in Clang's vector types;
 on CUDA, and at the grid's faces, node by node.
 """
 
@@ -12,24 +12,14 @@ from typing import Any
 
 import warp as wp
 
-from ..base.tiles import (
-    AHEAD,
-    GROUP,
-    TILE,
-    but_first,
-    first_of,
-    prefetch,
-    tile_of,
-    tiles_ahead,
-    touched_tiles,
-)
+from ..base.tiles import TILE, prefetch, tile_loop
 from ..base.types import gradient_type, real, vector
 from ..fields.interp import flat_index
 
 wp.set_module_options({"enable_backward": False})
 
-RUN = 16
-"""Nodes in a row that share a strength: a whole number of tiles."""
+TV_BLOCK = 16
+"""Nodes of a block, in a row, that share a weight of the total variation: whole tiles."""
 
 
 @wp.func
@@ -169,18 +159,20 @@ def tile_variation(n_floats: int) -> wp.Function:
 
 @cache
 def total_variation_forward_kernel(n_floats: int) -> wp.Kernel:
-    """Each node's share of TV(x). Training does not ask for it; the adjoint is held against it."""
+    """Each node's share of TV(x). Training does not need it; the adjoint is checked against it."""
     Node = vector(n_floats)
 
     @wp.kernel(module="unique", enable_backward=False)
     def total_variation_forward(
+        # launch
         first: int,
+        # scene
         values: wp.array(dtype=Node),  # [X * Y * Z]
         size: wp.vec3i,
+        # choices
         weight: Node,  # per channel
-        out_variation: wp.array(
-            dtype=real
-        ),  # [X * Y * Z] of each node's pairs towards larger indices
+        # out
+        out_variation: wp.array(dtype=real),  # [X * Y * Z] of pairs towards larger indices
     ):
         """Each node's share of TV(x); their sum is TV(x)."""
         n = first + wp.tid()
@@ -195,63 +187,76 @@ def total_variation_backward_kernel(n_floats: int) -> wp.Kernel:
     Node, Gradient = vector(n_floats), gradient_type(n_floats)
     add_tile_variation = tile_variation(n_floats)
 
+    @wp.struct
+    class Entries:
+        values: wp.array(dtype=Node)
+        size: wp.vec3i
+        weight: Node
+        strength: wp.array(dtype=real)
+        gradient: Gradient
+
+    @wp.func
+    def prefetch_tile(on: Entries, node: int):
+        stride_y = on.size[2]
+        stride_x = on.size[1] * on.size[2]
+        prefetch(on.gradient.values, node)
+        prefetch(on.values, node)
+        prefetch(on.values, node - stride_y)
+        prefetch(on.values, node + stride_y)
+        prefetch(on.values, node - stride_x)
+        prefetch(on.values, node + stride_x)
+
+    @wp.func
+    def work(on: Entries, node: int, begin: int, end: int):
+        size = on.size
+        stride_x = size[1] * size[2]
+        j = (begin // size[2]) % size[1]
+        k = begin % size[2]
+        inside = end - begin == wp.static(TILE)
+        inside = inside and node >= stride_x and node < on.values.shape[0] - stride_x
+        inside = inside and j > 0 and j + 1 < size[1]
+        inside = inside and k > 0 and k + wp.static(TILE) < size[2]
+        here = on.strength[node // wp.static(TV_BLOCK)]
+        last = end
+        if inside and add_tile_variation(on.values, size, on.weight, here, node, on.gradient):
+            last = begin
+        weights = here * on.weight
+        for n in range(begin, last):
+            adj = on.gradient.values[n]
+            if not (adj == Node()):
+                more = adj_node_variation(on.values, size, weights, n, j, k)
+                on.gradient.values[n] = adj + more
+            k += 1  # on to the next node, without dividing for each
+            if k == size[2]:
+                k = 0
+                j += 1
+                if j == size[1]:
+                    j = 0
+
+    over_tiles = tile_loop(prefetch_tile, work)
+
     @wp.kernel(module="unique", enable_backward=False)
     def total_variation_backward(
+        # launch
         first: int,
         span: int,  # nodes per thread
+        # scene
         values: wp.array(dtype=Node),  # [X * Y * Z]
         size: wp.vec3i,
+        # choices
         weight: Node,  # per channel
-        strength: wp.array(dtype=real),  # [ceil(X * Y * Z / RUN)] of nodes in a row, times weight
+        strength: wp.array(dtype=real),  # [ceil(n_nodes / TV_BLOCK)] times weight
+        # out
         gradient: Gradient,  # added to where not 0
     ):
         """d TV / d x at the nodes that already have a gradient; unseen ones stay as they are."""
-        n_nodes = values.shape[0]
         start = (first + wp.tid()) * span
-        end = start + wp.min(span, n_nodes - start)
-        last = tile_of(end - 1) + 1
-        stride_y = size[2]
-        stride_x = size[1] * size[2]
-        for group in range(tile_of(start), last, wp.static(GROUP)):
-            # In turns, as in adam_step.
-            ahead = tiles_ahead(gradient.touched, group, last)
-            tiles = touched_tiles(gradient.touched, group, last)
-            while tiles != wp.uint64(0) or ahead != wp.uint64(0):
-                if ahead != wp.uint64(0):
-                    node = (group + wp.static(AHEAD) + first_of(ahead)) * wp.static(TILE)
-                    prefetch(gradient.values, node)
-                    prefetch(values, node)
-                    prefetch(values, node - stride_y)
-                    prefetch(values, node + stride_y)
-                    prefetch(values, node - stride_x)
-                    prefetch(values, node + stride_x)
-                    ahead = but_first(ahead)
-                if tiles == wp.uint64(0):
-                    continue
-                node = (group + first_of(tiles)) * wp.static(TILE)
-                first_node = wp.max(start, node)
-                end_node = wp.min(end, node + wp.static(TILE))
-                j = (first_node // size[2]) % size[1]
-                k = first_node % size[2]
-                inside = end_node - first_node == wp.static(TILE)
-                inside = inside and node >= stride_x and node < n_nodes - stride_x
-                inside = inside and j > 0 and j + 1 < size[1]
-                inside = inside and k > 0 and k + wp.static(TILE) < size[2]
-                here = strength[node // wp.static(RUN)]
-                if inside and add_tile_variation(values, size, weight, here, node, gradient):
-                    end_node = first_node
-                weights = here * weight
-                for n in range(first_node, end_node):
-                    adj = gradient.values[n]
-                    if not (adj == Node()):
-                        more = adj_node_variation(values, size, weights, n, j, k)
-                        gradient.values[n] = adj + more
-                    k += 1  # on to the next node, without dividing for each
-                    if k == size[2]:
-                        k = 0
-                        j += 1
-                        if j == size[1]:
-                            j = 0
-                tiles = but_first(tiles)
+        on = Entries()
+        on.values = values
+        on.size = size
+        on.weight = weight
+        on.strength = strength
+        on.gradient = gradient
+        over_tiles(on, gradient.touched, start, start + wp.min(span, values.shape[0] - start))
 
     return total_variation_backward

@@ -1,24 +1,27 @@
-"""Which blocks of a photograph's pixels have rays that may meet something."""
+"""Background culling: which blocks of a photograph's pixels have rays that may meet something."""
 
 import warp as wp
 
 from ..base.types import Box, FreeSpace, Ray, real, vec2, vec3
-from ..space.camera import View, pixel_direction
-from ..space.contraction import NONE
+from ..space.camera import CameraParams, pixel_direction
 from .occupancy import FAR
-from .traversal import free_distance, free_length, slab
+from .traversal import free_distance, slab, straight_length
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
 def cover_blocks(
+    # launch
     first: int,
-    view: View,
-    block: int,  # edge of a block, pixels
-    first_block: int,  # how many the views before have
+    # scene
+    view: CameraParams,
     box: Box,  # without contraction
     free: FreeSpace,
+    # choices
+    block: int,  # edge of a block, pixels
+    first_block: int,  # how many the views before have
+    # out
     out_covered: wp.array(dtype=wp.uint8),  # [n_blocks] of all views: 0 where rays meet nothing
 ):
     """Follows the cone around a block's rays through free space, up to the first occupied cell.
@@ -60,7 +63,7 @@ def cover_blocks(
         if distance <= wide:
             covered = wp.uint8(1)
             break
-        free_way = free_length(free, ray, m, distance - wide, NONE)
+        free_way = straight_length(free, ray, m, distance - wide)
         # Over the edge between two cells, and by more than t is rounded to.
         t += wp.max(free_way, wp.max(real(1.0e-3) * edge, real(4.0e-7) * t))
     out_covered[first_block + i] = covered

@@ -1,11 +1,11 @@
-"""Free space: which cells of the grid's domain hold nothing that could be seen."""
+"""Occupancy grid: which cells of the domain hold nothing that could be seen (free space)."""
 
 from functools import cache
 
 import warp as wp
 
 from ..base.activation import softplus
-from ..base.parts import Sampler
+from ..base.parts import Sampler, Space
 from ..base.types import Box, Density, real, vec3
 
 wp.set_module_options({"enable_backward": False})
@@ -14,21 +14,24 @@ FAR = wp.constant(8)  # distances are counted up to here, cells
 
 
 @cache
-def mark_occupied_kernel(sampler: Sampler) -> wp.Kernel:
+def mark_occupied_kernel(sampler: Sampler, space: Space) -> wp.Kernel:
     """Which cells hold something that a step could see."""
-    Steps, longest = sampler.Params, sampler.longest
+    Steps, longest, boxes_out = sampler.Params, sampler.longest, space.boxes_out
 
     @wp.kernel(module="unique", enable_backward=False)
     def mark_occupied(
+        # launch
         first: int,
         span: int,  # cells per thread, in one row along z
+        # scene
         box: Box,
         density: Density,
         highest: wp.array(dtype=real),  # [MX * MY * MZ] by find_highest, and join_highest twice
         size: wp.vec3i,  # cells
         march: Steps,
-        contraction: int,
+        # choices
         alpha_min: real,  # what counts as visible
+        # out
         out_distance: wp.array(dtype=wp.uint8),  # [MX * MY * MZ] 0 where occupied, else FAR + 1
     ):
         """A cell is occupied if any node in it or next to it would give a step this much alpha."""
@@ -43,7 +46,7 @@ def mark_occupied_kernel(sampler: Sampler) -> wp.Kernel:
                 (wp.abs(middle[1]) + real(0.5)) / half[1],
                 (wp.abs(middle[2]) + real(0.5)) / half[2],
             )
-            step = longest(march, box, (real(1.0) + box.border) * outermost, contraction)
+            step = longest(march, boxes_out(box, (real(1.0) + box.border) * outermost))
             sigma = density.scale * softplus(highest[n] + density.shift)
             if real(1.0) - wp.exp(-step * sigma) <= alpha_min:
                 out_distance[n] = wp.uint8(FAR + 1)
@@ -56,11 +59,15 @@ def mark_occupied_kernel(sampler: Sampler) -> wp.Kernel:
 
 @wp.kernel
 def spread_distance(
+    # launch
     first: int,
     span: int,  # cells per thread, in one row along z
-    size: wp.vec3i,  # cells
-    axis: int,
+    # scene
     distance: wp.array(dtype=wp.uint8),  # [MX * MY * MZ]
+    size: wp.vec3i,  # cells
+    # choices
+    axis: int,
+    # out
     out_distance: wp.array(dtype=wp.uint8),  # [MX * MY * MZ]
 ):
     """One axis of the chessboard distance to the nearest occupied cell, up to FAR + 1.

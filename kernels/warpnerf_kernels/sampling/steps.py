@@ -1,4 +1,4 @@
-"""The placing of steps along a ray: equal ones, then geometrically growing ones. A sampler.
+"""Ray marching: equal steps along a ray, then geometrically growing ones. A sampler.
 
 Sample k sits at edge(k) + offset (edge(k + 1) - edge(k)). Neither the box nor free space moves a
 sample: they only decide which ones are visited. So skipping is exact, and a ray walked twice visits
@@ -11,10 +11,9 @@ from typing import Any
 
 import warp as wp
 
-from ..base.parts import Sampler
+from ..base.parts import INFINITELY_FAR, Sampler
 from ..base.simd import VECTORS
-from ..base.types import Box, Ray, real, vec2, vec3
-from ..space.contraction import norm_of
+from ..base.types import Ray, real, vec2
 
 wp.set_module_options({"enable_backward": False})
 
@@ -94,18 +93,20 @@ auto& pack = packs.data[slot];
 const ivec lane = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
 const ivec k = step + lane;
 vec begin = march.near + to_float(k) * march.step;
-vec dt = all(march.step);
+vec dt = splat(march.step);
 if (march.growth != 0.0f) {
     ivec n = k - (step > march.n_linear ? step : march.n_linear);
-    vec power = all(1.0f);
+    vec power = splat(1.0f);
     float g = 1.0f + march.growth;
-    for (int bit = 1; bit < LANES; bit *= 2, g *= g) power *= (n & bit) != 0 ? all(g) : all(1.0f);
+    for (int bit = 1; bit < LANES; bit *= 2, g *= g) {
+        power *= (n & bit) != 0 ? splat(g) : splat(1.0f);
+    }
     begin = n < 0 ? begin : edge * power;
     dt = n < 0 ? dt : begin * march.growth;
 }
 vec t = begin + ray.offset * dt;
 pack.step = step;
-store_int(pack.visited, (k < ray.end) & (t < march.far));
+store_int(pack.active, (k < ray.end) & (t < march.far));
 store(pack.t, t);
 store(pack.dt, dt);
 """
@@ -132,19 +133,17 @@ def place_steps(march: March, ray: Ray, step: int, packs: wp.array(dtype=Any), s
 
 
 @wp.func
-def longest_step(march: March, box: Box, c: vec3, contraction: int) -> real:
-    """How long steps can be where contracted coordinates are no larger than c, on each axis.
+def longest_step(march: March, boxes_out: real) -> real:
+    """How long steps can be at so many half boxes from the middle.
 
     A point n boxes out is at most n times as far from a training camera as equal steps reach: these
     go from all of them to the farthest corner of the box.
     """
-    norm = norm_of(c, contraction)
-    if norm <= real(1.0) or march.growth == real(0.0):
+    if boxes_out == real(0.0) or march.growth == real(0.0):
         return march.step
     t = march.far
-    if norm < real(1.0) + box.border:
-        n = box.border / (real(1.0) + box.border - norm)
-        t = wp.min(t, n * step_edge(march, march.n_linear))
+    if boxes_out < real(wp.static(INFINITELY_FAR)):
+        t = wp.min(t, boxes_out * step_edge(march, march.n_linear))
     return wp.max(march.step, march.growth * t)
 
 

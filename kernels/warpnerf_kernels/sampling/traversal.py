@@ -1,4 +1,4 @@
-"""Which steps of a ray are samples: the box, folded space, and the skipping of free space."""
+"""Empty-space skipping: which steps of a ray are samples, by box, contraction and free space."""
 
 from functools import cache
 from types import SimpleNamespace
@@ -6,11 +6,9 @@ from typing import Any
 
 import warp as wp
 
-from ..base.parts import Sampler
+from ..base.parts import Sampler, Space
 from ..base.simd import VECTORS
 from ..base.types import Box, FreeSpace, Ray, Sample, real, vec2, vec3
-from ..space.contraction import L2, LINF, NDC, contract, det_jacobian_of, folds
-from ..space.ndc import LEAST, distance_at, enter, length_to, stretch_at
 
 wp.set_module_options({"enable_backward": False})
 
@@ -59,63 +57,39 @@ def cell_margin(m: real) -> real:
 
 
 @wp.func
-def free_length(free: FreeSpace, ray: Ray, m: vec3, distance: int, contraction: int) -> real:
-    """A distance along the ray through which nothing but free cells is met."""
+def straight_length(free: FreeSpace, ray: Ray, m: vec3, distance: int) -> real:
+    """A distance along the ray through which nothing but free cells is met; c is q."""
     rings = real(distance - 1)
-    if not folds(contraction):
-        speed = wp.cw_mul(ray.q_direction, free.to_cells)
-        return wp.min(
-            block_exit(m[0], speed[0], rings),
-            wp.min(block_exit(m[1], speed[1], rings), block_exit(m[2], speed[2], rings)),
-        )
-    # A contraction with border <= 1 stretches no displacement by more than 2 (largest component out
-    # over length in), so whatever its direction the ray stays in the block for this long.
+    speed = wp.cw_mul(ray.q_direction, free.to_cells)
+    return wp.min(
+        block_exit(m[0], speed[0], rings),
+        wp.min(block_exit(m[1], speed[1], rings), block_exit(m[2], speed[2], rings)),
+    )
+
+
+@wp.func
+def contracted_length(free: FreeSpace, ray: Ray, m: vec3, distance: int, stretch: real) -> real:
+    """The same where space is contracted, and no displacement stretched by more than this.
+
+    Whatever its direction, the ray stays in the block for so long.
+    """
+    rings = real(distance - 1)
     widest = wp.max(wp.max(free.to_cells[0], free.to_cells[1]), free.to_cells[2])
     margin = wp.min(wp.min(cell_margin(m[0]), cell_margin(m[1])), cell_margin(m[2]))
-    return (rings + margin) / (real(2.0) * wp.length(ray.q_direction) * widest)
+    return (rings + margin) / (stretch * wp.length(ray.q_direction) * widest)
 
 
-@wp.func
-def distance_of(ray: Ray, t: real, contraction: int) -> real:
-    """How far from its origin a ray is at t, scene units."""
-    if contraction == NDC:
-        return distance_at(ray.line, t)
-    return t
-
-
-@wp.func
-def length_of(ray: Ray, distance: real, dt: real, contraction: int) -> real:
-    """How long a step dt at a distance is, scene units."""
-    if contraction == NDC:
-        return dt * stretch_at(ray.line, distance)
-    return dt
-
-
-@wp.func_native(
-    VECTORS
-    + r"""
+PLACES = r"""
 auto& pack = packs.data[slot];
 vec t = load(pack.t);
-const bool folds = contraction == LINF || contraction == L2;
 vec qx = ray.q_origin.c[0] + t * ray.q_direction.c[0];
 vec qy = ray.q_origin.c[1] + t * ray.q_direction.c[1];
 vec qz = ray.q_origin.c[2] + t * ray.q_direction.c[2];
-ivec visited = load_int(pack.visited);
-vec det_jacobian = all(1.0f);
-if (!folds) {
-    visited &= (magnitude(qx) <= 1.0f) & (magnitude(qy) <= 1.0f) & (magnitude(qz) <= 1.0f);
-} else {
-    vec norm = contraction == L2
-        ? __builtin_elementwise_sqrt(qx * qx + qy * qy + qz * qz)
-        : most(most(magnitude(qx), magnitude(qy)), magnitude(qz));
-    vec n = most(norm, all(1.0f));
-    vec shrink = norm > 1.0f ? (1.0f + box.border - box.border / n) / n : all(1.0f);
-    vec across = ((1.0f + box.border) * n - box.border) / (n * n);
-    det_jacobian = norm > 1.0f ? box.border / (n * n) * across * across : det_jacobian;
-    qx *= shrink;
-    qy *= shrink;
-    qz *= shrink;
-}
+ivec active = load_int(pack.active);
+vec det_jacobian = splat(1.0f);
+"""
+
+CELLS = r"""
 if (free.distance.shape[0] > 1) {
     ivec i = clamp(truncate(qx * free.to_cells.c[0] + 0.5f * free.size.c[0]), free.size.c[0]);
     ivec j = clamp(truncate(qy * free.to_cells.c[1] + 0.5f * free.size.c[1]), free.size.c[1]);
@@ -123,63 +97,65 @@ if (free.distance.shape[0] > 1) {
     ivec cell = (i * free.size.c[1] + j) * free.size.c[2] + l;
     ivec distance;
     for (int n = 0; n < LANES; ++n) distance[n] = free.distance.data[cell[n]];
-    visited &= distance == 0;
+    active &= distance == 0;
 }
-if (contraction == NDC) {
-    const vec left = most(ray.line.speed - t * ray.line.slope, all(LEAST * ray.line.speed));
-    t = ray.line.t + t * ray.line.w / left;
-    visited &= t < box.frustum.end;
-}
-store_int(pack.visited, visited);
-store(pack.t, visited ? t : all(0.0f));
+"""
+
+FOUND = r"""
+store_int(pack.active, active);
+store(pack.t, active ? t : splat(0.0f));
 store(pack.det_jacobian, det_jacobian);
 store(pack.x, qx);
 store(pack.y, qy);
 store(pack.z, qz);
-""".replace("LINF", str(LINF))
-    .replace("L2", str(L2))
-    .replace("NDC", str(NDC))
-    .replace("LEAST", f"{LEAST!r}f")
-)
-def locate_pack(
-    box: Box,
-    free: FreeSpace,
-    ray: Ray,
-    contraction: int,
-    packs: wp.array(dtype=Any),
-    slot: int,
-):
-    """What next_sample does with a step, for sixteen: where they are, and which are samples."""
-    ...
+"""
 
-
-@wp.func_native(
-    VECTORS
-    + r"""
+LENGTHS = r"""
 auto& pack = packs.data[slot];
+const vec t = load(pack.t);
 vec length = load(pack.dt);
-if (contraction == NDC) {
-    const vec w = ray.line.w + (load(pack.t) - ray.line.t) * ray.line.slope;
-    length *= w * w / (ray.line.w * ray.line.speed);
-}
+OF_SPACE
 store(pack.length, length);
-""".replace("NDC", str(NDC))
-)
-def measure_pack(ray: Ray, contraction: int, packs: wp.array(dtype=Any), slot: int):
-    """length_of each sample of a pack, for losses."""
-    ...
+"""
 
 
 @cache
-def traversal(sampler: Sampler) -> SimpleNamespace:
-    """The functions that ask the sampler where a step lies.
+def pack_traversal(space: Space) -> SimpleNamespace:
+    """The vector form of what a space does with steps.
+
+    Args:
+        space: Which has a vector form.
+
+    Returns:
+        locate_pack(box, free, ray, packs, slot), measure_pack(ray, packs, slot).
+    """
+    own = space.vectors
+
+    @wp.func_native(VECTORS + PLACES + own.locate + CELLS + own.distance + FOUND)
+    def locate_pack(box: Box, free: FreeSpace, ray: Ray, packs: wp.array(dtype=Any), slot: int):
+        """What next_sample does with a step, for sixteen: where they are, and which are samples."""
+        ...
+
+    @wp.func_native(VECTORS + LENGTHS.replace("OF_SPACE", own.length))
+    def measure_pack(ray: Ray, packs: wp.array(dtype=Any), slot: int):
+        """length_of each sample of a pack, for losses."""
+        ...
+
+    return SimpleNamespace(locate_pack=locate_pack, measure_pack=measure_pack)
+
+
+@cache
+def traversal(sampler: Sampler, space: Space) -> SimpleNamespace:
+    """The functions that ask the sampler where a step lies, and the space what is there.
 
     Args:
         sampler: Where steps lie.
+        space: In which coordinates.
 
     Returns:
-        prepare_ray(box, march, index, origin, direction, offset, contraction) -> Ray,
-        next_sample(box, free, march, ray, first, contraction) -> Sample.
+        clip_ray(box, near and far, index, origin, direction, offset) -> Ray, interval of t,
+        prepare_ray(box, march, index, origin, direction, offset) -> Ray,
+        next_sample(box, free, march, ray, first) -> Sample.
     """
     Steps = sampler.Params
     interval_of, steps_within, step_after = (
@@ -187,6 +163,37 @@ def traversal(sampler: Sampler) -> SimpleNamespace:
         sampler.steps_within,
         sampler.step_after,
     )
+    contracts, stretch = space.contracts, space.stretch
+    enter, contract, det_jacobian = space.enter, space.contract, space.det_jacobian
+    distance_of, ends = space.distance_of, space.ends
+
+    @wp.func
+    def clip_ray(
+        box: Box,
+        between: vec2,  # near and far
+        index: int,
+        origin: vec3,
+        direction: vec3,  # unit
+        offset: real,
+    ):
+        """A ray without its steps, and which interval of t may hold samples.
+
+        That ends before it begins where there is none: where the ray misses the box, is not finite
+        or has no direction, of a lens that folds over.
+        """
+        ray = Ray()
+        ray.index = index
+        ray.offset = offset
+        ray.direction = direction
+        ray, interval = enter(box, ray, origin, between)
+        if wp.static(not contracts):
+            interval = slab(ray.q_origin[0], ray.q_direction[0], interval)
+            interval = slab(ray.q_origin[1], ray.q_direction[1], interval)
+            interval = slab(ray.q_origin[2], ray.q_direction[2], interval)
+        finite = wp.isfinite(ray.q_origin) and wp.isfinite(ray.q_direction)
+        if not (finite and wp.length_sq(ray.q_direction) > real(0.0)):
+            interval = vec2(real(1.0), real(0.0))
+        return ray, interval
 
     @wp.func
     def prepare_ray(
@@ -196,34 +203,12 @@ def traversal(sampler: Sampler) -> SimpleNamespace:
         origin: vec3,
         direction: vec3,  # unit
         offset: real,
-        contraction: int,
     ) -> Ray:
-        """Clip a ray to the box and to [near, far].
-
-        A ray that is not finite or has no direction, of a lens that folds over, meets nothing.
-        """
-        ray = Ray()
-        ray.index = index
-        ray.offset = offset
-        ray.direction = direction
-        interval = vec2(march.near, march.far)
-        if contraction == NDC:
-            line, place, along = enter(box.frustum, origin, direction)
-            ray.line = line
-            ray.q_origin = wp.cw_div(place - box.centre, box.half)
-            ray.q_direction = wp.cw_div(along, box.half)
-            interval[1] = wp.min(interval[1], length_to(line, box.frustum.end))
-        else:
-            ray.q_origin = wp.cw_div(origin - box.centre, box.half)
-            ray.q_direction = wp.cw_div(direction, box.half)
-        if not folds(contraction):
-            interval = slab(ray.q_origin[0], ray.q_direction[0], interval)
-            interval = slab(ray.q_origin[1], ray.q_direction[1], interval)
-            interval = slab(ray.q_origin[2], ray.q_direction[2], interval)
+        """Clip a ray to the box and to [near, far]; it may have no steps there."""
+        ray, interval = clip_ray(box, vec2(march.near, march.far), index, origin, direction, offset)
         ray.begin = int(0)
         ray.end = int(0)
-        finite = wp.isfinite(ray.q_origin) and wp.isfinite(ray.q_direction)
-        if interval[0] <= interval[1] and finite and wp.length_sq(ray.q_direction) > real(0.0):
+        if interval[0] <= interval[1]:
             steps = steps_within(march, ray, interval)
             ray.begin = steps[0]
             ray.end = steps[1]
@@ -236,7 +221,6 @@ def traversal(sampler: Sampler) -> SimpleNamespace:
         march: Steps,
         ray: Ray,
         first: int,  # step to begin looking at
-        contraction: int,
     ) -> Sample:
         """The first sample at or after step `first` that is in the box and not in free space.
 
@@ -257,26 +241,29 @@ def traversal(sampler: Sampler) -> SimpleNamespace:
                 and wp.abs(q[1]) <= real(1.0)
                 and wp.abs(q[2]) <= real(1.0)
             )
-            if inside or folds(contraction):
-                c = contract(q, box.border, contraction)
+            if inside or wp.static(contracts):
+                c = contract(box, q)
                 m = wp.cw_mul(c, free.to_cells) + real(0.5) * vec3(
                     real(free.size[0]), real(free.size[1]), real(free.size[2])
                 )
                 distance = free_distance(free, m)
                 if distance == 0:
-                    sample.t = distance_of(ray, t, contraction)
-                    if contraction == NDC and sample.t >= box.frustum.end:
+                    sample.t = distance_of(ray, t)
+                    if ends(box, sample.t):
                         return sample
                     sample.step = step
                     sample.dt = dt
-                    sample.det_jacobian = det_jacobian_of(q, box.border, contraction)
+                    sample.det_jacobian = det_jacobian(box, q)
                     sample.position = c
                     return sample
-                step = step_after(
-                    march, ray, t + free_length(free, ray, m, distance, contraction), step
-                )
+                leap = real(0.0)
+                if wp.static(contracts):
+                    leap = contracted_length(free, ray, m, distance, real(stretch))
+                else:
+                    leap = straight_length(free, ray, m, distance)
+                step = step_after(march, ray, t + leap, step)
             else:
                 step += 1
         return sample
 
-    return SimpleNamespace(prepare_ray=prepare_ray, next_sample=next_sample)
+    return SimpleNamespace(clip_ray=clip_ray, prepare_ray=prepare_ray, next_sample=next_sample)

@@ -1,1 +1,1 @@
-"""Where things are: cameras, and unbounded space folded into a box."""
+"""Where things are: cameras, and unbounded space contracted into a box."""

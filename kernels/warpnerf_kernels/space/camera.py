@@ -1,4 +1,4 @@
-"""From pixels to rays, and from photographs to batches of rays with their colours.
+"""Camera rays: from pixels to rays, and from photographs to batches of rays with colours.
 
 ``c2w`` has OpenGL axes (x right, y up, looking along -z); pixel (u, v) has its centre at
 (u + 0.5, v + 0.5), row 0 at the top.
@@ -7,14 +7,14 @@
 import warp as wp
 
 from ..base.tiles import prefetch
-from ..base.types import mat33, real, vec2, vec3
+from ..base.types import Rays, mat33, real, vec2, vec3
 
 wp.set_module_options({"enable_backward": False})
 
 RANDOM_BACKGROUND = 1
 
 AHEAD = 8
-"""Rays from the one that a CPU draws to the one whose pixel it asks for."""
+"""Rays from the one that a CPU draws to the one whose pixel it prefetches."""
 
 
 TRIES = 1024
@@ -26,7 +26,7 @@ MANY_PIXELS = 2**26
 
 
 @wp.struct
-class View:
+class CameraParams:
     """A photograph: its camera, its pixels, and their place among those of all photographs."""
 
     rotation: mat33  # camera to world
@@ -43,12 +43,35 @@ class View:
     width: int  # pixels
     first_pixel: wp.int64  # how many pixels count in the views before
     channels: int  # bytes of a pixel: 3, or 4 with straight alpha
-    pixels: wp.array(dtype=wp.uint8)  # [H * W * channels]; empty where only rays are asked for
+    pixels: wp.array(dtype=wp.uint8)  # [H * W * channels]; empty where only rays are requested
     runs: wp.array(dtype=wp.vec2i)  # of pixels that count: how many before, the first; none: all
 
 
+@wp.struct
+class PixelSource:
+    """What pixels are drawn from: photographs, and which blocks of them are covered."""
+
+    views: wp.array(dtype=CameraParams)  # [n_views], by first_pixel
+    n_pixels: wp.int64  # that count in all of them
+    content_distances: wp.array(dtype=real)  # [n_views] scene units
+    block: int  # edge of a block of pixels
+    first_blocks: wp.array(dtype=int)  # [n_views] how many the views before have
+    covered: wp.array(dtype=wp.uint8)  # [n_blocks] 0: nothing is drawn there; empty: draw anywhere
+
+
+@wp.struct
+class Draw:
+    """How a batch of pixels is drawn."""
+
+    seed: int  # of the training
+    rays_before: wp.uint32  # in the training, before ray 0 of this batch
+    background: vec3  # rgb in [0, 1]
+    background_mode: int  # RANDOM_BACKGROUND: a colour of its own for each ray
+    jitter: int  # 1: a random offset for each ray, 0: the middle of the step
+
+
 @wp.func
-def radial_factor(view: View, r2: real):
+def radial_factor(view: CameraParams, r2: real):
     """What radial distortion multiplies a point by, r2 from the axis, and its derivative by r2."""
     two = real(2.0)
     three = real(3.0)
@@ -63,7 +86,7 @@ def radial_factor(view: View, r2: real):
 
 
 @wp.func
-def distort(view: View, p: vec2) -> vec2:
+def distort(view: CameraParams, p: vec2) -> vec2:
     """OpenCV's radial and tangential distortion of a point in the plane z = 1."""
     x = p[0]
     y = p[1]
@@ -79,7 +102,7 @@ def distort(view: View, p: vec2) -> vec2:
 
 
 @wp.func
-def strain(view: View, r2: real) -> real:
+def strain(view: CameraParams, r2: real) -> real:
     """A bound on how far distort's Jacobian is from the identity, up to r2 from the axis.
 
     Not of rational lenses.
@@ -91,7 +114,7 @@ def strain(view: View, r2: real) -> real:
 
 
 @wp.func
-def undistort(view: View, distorted: vec2) -> vec2:
+def undistort(view: CameraParams, distorted: vec2) -> vec2:
     """Inverse of distort, by Newton's method on the two equations.
 
     Where a lens changes little, p starts at the target. Else the target moves out from the
@@ -139,11 +162,11 @@ def undistort(view: View, distorted: vec2) -> vec2:
 
 
 @wp.func
-def fisheye_angle(view: View, distorted: real) -> real:
+def fisheye_angle(view: CameraParams, distorted: real) -> real:
     """The angle to the axis whose distorted one is given, radians; at most view.angle_max.
 
     distorted = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8), by Newton's method
-    between bounds, in whose middle it goes on where it would leave them.
+    between bounds, in whose middle it continues where it would leave them.
     """
     low = real(0.0)
     high = view.angle_max
@@ -172,7 +195,7 @@ def fisheye_angle(view: View, distorted: real) -> real:
 
 
 @wp.func
-def fisheye_direction(view: View, p: vec2) -> vec3:
+def fisheye_direction(view: CameraParams, p: vec2) -> vec3:
     """Unit direction in camera axes of a distorted point, in focal lengths from the principal one.
 
     Points beyond what the lens can see get the direction of the last that it sees on their side.
@@ -186,7 +209,7 @@ def fisheye_direction(view: View, p: vec2) -> vec3:
 
 
 @wp.func
-def pixel_direction(view: View, u: real, v: real) -> vec3:
+def pixel_direction(view: CameraParams, u: real, v: real) -> vec3:
     """Unit direction in world space of the ray through image position (u, v), in pixels."""
     p = vec2((u - view.principal[0]) / view.focal[0], (v - view.principal[1]) / view.focal[1])
     if view.fisheye == 1:
@@ -199,8 +222,11 @@ def pixel_direction(view: View, u: real, v: real) -> vec3:
 
 @wp.kernel
 def camera_rays(
+    # launch
     first: int,
-    view: View,
+    # scene
+    view: CameraParams,
+    # out
     out_origins: wp.array(dtype=vec3),  # [H * W] scene units
     out_directions: wp.array(dtype=vec3),  # [H * W] unit vectors
 ):
@@ -213,7 +239,7 @@ def camera_rays(
 
 
 @wp.func
-def view_of_pixel(views: wp.array(dtype=View), pixel: wp.int64) -> int:
+def view_of_pixel(views: wp.array(dtype=CameraParams), pixel: wp.int64) -> int:
     """The last view whose first pixel is not after `pixel`."""
     low = int(0)
     high = int(views.shape[0])
@@ -226,7 +252,7 @@ def view_of_pixel(views: wp.array(dtype=View), pixel: wp.int64) -> int:
 
 
 @wp.func
-def counting_pixel(view: View, number: int) -> int:
+def counting_pixel(view: CameraParams, number: int) -> int:
     """The pixel of a view that has so many before it that count."""
     if view.runs.shape[0] == 0:
         return number
@@ -254,15 +280,7 @@ def random_below(state: wp.uint32, n: wp.int64):
 
 
 @wp.func
-def draw_pixel(
-    views: wp.array(dtype=View),
-    n_pixels: wp.int64,
-    block: int,
-    first_blocks: wp.array(dtype=int),
-    covered: wp.array(dtype=wp.uint8),
-    seed: int,
-    ray: wp.uint32,
-):
+def draw_pixel(source: PixelSource, seed: int, ray: wp.uint32):
     """A ray's view, its pixel there, and the state of the ray's generator after that.
 
     Where blocks are given, a pixel whose block is not covered is drawn again.
@@ -272,63 +290,50 @@ def draw_pixel(
     local = int(0)
     tries = int(0)
     while tries < wp.static(TRIES):
-        pixel, state = random_below(state, n_pixels)
-        view = view_of_pixel(views, pixel)
-        local = counting_pixel(views[view], int(pixel - views[view].first_pixel))
+        pixel, state = random_below(state, source.n_pixels)
+        view = view_of_pixel(source.views, pixel)
+        local = counting_pixel(source.views[view], int(pixel - source.views[view].first_pixel))
         tries += 1
-        if covered.shape[0] == 0:
+        if source.covered.shape[0] == 0:
             break
-        width = views[view].width
+        width = source.views[view].width
+        block = source.block
         across = (width + block - 1) // block
-        at = first_blocks[view] + local // width // block * across + local % width // block
-        if covered[at] != wp.uint8(0):
+        at = source.first_blocks[view] + local // width // block * across + local % width // block
+        if source.covered[at] != wp.uint8(0):
             break
     return view, local, state
 
 
 @wp.kernel
 def sample_pixels(
-    first: int,  # this launch makes rays first, first + 1, ...
-    # photographs
-    views: wp.array(dtype=View),  # [n_views], by first_pixel
-    n_pixels: wp.int64,  # that count in all of them
-    block: int,  # edge of a block of pixels
-    first_blocks: wp.array(dtype=int),  # [n_views] how many the views before have
-    covered: wp.array(dtype=wp.uint8),  # [n_blocks] 0: nothing is drawn there; empty: draw anywhere
-    content_distances: wp.array(dtype=real),  # [n_views] scene units
-    # how
-    seed: int,  # of the training
-    rays_before: wp.uint32,  # in the training, before ray 0 of this batch
-    background: vec3,  # rgb in [0, 1]
-    background_mode: int,  # RANDOM_BACKGROUND: a colour of its own for each ray
-    jitter: int,  # 1: a random offset for each ray, 0: the middle of the step
+    # launch
+    first: int,  # it makes rays first, first + 1, ...
+    # scene
+    source: PixelSource,
+    # choices
+    draw: Draw,
     # out
-    out_origins: wp.array(dtype=vec3),  # [n_rays] scene units
-    out_directions: wp.array(dtype=vec3),  # [n_rays] unit vectors
-    out_offsets: wp.array(dtype=real),  # [n_rays] in [0, 1)
-    out_background: wp.array(dtype=vec3),  # [n_rays] in [0, 1]
-    out_content_distance: wp.array(dtype=real),  # [n_rays] scene units
+    out_rays: Rays,
     out_target_rgb: wp.array(dtype=vec3),  # [n_rays] the pixel over its background, in [0, 1]
 ):
     """A batch of rays through random pixels, all that count and are covered equally likely."""
     i = first + wp.tid()
-    ray = rays_before + wp.uint32(i)
+    ray = draw.rays_before + wp.uint32(i)
     later = ray + wp.uint32(wp.static(AHEAD))
-    later_v, later_local, _later = draw_pixel(
-        views, n_pixels, block, first_blocks, covered, seed, later
-    )
-    prefetch(views[later_v].pixels, later_local * views[later_v].channels)
-    v, local, state = draw_pixel(views, n_pixels, block, first_blocks, covered, seed, ray)
-    view = views[v]
-    out_origins[i] = view.position
-    out_directions[i] = pixel_direction(
+    later_v, later_local, _later = draw_pixel(source, draw.seed, later)
+    prefetch(source.views[later_v].pixels, later_local * source.views[later_v].channels)
+    v, local, state = draw_pixel(source, draw.seed, ray)
+    view = source.views[v]
+    out_rays.origins[i] = view.position
+    out_rays.directions[i] = pixel_direction(
         view, real(local % view.width) + real(0.5), real(local // view.width) + real(0.5)
     )
-    behind = background
-    if background_mode == RANDOM_BACKGROUND:
+    behind = draw.background
+    if draw.background_mode == RANDOM_BACKGROUND:
         behind = vec3(real(wp.randf(state)), real(wp.randf(state)), real(wp.randf(state)))
     offset = real(0.5)
-    if jitter == 1:
+    if draw.jitter == 1:
         offset = real(wp.randf(state))
     at = local * view.channels
     opaque = wp.uint8(255)
@@ -337,7 +342,7 @@ def sample_pixels(
     unit = real(1.0) / real(255.0)
     alpha = real(opaque) * unit
     rgb = unit * vec3(real(view.pixels[at]), real(view.pixels[at + 1]), real(view.pixels[at + 2]))
-    out_offsets[i] = offset
-    out_background[i] = behind
-    out_content_distance[i] = content_distances[v]
+    out_rays.offsets[i] = offset
+    out_rays.background[i] = behind
+    out_rays.content_distance[i] = source.content_distances[v]
     out_target_rgb[i] = alpha * rgb + (real(1.0) - alpha) * behind

@@ -15,7 +15,9 @@ Source: Mildenhall et al. 2020, appendix C; Sun et al. 2022 (DVGOv2, multiplane 
 
 import warp as wp
 
-from ..base.types import Frustum, Line, real, vec3
+from ..base.parts import SpaceVectors
+from ..base.types import Box, Frustum, Line, Ray, real, vec2, vec3
+from .none import NONE, WITHIN
 
 wp.set_module_options({"enable_backward": False})
 
@@ -28,7 +30,7 @@ LEAST = 0.5 / FARTHEST
 
 
 @wp.func
-def enter(frustum: Frustum, origin: vec3, direction: vec3):
+def line_in(frustum: Frustum, origin: vec3, direction: vec3):
     """Where a ray passes the near plane, or begins beyond it: its line, e_0 and its direction in e.
 
     A ray that never does is outside all along: before the near plane, or behind the far one.
@@ -73,3 +75,55 @@ def stretch_at(line: Line, t: real) -> real:
     """dt/ds at distance t."""
     w = line.w + (t - line.t) * line.slope
     return w * w / (line.w * line.speed)
+
+
+@wp.func
+def enter(box: Box, ray: Ray, origin: vec3, interval: vec2):
+    """The ray in the box's coordinates, up to where it is as far away as is sampled.
+
+    There t is a length in the frustum's coordinates, from where the ray enters it.
+    """
+    line, place, along = line_in(box.frustum, origin, ray.direction)
+    ray.line = line
+    ray.q_origin = wp.cw_div(place - box.centre, box.half)
+    ray.q_direction = wp.cw_div(along, box.half)
+    return ray, vec2(interval[0], wp.min(interval[1], length_to(line, box.frustum.end)))
+
+
+@wp.func
+def distance_of(ray: Ray, t: real) -> real:
+    """t(s), with s what steps are placed by."""
+    return distance_at(ray.line, t)
+
+
+@wp.func
+def length_of(ray: Ray, distance: real, dt: real) -> real:
+    """Of a step that is dt long in the frustum's coordinates."""
+    return dt * stretch_at(ray.line, distance)
+
+
+@wp.func
+def ends(box: Box, distance: real) -> bool:
+    """Steps know no distances, so the frustum says how far they go."""
+    return distance >= box.frustum.end
+
+
+DISTANCE = r"""
+const vec left = max(ray.line.speed - t * ray.line.slope, splat(LEAST * ray.line.speed));
+t = ray.line.t + t * ray.line.w / left;
+active &= t < box.frustum.end;
+""".replace("LEAST", f"{LEAST!r}f")
+
+LENGTH = r"""
+const vec w = ray.line.w + (t - ray.line.t) * ray.line.slope;
+length *= w * w / (ray.line.w * ray.line.speed);
+"""
+
+NDC = NONE._replace(
+    enter=enter,
+    distance_of=distance_of,
+    length_of=length_of,
+    ends=ends,
+    vectors=SpaceVectors(locate=WITHIN, distance=DISTANCE, length=LENGTH),
+)
+"""The space of forward-facing captures: in the frustum's coordinates nothing is contracted."""

@@ -1,4 +1,4 @@
-"""Emission and absorption of one sample, and what lies behind it: the sums along a ray.
+"""Volume rendering of one sample (emission, absorption), and the suffix sum of what lies behind.
 
 Here are the scalar forms, a sample at a time; pack.py has the vector forms, sixteen at a time. The
 walks along a ray that use them are walk.py and walk_packs.py.
@@ -13,8 +13,8 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.struct
-class Matter:
-    """What a sample's density makes of its step."""
+class DensitySample:
+    """The activated density of a sample, and the transmittance of its step."""
 
     sigma: real  # 1 / scene unit
     sigma_slope: real  # d sigma / d raw density
@@ -22,21 +22,24 @@ class Matter:
 
 
 @wp.func
-def matter_of(density: Density, raw_density: real, dt: real) -> Matter:
-    """Activate a raw density, and let light through a step of it."""
+def activate_density(density: Density, raw_density: real, dt: real) -> DensitySample:
+    """Density activation (shifted softplus), and the attenuation of a step of that density."""
     shifted = raw_density + density.shift
-    matter = Matter()
-    matter.sigma = density.scale * softplus(shifted)
-    matter.sigma_slope = density.scale * softplus_slope(shifted)
-    matter.attenuation = wp.exp(-matter.sigma * dt)
-    return matter
+    activated = DensitySample()
+    activated.sigma = density.scale * softplus(shifted)
+    activated.sigma_slope = density.scale * softplus_slope(shifted)
+    activated.attenuation = wp.exp(-activated.sigma * dt)
+    return activated
 
 
 @wp.func
-def shed(behind: real, weight: real, adj_weight: real, limit: real, transmittance: real) -> real:
-    """What lies behind a sample, from what lay behind the one before.
+def advance_suffix(
+    suffix_sum: real, weight: real, adj_weight: real, limit: real, transmittance: real
+) -> real:
+    """The suffix sum behind a sample, from that behind the one before.
 
-    It is a sum over weights that add up to the light that gets there. Shed by subtraction it keeps
-    a rest of rounding, which behind an opaque surface would be all there is; the bound removes it.
+    It is a sum over weights that add up to the light that gets there. Advanced by subtraction it
+    keeps a rest of rounding, which behind an opaque surface would be all there is; the bound
+    removes it.
     """
-    return wp.clamp(behind - weight * adj_weight, -limit * transmittance, limit * transmittance)
+    return wp.clamp(suffix_sum - weight * adj_weight, -limit * transmittance, limit * transmittance)

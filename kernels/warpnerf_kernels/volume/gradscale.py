@@ -1,4 +1,4 @@
-"""Distance scaling of the gradient: Philip & Deschaintre 2023, "Floaters No More", eq. 7.
+"""Gradient scaling by distance: Philip & Deschaintre 2023, "Floaters No More", eq. 7.
 
 Space close to a camera is crossed by many rays of few cameras: samples per volume go as 1 / t^2.
 Each sample's gradient is multiplied by s(t), which takes that out again; the image is untouched.
@@ -62,8 +62,8 @@ const vec ratio = load(pack.t) / content_distance;
 vec scale = ratio * ratio;
 if (jacobian == DENSITY) scale *= load(pack.det_jacobian);
 if (jacobian == PAPER) scale /= load(pack.det_jacobian);
-if (scaling == CLAMPED) scale = scale > 1.0f ? all(1.0f) : scale;
-store(pack.scale, scaling == NONE ? all(1.0f) : scale);
+if (scaling == CLAMPED) scale = scale > 1.0f ? splat(1.0f) : scale;
+store(pack.scale, scaling == NONE ? splat(1.0f) : scale);
 """
 )
 def scale_pack(

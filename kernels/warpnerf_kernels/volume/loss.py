@@ -1,10 +1,11 @@
-"""What a rendered ray's colour is held against its pixel by, and how that flows back."""
+"""Photometric losses, which compare a rendered ray's colour with its pixel, and their adjoints."""
 
 import warp as wp
 
 from ..base.parts import Losses, Photometric
 from ..base.types import Nothing, real, vec3
 from .ray_loss import NONE
+from .sample_loss import NO_SAMPLE_LOSS
 
 wp.set_module_options({"enable_backward": False})
 
@@ -42,7 +43,7 @@ class HuberParams:
 
 @wp.func
 def huber(params: HuberParams, rgb: vec3, target_rgb: vec3) -> real:
-    """Summed over channels: d^2 up to |d| = delta, and from there on the line that goes on so.
+    """Summed over channels: d^2 up to |d| = delta, and from there on its tangent.
 
     Source: Huber 1964, times two, so that it is the squared error where errors are small.
     """
@@ -67,5 +68,5 @@ def adj_huber(params: HuberParams, rgb: vec3, target_rgb: vec3, adj_value: real)
 SQUARED = Photometric(Params=Nothing, value=squared, adj_value=adj_squared)
 HUBER = Photometric(Params=HuberParams, value=huber, adj_value=adj_huber)
 
-PLAIN = Losses(photometric=SQUARED, on_ray=NONE)
+PHOTOMETRIC_ONLY = Losses(photometric=SQUARED, on_ray=NONE, on_samples=NO_SAMPLE_LOSS)
 """The squared error, and nothing else."""

@@ -1,13 +1,13 @@
-"""Sixteen steps of a ray at a time: compositing.py in vectors, for a CPU's cores.
+"""SIMD volume rendering, sixteen steps at a time: compositing.py in vectors, for a CPU's cores.
 
 A core computes many numbers as fast as one, but only where code says so. It computes sixteen in
 less time than eight twice, even where they take two instructions each: a sample is a long chain of
 operations that wait for each other. Each function here is the vector form of the scalar one that
-its docstring names, and tests hold the two together. CUDA, where threads are the vector, and
+its docstring names, and tests compare the two. CUDA, where threads are the vector, and
 float64, which is for checking, run the scalar ones.
 
 The bodies are C++ on Clang's vector types, which compile for any processor. A native function
-cannot return a vector: they hand on what they compute in a ``Pack``, scratch memory of a worker.
+cannot return a vector: they pass on what they compute in a ``Pack``, scratch memory of a worker.
 """
 
 from functools import cache
@@ -19,7 +19,8 @@ from ..base.parts import Encoding, Head, Losses
 from ..base.simd import LANES, VECTORS, lanes, lanes_int
 from ..base.types import Density, Ray, struct
 from .ray_loss import NONE, vector_form
-from .sample_loss import ColourSums
+from .sample_loss import NO_SAMPLE_LOSS, lanes_form
+from .walk import adjoint_type
 
 wp.set_module_options({"enable_backward": False})
 
@@ -27,20 +28,25 @@ wp.set_module_options({"enable_backward": False})
 @cache
 def pack_type(encoding: Encoding, head: Head, losses: Losses) -> type:
     """Sixteen consecutive steps of a ray, which of them are samples, and what those hold."""
-    loss = losses.on_ray
+    loss, on_samples = losses.on_ray, losses.on_samples
+    by_channel = wp.types.matrix((head.n_channels, LANES), wp.float32)
+    for_samples = {
+        "colour_weight": lanes,  # the weight where a sample has a colour, else 0; forward
+        "adj_channel": by_channel,  # what flows back to channels
+    }
     return struct(
         "Pack",
         {
             "step": int,  # of the first lane
             "n_samples": int,
-            "passed": wp.float32,  # light that passes the pack
-            "behind": wp.float32,  # of what flows back, the part that lies behind the pack
+            "transmittance_out": wp.float32,  # light that passes the pack
+            "suffix_sum": wp.float32,  # of what flows back, the part that lies behind the pack
             "depth": wp.float32,  # sum of weight times t
-            "visited": lanes_int,  # -1 where a step is a sample, 0 where it is not
+            "active": lanes_int,  # -1 where a step is a sample, 0 where it is not
             "t": lanes,  # distance from the ray's origin
             "dt": lanes,  # step length
             "det_jacobian": lanes,  # |det J| of the contraction, 1 without
-            "x": lanes,  # position, folded coordinates c
+            "x": lanes,  # position, contracted coordinates c
             "y": lanes,
             "z": lanes,
             "sigma_slope": lanes,  # d sigma / d raw density
@@ -49,7 +55,7 @@ def pack_type(encoding: Encoding, head: Head, losses: Losses) -> type:
             "scale": lanes,  # of the gradient, by distance
             "raw": wp.types.matrix((encoding.vectors.n_by_lane, LANES), wp.float32),
             "adj_raw": wp.types.matrix((encoding.vectors.n_by_lane, LANES), wp.float32),
-            "channel": wp.types.matrix((head.n_channels, LANES), wp.float32),
+            "channel": by_channel,
             "sums": wp.types.vector(head.n_channels, wp.float32),  # of weight times channel
             **dict(encoding.vectors.pack_fields),
             **dict(head.vectors.pack_fields),
@@ -57,21 +63,22 @@ def pack_type(encoding: Encoding, head: Head, losses: Losses) -> type:
             **({"length": lanes} if loss is not NONE else {}),  # of steps, scene units; for it
             **({"adj_density": lanes} if loss.adj_density else {}),  # likewise, of raw densities
             **dict(vector_form(loss).pack_fields),
-            **({"of_samples": wp.types.vector(2, wp.float32)} if losses.on_samples else {}),
+            **(for_samples if on_samples is not NO_SAMPLE_LOSS else {}),
+            **dict(lanes_form(on_samples, head.n_channels).pack_fields),
         },
         __name__,
     )
 
 
 @cache
-def row_type(head: Head, losses: Losses) -> type:
-    """A ray between the two passes."""
+def ray_state_type(head: Head, losses: Losses) -> type:
+    """The state of a ray between the two passes."""
     loss = losses.on_ray
     channels = wp.types.vector(head.n_channels, wp.float32)
     vec3 = wp.types.vector(3, wp.float32)
-    of_colours = {"of_samples": ColourSums, "target_rgb": vec3, "sample_slope": wp.float32}
+    of_samples = losses.on_samples
     return struct(
-        "Row",
+        "RayState",
         {
             "ray": Ray,
             "channels": channels,  # sums of weight times channel, without background
@@ -80,12 +87,13 @@ def row_type(head: Head, losses: Losses) -> type:
             "n_samples": int,
             "slot": int,  # of its first pack
             "rgb": vec3,  # without background
+            "target_rgb": vec3,  # for the loss on samples
             "adj_rgb": vec3,
-            "adj_channels": channels,
-            "adj_opacity": wp.float32,
+            "adj_opacity": wp.float32,  # of the head
+            "adj": adjoint_type(head.n_channels),
             **dict(head.vectors.row_fields),
             **({"loss": loss.State} if loss is not NONE else {}),  # sums over its samples
-            **(of_colours if losses.on_samples else {}),
+            **({"of_samples": of_samples.State} if of_samples is not NO_SAMPLE_LOSS else {}),
         },
         __name__,
     )
@@ -96,26 +104,26 @@ def row_type(head: Head, losses: Losses) -> type:
     + r"""
 auto& pack = packs.data[slot];
 const vec raw = load(pack.raw.data[0]) + density.shift;
-vec e = exponential(-magnitude(raw));
-vec sigma = density.scale * ((raw < 0.0f ? all(0.0f) : raw) + log1p(e));
-vec slope = (raw >= 0.0f ? all(1.0f) : e) / (1.0f + e);
+vec e = exponential(-abs(raw));
+vec sigma = density.scale * ((raw < 0.0f ? splat(0.0f) : raw) + log1p(e));
+vec slope = (raw >= 0.0f ? splat(1.0f) : e) / (1.0f + e);
 vec tau = sigma * load(pack.dt);
 vec attenuation = exponential(-tau);
-vec series = fma(all(-1.0f / 24.0f), tau, all(1.0f / 6.0f));
-series = fma(fma(series, -tau, all(0.5f)), -tau, all(1.0f));
+vec series = fma(splat(-1.0f / 24.0f), tau, splat(1.0f / 6.0f));
+series = fma(fma(series, -tau, splat(0.5f)), -tau, splat(1.0f));
 store(pack.sigma_slope, density.scale * slope);
 const vec alpha = tau < 0.01f ? tau * series : 1.0f - attenuation;
 
-ivec visited = load_int(pack.visited);
-vec light = transmittance * running_product(visited ? attenuation : all(1.0f));
-vec before = UP_1(light, all(transmittance));
-ivec lit = ~(before < transmittance_min);
-visited &= lit;
-store_int(pack.visited, visited);
-store(pack.weight, visited ? before * alpha : all(0.0f));
+ivec active = load_int(pack.active);
+vec light = transmittance * running_product(active ? attenuation : splat(1.0f));
+vec before = SHIFT_LANES_1(light, splat(transmittance));
+ivec reached = ~(before < transmittance_min);
+active &= reached;
+store_int(pack.active, active);
+store(pack.weight, active ? before * alpha : splat(0.0f));
 store(pack.transmittance, light);
-pack.n_samples = count(visited);
-pack.passed = pack.transmittance.c[count(lit) - 1];
+pack.n_samples = count(active);
+pack.transmittance_out = pack.transmittance.c[count(reached) - 1];
 """
 )
 def weigh(
@@ -125,19 +133,9 @@ def weigh(
     packs: wp.array(dtype=Any),
     slot: int,
 ):
-    """compositing.matter_of and the weights of a pack's samples, from their raw densities."""
+    """activate_density and the weights of a pack's samples, from their raw densities."""
     ...
 
-
-OF_SAMPLES = r"""
-const vec counted = weight > WEIGHT_MIN ? weight : all(0.0f);
-vec square = all(0.0f);
-for (int c = 0; c < CHANNELS; ++c) {
-    square = fma(load(pack.channel.data[c]), load(pack.channel.data[c]), square);
-}
-pack.of_samples.c[0] = sum(counted);
-pack.of_samples.c[1] = sum(counted * square);
-"""
 
 COMPOSITE = r"""
 auto& pack = packs.data[slot];
@@ -148,44 +146,51 @@ for (int c = 0; c < CHANNELS; ++c) {
     pack.sums.c[c] = sum(weight * load(pack.channel.data[c]));
 }
 pack.depth = sum(weight * load(pack.t));
+OF_SAMPLES
 """
 
 ADJ_COMPOSITE = r"""
 auto& pack = packs.data[slot];
-const auto& adj = rows.data[row].adj_channels;
+const auto& adj = rows.data[row].adj.channels;
 constexpr int CHANNELS = sizeof(pack.channel) / sizeof(vec);
 vec weight = load(pack.weight);
-vec adj_weight = fma(all(adj_depth), load(pack.t),
+vec adj_weight = fma(splat(adj_depth), load(pack.t),
                      adj.c[CHANNELS - 1] * load(pack.channel.data[CHANNELS - 1]));
 #pragma clang loop unroll(full)
 for (int c = CHANNELS - 2; c >= 0; --c) {
-    adj_weight = fma(all(adj.c[c]), load(pack.channel.data[c]), adj_weight);
+    adj_weight = fma(splat(adj.c[c]), load(pack.channel.data[c]), adj_weight);
 }
 OF_LOSS
 vec light = load(pack.transmittance);
-vec left = behind - running_sum(weight * adj_weight);
-left = least(most(left, -limit * light), limit * light);
+vec left = suffix_sum - running_sum(weight * adj_weight);
+left = min(max(left, -limit * light), limit * light);
 vec adj_tau = fma(light, adj_weight, -left);
 const vec adj_sigma = load(pack.scale) * (load(pack.dt) * adj_tau);
 store(pack.adj_raw.data[0], load(pack.sigma_slope) * adj_sigma OF_DENSITY);
-pack.behind = left[LANES - 1];
+pack.suffix_sum = left[LANES - 1];
+OF_SAMPLES
 """
+
+COLOUR_WEIGHT = "store(pack.colour_weight, weight > WEIGHT_MIN ? weight : splat(0.0f));"
+BY_SAMPLE = "for (int c = 0; c < CHANNELS; ++c) store(pack.adj_channel.data[c], splat(adj.c[c]));"
+"""What both do for a loss on samples: it adds its own to the pack's adj_channel."""
 
 
 @cache
 def compositing(head: Head, losses: Losses) -> tuple[wp.Function, wp.Function]:
-    """composite, what walk.integrate adds up for the samples of a pack, and adj_composite.
+    """composite, what walk.integrate accumulates for the samples of a pack, and adj_composite.
 
     The latter does what walk.adj_integrate does with densities. Where there is a loss on the ray,
     the pack holds what it adds to the slopes of each weight and each raw density.
     """
     loss = losses.on_ray
-    forward = VECTORS + COMPOSITE
-    if losses.on_samples:
-        forward += OF_SAMPLES.replace("WEIGHT_MIN", f"{float(head.weight_min)!r}f")
+    has_sample_loss = losses.on_samples is not NO_SAMPLE_LOSS
+    colour_weight = COLOUR_WEIGHT.replace("WEIGHT_MIN", f"{float(head.weight_min)!r}f")
+    forward = VECTORS + COMPOSITE.replace("OF_SAMPLES", colour_weight if has_sample_loss else "")
     of_loss = "" if loss is NONE else "adj_weight += load(pack.adj_weight);"
     of_density = "+ load(pack.scale) * load(pack.adj_density)" if loss.adj_density else ""
     backward = VECTORS + ADJ_COMPOSITE.replace("OF_LOSS", of_loss).replace("OF_DENSITY", of_density)
+    backward = backward.replace("OF_SAMPLES", BY_SAMPLE if has_sample_loss else "")
 
     @wp.func_native(forward)
     def composite(packs: wp.array(dtype=Any), slot: int): ...
@@ -193,10 +198,10 @@ def compositing(head: Head, losses: Losses) -> tuple[wp.Function, wp.Function]:
     @wp.func_native(backward)
     def adj_composite(
         adj_depth: wp.float32,
-        behind: wp.float32,  # what lies behind the pack before this one
+        suffix_sum: wp.float32,  # what lies behind the pack before this one
         limit: wp.float32,  # of what lies behind, for each unit of light
         rows: wp.array(dtype=Any),
-        row: int,  # whose adj_channels flow back
+        row: int,  # whose adj.channels flow back
         packs: wp.array(dtype=Any),
         slot: int,
     ): ...

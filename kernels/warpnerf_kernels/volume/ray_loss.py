@@ -107,7 +107,7 @@ def vector_form(loss: RayLoss) -> RayLossVectors:
         """The sums with the samples of a pack."""
         after = state
         for lane in range(LANES):
-            if packs[slot].visited[lane] != 0:
+            if packs[slot].active[lane] != 0:
                 weight, t, dt = (
                     packs[slot].weight[lane],
                     packs[slot].t[lane],
@@ -129,7 +129,7 @@ def vector_form(loss: RayLoss) -> RayLossVectors:
         after = before
         adj, adj_raw = lanes(), lanes()
         for lane in range(LANES):
-            if packs[slot].visited[lane] != 0:
+            if packs[slot].active[lane] != 0:
                 weight, t, dt = (
                     packs[slot].weight[lane],
                     packs[slot].t[lane],

@@ -1,35 +1,85 @@
-"""Loss of the colours of single samples, held against the pixel of their ray.
+"""Losses on the colours of a ray's samples: none, and the vector form of those that have none.
 
-    L = factor sum_i w_i |c_i - target|^2,    weights w_i taken as constants
-
-Source: Sun, Sun & Chen 2022 (DVGO). It reaches colours only. Samples that have no colour, because
-they weigh too little, do not count.
+Those of the package are in losses/, a file each.
 """
+
+from functools import cache
+from typing import Any
 
 import warp as wp
 
-from ..base.types import real, vec3
+from ..base.parts import SampleLoss, SampleLossVectors
+from ..base.simd import LANES
+from ..base.types import Nothing, real, vec3
 
 wp.set_module_options({"enable_backward": False})
 
 
-@wp.struct
-class ColourSums:
-    """Over the samples with a colour; with the ray's own sum of colours, all that L needs."""
-
-    weight: real
-    square: real  # of weight times |c|^2
+@wp.func
+def add_nothing(
+    params: Any, state: Nothing, weight: real, channels: Any, target_rgb: vec3
+) -> Nothing:
+    """There are no sums."""
+    return state
 
 
 @wp.func
-def sample_loss(factor: real, sums: ColourSums, rgb: vec3, target_rgb: vec3) -> real:
-    """L, with rgb the sum of weight times colour. Rounding does not make it negative."""
-    crossed = real(2.0) * wp.dot(rgb, target_rgb)
-    total = sums.square - crossed + sums.weight * wp.length_sq(target_rgb)
-    return factor * wp.max(total, real(0.0))
+def no_value(params: Any, state: Nothing, channels: Any, target_rgb: vec3) -> real:
+    """Value of no loss."""
+    return real(0.0)
 
 
-@wp.func
-def adj_sample_loss(slope: real, rgb: vec3, target_rgb: vec3) -> vec3:
-    """dL/dc of a sample over its weight; slope is twice the factor, times what flows back to L."""
-    return slope * (rgb - target_rgb)
+NO_SAMPLE_LOSS = SampleLoss(
+    Params=Nothing, State=Nothing, add=add_nothing, value=no_value, adj_channels=None
+)
+"""The loss that is 0."""
+
+
+@cache
+def lanes_form(loss: SampleLoss, n_channels: int) -> SampleLossVectors:
+    """A loss's vector form, or the scalar functions called for each sample of a pack in turn."""
+    if loss.vectors is not None:
+        return loss.vectors
+    Params, State, add, adj_channels = loss.Params, loss.State, loss.add, loss.adj_channels
+    Channels = wp.types.vector(n_channels, wp.float32)
+    OfLanes = wp.types.matrix((n_channels, LANES), wp.float32)
+
+    @wp.func
+    def channels_of(packs: wp.array(dtype=Any), slot: int, lane: int) -> Channels:
+        channels = Channels()
+        for c in range(n_channels):
+            channels[c] = packs[slot].channel[c, lane]
+        return channels
+
+    @wp.func
+    def add_pack(
+        params: Params, state: State, target_rgb: vec3, packs: wp.array(dtype=Any), slot: int
+    ) -> State:
+        """The sums with the samples of a pack."""
+        after = state
+        for lane in range(LANES):
+            weight = packs[slot].colour_weight[lane]
+            if weight > 0.0:
+                channels = channels_of(packs, slot, lane)
+                after = add(params, after, weight, channels, target_rgb)
+        return after
+
+    @wp.func
+    def adj_add_pack(
+        params: Params,
+        adj_value: wp.float32,
+        target_rgb: vec3,
+        packs: wp.array(dtype=Any),
+        slot: int,
+    ):
+        """What flows back to the channels of a pack's samples, besides what the ray's do."""
+        adj = OfLanes()
+        for lane in range(LANES):
+            if packs[slot].active[lane] != 0:
+                channels = channels_of(packs, slot, lane)
+                own = adj_channels(params, channels, target_rgb, adj_value)
+                for c in range(n_channels):
+                    adj[c, lane] = own[c]
+        packs[slot].adj_channel = packs[slot].adj_channel + adj
+
+    return SampleLossVectors(add_pack, adj_add_pack)

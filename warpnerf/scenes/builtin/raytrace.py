@@ -16,7 +16,7 @@ import numpy as np
 
 from warpnerf.runtime.memory import usable_cores
 from warpnerf.scenes.builtin.solids import Box, Surface, Vec3, make_rays
-from warpnerf.scenes.camera import Camera
+from warpnerf.scenes.cameras.camera import Camera
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -27,7 +27,7 @@ _REACH = 0.7  # scene units: what is farther away leaves the ambient light alone
 _OPEN_RAYS = 24  # directions that sample the ambient light
 _GROUP = 2048  # nodes that are lit together: enough to make numpy's calls worth while
 _CELL = 1.0  # scene units: nodes that are lit together are about as near to each other
-_PIECES = 4  # of rays to lights, each held against the solids' boxes
+_PIECES = 4  # of rays to lights, each compared with the solids' boxes
 _ROUNDING = 1e-4  # scene units by which boxes are larger then, so that no hit is lost
 _AHEAD = 1e-6  # scene units in front of a camera where outlines are cut off
 _EDGES = np.array([(a, a + bit) for a in range(8) for bit in (1, 2, 4) if not a & bit]).T

@@ -31,7 +31,7 @@ from warpnerf.scenes.builtin.room_textures import (
     wood,
 )
 from warpnerf.scenes.builtin.solids import Ball, Box, Cylinder, Room, Texture, Vec3
-from warpnerf.scenes.camera import Camera
+from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.scene import Scene, View
 
 WIDTH, HEIGHT = 160, 120

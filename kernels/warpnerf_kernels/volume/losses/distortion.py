@@ -1,4 +1,4 @@
-"""Distortion: weights of a ray that lie apart cost, so that its matter comes together.
+"""Distortion loss: weights of a ray that lie apart cost, so that its density concentrates.
 
     L = sum_ij w_i w_j |s_i - s_j| + 1/3 sum_i w_i^2 h_i,    s = t / (unit + t)
 
@@ -107,14 +107,15 @@ OF_PACK = (
     VECTORS
     + r"""
 auto& pack = packs.data[slot];
-const vec zero = all(0.0f), weight = load(pack.weight), t = load(pack.t);
+const vec zero = splat(0.0f), weight = load(pack.weight), t = load(pack.t);
 const vec half = 0.5f * load(pack.length), end = t + half;
 const vec begin = t > half ? t - half : zero;
 const vec s = t / (params.unit + t);
 const vec h = params.unit * (end - begin) / ((params.unit + begin) * (params.unit + end));
 const vec spread = (1.0f / 3.0f) * (weight * h), moment = weight * s;
 const vec weights = running_sum(weight), moments = running_sum(moment);
-const vec W = before.weight + UP_1(weights, zero), M = before.moment + UP_1(moments, zero);
+const vec W = before.weight + SHIFT_LANES_1(weights, zero);
+const vec M = before.moment + SHIFT_LANES_1(moments, zero);
 pack.distortion.c[1] = before.weight + weights[LANES - 1];
 pack.distortion.c[2] = before.moment + moments[LANES - 1];
 """

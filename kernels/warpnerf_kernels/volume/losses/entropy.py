@@ -1,6 +1,6 @@
-"""Entropy of the remaining light: a ray should end in matter, or meet none.
+"""Entropy loss on the remaining light: a ray should end at something opaque, or meet nothing.
 
-    L = -(p log p + (1 - p) log(1 - p)),    p = T_end, held to [1e-6, 1 - 1e-6]
+    L = -(p log p + (1 - p) log(1 - p)),    p = T_end, clamped to [1e-6, 1 - 1e-6]
 
 Source: Sun, Sun & Chen 2022 (DVGO). p is the transmittance itself, not 1 less a sum of weights,
 which in float32 would be noise where little light is left.
@@ -33,7 +33,7 @@ def entropy(params: EntropyParams, state: Nothing, transmittance: real) -> real:
 
 @wp.func
 def adj_entropy(params: EntropyParams, transmittance: real) -> real:
-    """dL/dp = log(1 - p) - log p; 0 where p is held."""
+    """dL/dp = log(1 - p) - log p; 0 where p is clamped."""
     if transmittance <= real(LEAST) or transmittance >= real(MOST):
         return real(0.0)
     return params.factor * (wp.log(real(1.0) - transmittance) - wp.log(transmittance))

@@ -1,4 +1,4 @@
-"""Near clip: pushes raw densities near a camera down, as DVGOv2 does; to compare with.
+"""Near-clip loss: pushes raw densities near a camera down, as DVGOv2 does; to compare with.
 
     L = sum of raw densities over samples with t < distance
 
@@ -63,8 +63,8 @@ def value(params: NearClipParams, state: NearClipSum, transmittance: real) -> re
     VECTORS
     + r"""
 auto& pack = packs.data[slot];
-const ivec near = load_int(pack.visited) & (load(pack.t) < params.distance);
-pack.near_clip = before.raw_density + sum(near ? load(pack.raw.data[0]) : all(0.0f));
+const ivec near = load_int(pack.active) & (load(pack.t) < params.distance);
+pack.near_clip = before.raw_density + sum(near ? load(pack.raw.data[0]) : splat(0.0f));
 """
 )
 def sum_up(params: NearClipParams, before: NearClipSum, packs: wp.array(dtype=Any), slot: int):
@@ -76,8 +76,8 @@ def sum_up(params: NearClipParams, before: NearClipSum, packs: wp.array(dtype=An
     VECTORS
     + r"""
 auto& pack = packs.data[slot];
-const ivec near = load_int(pack.visited) & (load(pack.t) < params.distance);
-const vec slope = near ? all(params.factor * adj_value) : all(0.0f);
+const ivec near = load_int(pack.active) & (load(pack.t) < params.distance);
+const vec slope = near ? splat(params.factor * adj_value) : splat(0.0f);
 store(pack.adj_density, load(pack.adj_density) + slope);
 """
 )

@@ -1,4 +1,4 @@
-"""Opacity: a ray should end in matter, as where photographs show something in each of their pixels.
+"""Opacity loss: a ray should end at something opaque, where each pixel shows something.
 
     L = -log o,                         o = 1 - T_end, where o >= LEAST;
     L = -log LEAST + 1 - o / LEAST      below, on the tangent

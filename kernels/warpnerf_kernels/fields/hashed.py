@@ -1,0 +1,264 @@
+"""A hash: tables of entries by level of resolution, whose numbers a matrix decodes together.
+
+    raw(c) = M^T [E_1(c), E_2(c), ..]
+
+Level l is a lattice of cubes over the field, finer from level to level, and E_l(c) the trilinear
+mean of the eight entries around c. Where a level has more nodes than its table may have entries,
+rows of nodes along z are hashed as wholes: a row begins where its i and j say, and its k runs on
+from there. So the two nodes of a row around a sample lie side by side, as they do in a dense grid,
+and in place of eight reads of an entry there are four of a pair. Rows share entries, shifted
+against each other, and training finds out who needs them. The decoder M, [levels width, columns],
+is learned.
+
+Source: Mueller et al. 2022 (SIGGRAPH), Instant-NGP, which hashes i, j and k, and decodes by an MLP.
+"""
+
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from ..base.parts import Encoding
+from ..base.tiles import tile_of
+from ..base.types import real, vec3, vector
+from ..networks.mlp import add_weight
+from .decoder import columns_of, density_column
+from .hashed_packs import PRIME_X, PRIME_Y, vectors_of
+from .interp import lowest_node
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Level:
+    """A lattice of cubes over the field, and its entries."""
+
+    size: wp.vec3i  # nodes along x, y, z, each >= 2
+    to_nodes: vec3  # contracted coordinates to those of this lattice: u = c to_nodes + middle
+    middle: vec3  # u of the field's centre
+    begin: int  # of its entries
+    mask: wp.uint32  # where rows may begin, of what hashing gives; 0: each node has its own entry
+
+
+@cache
+def hash_type(width: int) -> type:
+    """A hash as kernels take it."""
+    Entry = vector(width)
+
+    @wp.struct
+    class Hash:
+        values: wp.array(dtype=Entry)  # [n_entries] level by level, rows along z
+        decoder: wp.array(dtype=real)  # [n_levels width columns] row by row
+        transposed: wp.array2d(dtype=real)  # [n_workers, n] scratch of the vector form
+        levels: wp.array(dtype=Level)  # [n_levels] coarsest first
+        n_active: int  # levels that are read; finer ones are not, and count as 0
+        width: int  # of an entry
+        n_decoded: int  # numbers of raw that are decoded; the others are padding
+
+    return Hash
+
+
+@cache
+def gradient_type(width: int) -> type:
+    """The gradient of a loss with respect to a hash, and to the weights of a head."""
+
+    @wp.struct
+    class Gradient:
+        values: wp.array(dtype=vector(width))  # [n_entries]
+        touched: wp.array(
+            dtype=wp.uint8
+        )  # [n_tiles] 1 where a pair of entries begins that got some
+        decoder: wp.array2d(
+            dtype=real
+        )  # [n_workers, n_levels width columns] a copy for each worker
+        weights: wp.array2d(dtype=real)  # [n_workers, n_weights] likewise
+
+    return Gradient
+
+
+@wp.struct
+class Corner:
+    """Where a position lies in a level."""
+
+    entries: wp.vec4i  # the lower entry of each of the four rows around, by x and y
+    fraction: vec3  # position between the nodes, [0, 1]
+
+
+@wp.func
+def begin_of_row(level: Level, i: int, j: int) -> int:
+    """The entry at which the row of nodes (i, j, 0), (i, j, 1), .. begins."""
+    hashed = (wp.uint32(i) * wp.uint32(PRIME_X)) ^ (wp.uint32(j) * wp.uint32(PRIME_Y))
+    own = (i * level.size[1] + j) * level.size[2]
+    return level.begin + wp.where(level.mask == wp.uint32(0), own, int(hashed & level.mask))
+
+
+@wp.func
+def rows_around(level: Level, i: int, j: int) -> wp.vec4i:
+    """Where the four rows begin that are next to positions in a cell."""
+    return wp.vec4i(
+        begin_of_row(level, i, j),
+        begin_of_row(level, i, j + 1),
+        begin_of_row(level, i + 1, j),
+        begin_of_row(level, i + 1, j + 1),
+    )
+
+
+@wp.func
+def corner_of(level: Level, position: vec3) -> Corner:
+    """Where a position lies in a level."""
+    u = wp.cw_mul(position, level.to_nodes) + level.middle
+    node = lowest_node(u, level.size)
+    at = Corner()
+    k = node[2]
+    at.entries = rows_around(level, node[0], node[1]) + wp.vec4i(k, k, k, k)
+    at.fraction = u - vec3(real(node[0]), real(node[1]), real(node[2]))
+    return at
+
+
+@wp.func
+def share_of(fraction: vec3, row: int) -> real:
+    """How much one of the four rows around a position counts; together they count 1."""
+    x = wp.where(row >= 2, fraction[0], real(1.0) - fraction[0])
+    y = wp.where(row % 2 == 1, fraction[1], real(1.0) - fraction[1])
+    return x * y
+
+
+@wp.func
+def in_level(params: Any, at: Corner):
+    """The mean of a level's eight entries around a position, by where it lies between them."""
+    up = at.fraction[2]
+    total = params.values[at.entries[0]] * real(0.0)
+    for row in range(4):
+        n = at.entries[row]
+        pair = (real(1.0) - up) * params.values[n] + up * params.values[n + 1]
+        total += share_of(at.fraction, row) * pair
+    return total
+
+
+@wp.func
+def adj_in_level(at: Corner, adj: Any, gradient: Any):
+    """Transpose of in_level. Additions are atomic on CUDA; on the CPU one thread may call this."""
+    up = at.fraction[2]
+    for row in range(4):
+        n = at.entries[row]
+        gradient.touched[tile_of(n)] = wp.uint8(1)
+        share = share_of(at.fraction, row) * adj
+        wp.atomic_add(gradient.values, n, (real(1.0) - up) * share)
+        wp.atomic_add(gradient.values, n + 1, up * share)
+
+
+@wp.func
+def place(params: Any, position: vec3) -> vec3:
+    """Where a position lies in the field, [0, 1]^3."""
+    level = params.levels[0]
+    u = wp.cw_mul(position, level.to_nodes) + level.middle
+    return wp.cw_div(u, real(2.0) * level.middle)
+
+
+@cache
+def hashed(
+    width: int, n_levels: int, n_floats: int, n_decoded: int, by_sample: bool = False
+) -> Encoding:
+    """The encoding whose entries hold so many numbers.
+
+    Args:
+        width: Of an entry: 2, 4 or 8.
+        n_levels: How many there are.
+        n_floats: Of a sample: 4, 8, 16, 32 or 64.
+        n_decoded: How many of these are not padding.
+        by_sample: Whether packs hold values after the first four sample by sample.
+    """
+    Hash, Gradient, Raw, Entry = (
+        hash_type(width),
+        gradient_type(width),
+        vector(n_floats),
+        vector(width),
+    )
+    columns = columns_of(n_floats)
+
+    # Loops run to a number that compilers do not know, as in networks.mlp.
+
+    @wp.func
+    def read(params: Hash, position: vec3) -> Raw:
+        """Raw values at a position."""
+        n_numbers, n_decoded = params.width, params.n_decoded
+        raw = Raw()
+        for m in range(params.n_active):
+            around = in_level(params, corner_of(params.levels[m], position))
+            for n in range(n_numbers):
+                row = (m * n_numbers + n) * columns
+                for o in range(n_decoded):
+                    raw[o] += around[n] * params.decoder[row + o]
+        return raw
+
+    @wp.func
+    def adj_read(params: Hash, position: vec3, adj_raw: Raw, gradient: Gradient):
+        """Transpose of read."""
+        n_numbers, n_decoded = params.width, params.n_decoded
+        for m in range(params.n_active):
+            at = corner_of(params.levels[m], position)
+            around = in_level(params, at)
+            adj = Entry()
+            for n in range(n_numbers):
+                row = (m * n_numbers + n) * columns
+                total = real(0.0)
+                for o in range(n_decoded):
+                    total += adj_raw[o] * params.decoder[row + o]
+                    add_weight(gradient.decoder, row + o, around[n] * adj_raw[o])
+                adj[n] = total
+            adj_in_level(at, adj, gradient)
+
+    return Encoding(
+        n_floats=n_floats,
+        Params=Hash,
+        Gradient=Gradient,
+        read=read,
+        adj_read=adj_read,
+        place=place,
+        vectors=vectors_of(width, n_levels, n_floats, n_decoded, columns, by_sample),
+    )
+
+
+@cache
+def node_densities_kernel(width: int) -> wp.Kernel:
+    """Raw densities at nodes of the lattice of the field."""
+    Hash, Density, column = hash_type(width), vector(1), density_column(width)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def node_densities(
+        # launch
+        first: int,
+        # scene
+        params: Hash,
+        # choices
+        columns: int,  # of the decoder
+        size: wp.vec3i,  # X, Y, Z of the field's lattice
+        reach: real,  # contracted coordinates lie in [-reach, reach]
+        begin: int,  # row of nodes along z that is the first of out
+        # out
+        out: wp.array(dtype=Density),  # [n_rows * Z]
+    ):
+        """Raw densities at the nodes of a row along z: fields.hashed.read there."""
+        row = first + wp.tid()
+        x = real((begin + row) // size[1]) / real(size[0] - 1)
+        y = real((begin + row) % size[1]) / real(size[1] - 1)
+        for k in range(size[2]):
+            out[row * size[2] + k] = Density(real(0.0))
+        for m in range(params.n_active):
+            level = params.levels[m]
+            decoder = column(params, m, columns)
+            corner = reach * vec3(real(2.0) * x - real(1.0), real(2.0) * y - real(1.0), real(-1.0))
+            at = corner_of(level, corner)
+            step = real(2.0) * level.middle[2] / real(size[2] - 1)
+            for k in range(size[2]):
+                u = real(k) * step
+                low = wp.clamp(int(u), 0, level.size[2] - 2)
+                up = u - real(low)
+                raw = real(0.0)
+                for side in range(4):
+                    n = at.entries[side] + low
+                    pair = (real(1.0) - up) * params.values[n] + up * params.values[n + 1]
+                    raw += share_of(at.fraction, side) * wp.dot(pair, decoder)
+                out[row * size[2] + k] += Density(raw)
+
+    return node_densities

@@ -1,0 +1,1 @@
+"""Networks that heads shade with, and that encodings may decode with."""

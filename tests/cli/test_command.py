@@ -1,0 +1,446 @@
+"""The command as people run it: what it says, leaves behind, and exits with."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.support import cli_process
+from tests.support.tiny_fields import assert_same_state
+from tests.support.tiny_scenes import picture, save, write_transforms
+from warpnerf.cli import train
+from warpnerf.cli.configured import STEPS_OF_TIMED
+from warpnerf.cli.main import main
+from warpnerf.presets import PRESETS
+from warpnerf.runs.checkpoint import load_checkpoint
+from warpnerf.runs.run import Run
+
+TINY = ("builtin:room-sparse", "--downscale", "8", "--threads", "1")
+
+
+def start(*arguments: str | Path) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "warpnerf", *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def run(*arguments: str | Path) -> tuple[int, str, str]:
+    done = cli_process.run(*arguments)
+    return done.returncode, done.stdout, done.stderr
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A tiny run, and what it printed."""
+    folder = tmp_path_factory.mktemp("runs") / "room"
+    process = start("train", *TINY, "--steps=3e1", "--output", folder)
+    out, err = process.communicate(timeout=240)
+    assert process.returncode == 0, err
+    assert "CUDA" not in err
+    return folder, out
+
+
+def test_help_names_every_option() -> None:
+    assert run("--help")[0] == 0
+    code, out, _ = run("train", "--help")
+    assert code == 0
+    options = ["output", "steps", "time-limit", "scaling", "content-distance", "near", "downscale"]
+    more = ["device", "threads", "seed", "preset", "voxels", "resume", "checkpoint-every"]
+    more += ["model", "model-options", "loss", "overwrite"]
+    for option in [*options, *more]:
+        assert f"--{option}" in out
+    code, out, _ = run("eval", "--help")
+    assert code == 0
+    for option in ("scene", "split", "lpips", "json"):
+        assert f"--{option}" in out
+
+
+def test_version() -> None:
+    process = start("--version")
+    out, _ = process.communicate(timeout=240)
+    assert process.returncode == 0
+    assert out.startswith("warpnerf ")
+
+
+def test_training_leaves_a_whole_run(trained: tuple[Path, str]) -> None:
+    folder, out = trained
+    assert "content distance" in out
+    assert {path.name for path in folder.iterdir()} == {
+        "config.json",
+        "log.jsonl",
+        "checkpoint-00000030.safetensors",
+        "field.safetensors",
+        "metrics.json",
+        "test",
+        "test.png",
+    }
+    assert out.splitlines()[-1] == f"look at {folder / 'test.png'}"
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert len(list((folder / "test").glob("*.png"))) == len(metrics["images"])
+    reports = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+    assert reports[-1]["step"] == 30
+    assert reports[-1]["fraction"] == 1.0
+    config = json.loads((folder / "config.json").read_text())
+    assert (config["scene"], config["downscale"]) == ("builtin:room-sparse", 8)
+
+
+def test_eval_repeats_the_figures(trained: tuple[Path, str], tmp_path: Path) -> None:
+    folder, _ = trained
+    target = tmp_path / "figures.json"
+    code, out, err = run("eval", folder, "--json", target, "--threads", "1")
+    assert code == 0, err
+    figures = json.loads(target.read_text())
+    assert list(figures) == ["mean", "floaters", "images"]
+    for row in (figures["mean"], *figures["images"]):
+        assert np.isfinite([row["psnr"], row["ssim"]]).all()
+    assert figures == json.loads((folder / "metrics.json").read_text())
+    assert f"{figures['mean']['psnr']:.2f}" in out
+
+
+def test_eval_with_lpips(trained: tuple[Path, str], tmp_path: Path) -> None:
+    weights = tmp_path / "weights.safetensors"
+    code, _, err = run("eval", trained[0], "--lpips", weights)
+    assert code == 2
+    assert str(weights) in err and "LPIPS" in err
+    assert "Traceback" not in err
+
+
+def test_eval_of_the_training_views(trained: tuple[Path, str], tmp_path: Path) -> None:
+    target = tmp_path / "figures.json"
+    code, _, err = run("eval", trained[0], "--split", "train", "--json", target)
+    assert code == 0, err
+    names = {image["name"] for image in json.loads(target.read_text())["images"]}
+    held_out = json.loads((trained[0] / "metrics.json").read_text())["images"]
+    assert names
+    assert not names & {image["name"] for image in held_out}
+
+
+def test_a_run_is_not_written_over_unasked(trained: tuple[Path, str]) -> None:
+    folder, _ = trained
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    code, _, err = run("train", *TINY, "--steps", "1", "--output", folder)
+    assert code == 2
+    assert "--overwrite" in err
+    assert f"--resume {folder}" in err
+    assert before == {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_overwrite_replaces_a_run(tmp_path: Path) -> None:
+    (tmp_path / "test").mkdir()
+    older = {"scene": "builtin:room", "downscale": 8, "content_distance": 1.0, "train": {}}
+    (tmp_path / "config.json").write_text(json.dumps(older))
+    for name in ("log.jsonl", "metrics.json", "test/old.png"):
+        (tmp_path / name).write_text("older")
+    code, _, err = run("train", *TINY, "--steps", "3", "--output", tmp_path, "--overwrite")
+    assert code == 0, err
+    lines = (tmp_path / "log.jsonl").read_text().splitlines()
+    assert [json.loads(line)["step"] for line in lines] == [3]
+    assert not (tmp_path / "test" / "old.png").exists()
+    assert json.loads((tmp_path / "metrics.json").read_text())["images"]
+
+
+def test_a_time_limit_takes_the_place_of_the_presets_steps(tmp_path: Path) -> None:
+    few = replace(PRESETS["fast"], steps=2)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(PRESETS, "fast", few)
+        begun = []
+        patch.setattr(train, "_begin", lambda *a: begun.append(a[5]) or 0)
+        for given in (
+            "--time-limit 9",
+            "--time-limit 9 --steps 7",
+            "",
+            "--preset quality --steps 7",
+        ):
+            options = ["--output", str(tmp_path / "a"), *given.split()]
+            assert main(["train", "builtin:room", *options]) == 0
+    assert [config.steps for config in begun] == [STEPS_OF_TIMED, 7, 2, 7]
+    assert [config.time_limit for config in begun] == [9.0, 9.0, None, None]
+
+
+def test_files_that_are_no_run_are_never_touched(tmp_path: Path) -> None:
+    (tmp_path / "thesis.txt").write_text("mine")
+    assert run("train", *TINY, "--output", tmp_path)[0] == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("/nowhere/at/all",), "/nowhere/at/all"),
+        (("builtin:palace",), "builtin:palace"),
+        ((*TINY, "--device", "cuda:9"), "cuda:9"),
+        ((*TINY, "--time-limit", "-3"), "time_limit"),
+        (("builtin:room", "--downscale", "0"), "downscale"),
+        ((*TINY, "--scaling", "cubic"), "scaling"),
+        ((*TINY, "--stesp", "3"), "--steps"),
+        (("",), "empty"),
+    ],
+)
+def test_bad_input_gets_a_sentence(tmp_path: Path, arguments: tuple[str, ...], says: str) -> None:
+    code, out, err = run("train", *arguments, "--output", tmp_path / "run")
+    assert code == 2
+    assert says in out + err
+    assert "Traceback" not in out + err
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("options", [("--device", "cuda:9"), ("--threads", "100000")])
+def test_a_machine_that_is_not_there_is_refused_before_photographs_are_read(
+    tmp_path: Path, options: tuple[str, str]
+) -> None:
+    code, out, err = run("train", *TINY, *options, "--output", tmp_path / "run")
+    assert code == 2
+    assert "reading" not in out
+    assert options[1] in err
+
+
+def test_a_bad_scene_leaves_nothing(tmp_path: Path) -> None:
+    content = write_transforms(tmp_path / "scene")
+    content["frames"][2]["transform_matrix"] = [[1, 0], [0, 1]]
+    save(tmp_path / "scene" / "transforms.json", content)
+    code, _, err = run("train", tmp_path / "scene", "--output", tmp_path / "run")
+    assert code == 2
+    assert err.strip().splitlines()[-1].startswith("warpnerf: error: ")
+    assert "transform_matrix" in err
+    assert "Traceback" not in err
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("damage", ["missing", "empty", "config", "field"])
+def test_eval_of_a_bad_run(trained: tuple[Path, str], tmp_path: Path, damage: str) -> None:
+    run_folder = tmp_path / "run"
+    if damage != "missing":
+        run_folder.mkdir()
+    if damage in ("config", "field"):
+        config = (trained[0] / "config.json").read_text()
+        (run_folder / "config.json").write_text(config[:30] if damage == "config" else config)
+        (run_folder / "field.safetensors").write_bytes(b"no field")
+    code, _, err = run("eval", run_folder)
+    assert code == 2
+    assert str(run_folder) in err
+    assert "Traceback" not in err
+
+
+GROWING = (*TINY, "--steps", "210", "--voxels", "20000")
+"""Grows before the first update after step 200, and trains on for a few steps."""
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "whole"
+    code, _, err = run("train", *GROWING, "--output", folder)
+    assert code == 0, err
+    return folder
+
+
+def begun(folder: Path, *signals: int) -> tuple[int, str, str]:
+    """A training that is sent signals when it is under way: how it ended."""
+    process = start("train", *GROWING, "--output", folder)
+    try:
+        assert process.stdout is not None
+        for line in process.stdout:  # a progress report: training is under way
+            if "step " in line and "loss" in line:
+                break
+        for number in signals:
+            process.send_signal(number)
+        out, err = process.communicate(timeout=240)
+    finally:
+        process.kill()
+    return process.returncode, out, err
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no SIGINT for one process there")
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
+)
+def test_stopped_it_saves_and_says_how_to_go_on(tmp_path: Path, number: int, code: int) -> None:
+    folder = tmp_path / "my run"
+    returned, out, err = begun(folder, number)
+    assert returned == code
+    assert "Traceback" not in err
+    assert len(out.splitlines()) == 1
+    state = load_checkpoint(Run(folder).checkpoints[0])
+    step = state.progress.step
+    saved = f"stopped and saved after step {step}"
+    assert out == f"{saved}; continue with: {Run(folder).resume_command}\n"
+    code, _, err = run("eval", folder, "--threads", "1")  # the field so far
+    assert code == 0, err
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no SIGINT for one process there")
+def test_stopped_and_resumed_a_run_ends_as_if_it_had_not_been(
+    uninterrupted: Path, tmp_path: Path, on_cpu: None
+) -> None:
+    folder = tmp_path / "my run"
+    _, out, _ = begun(folder, signal.SIGINT)
+    assert load_checkpoint(Run(folder).checkpoints[0]).grown == 0
+    command = shlex.split(out.strip().partition("continue with: ")[2])
+    code, out, err = run(*command[1:])
+    assert code == 0, err
+    assert "resuming after step" in out
+    for name in ("field.safetensors", "metrics.json"):
+        assert (folder / name).read_bytes() == (uninterrupted / name).read_bytes()
+    resumed, whole = (load_checkpoint(Run(f).checkpoints[0]) for f in (folder, uninterrupted))
+    assert resumed.grown == 4
+    same = replace(whole.progress, seconds=resumed.progress.seconds)
+    assert_same_state(resumed, replace(whole, progress=same))
+    assert reports(folder) == reports(uninterrupted)
+
+
+def reports(folder: Path) -> list[tuple[int, float]]:
+    lines = (folder / "log.jsonl").read_text().splitlines()
+    return [(line["step"], line["loss"]) for line in map(json.loads, lines)]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no SIGINT for one process there")
+def test_asked_twice_it_ends_at_once_and_the_checkpoint_stays(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    code, out, err = begun(folder, signal.SIGINT, signal.SIGTERM, signal.SIGINT)
+    assert code in (130, 143)
+    assert "Traceback" not in out + err
+    for path in Run(folder).checkpoints:
+        load_checkpoint(path)
+    assert not list(folder.glob(".*"))
+
+
+def test_a_finished_run_is_resumed_to_its_figures(
+    trained: tuple[Path, str], tmp_path: Path
+) -> None:
+    folder = shutil.copytree(trained[0], tmp_path / "run")
+    before = (folder / "checkpoint-00000030.safetensors").stat().st_mtime_ns
+    for name in ("metrics.json", "field.safetensors"):
+        (folder / name).unlink()
+    code, _, err = run("train", "--resume", folder)
+    assert code == 0, err
+    for name in ("metrics.json", "field.safetensors"):
+        assert (folder / name).read_bytes() == (trained[0] / name).read_bytes()
+    assert (folder / "checkpoint-00000030.safetensors").stat().st_mtime_ns == before
+
+
+def test_other_threads_are_allowed_and_noted(trained: tuple[Path, str]) -> None:
+    code, out, err = run("train", "--resume", trained[0], "--threads", "2")
+    assert code == 0, err
+    assert "threads 2 instead of 1" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("--steps", "31"), "steps is 31"),
+        (("--time-limit", "5"), "time_limit is 5.0"),
+        (("--near", "0.1"), "march.near is 0.1"),
+        (("--seed", "1"), "seed is 1"),
+        (("--model", "sh"), "model"),
+        (("--model-options", "width=48"), "model.width is 48"),
+        (("--downscale", "8"), "--downscale does not go with --resume"),
+        (("--downscale", "0"), "--downscale does not go with --resume"),
+        (("--preset", "fast"), "--preset does not go with --resume"),
+        (("--overwrite",), "--overwrite does not go with --resume"),
+        (("--scaling", "None"), "--scaling cannot be None; leave it out"),
+        (("--scaling=None",), "--scaling cannot be None; leave it out"),
+        (("--output", "elsewhere"), "--output does not go with --resume"),
+    ],
+)
+def test_what_would_change_a_resumed_run_is_refused(
+    trained: tuple[Path, str], arguments: tuple[str, ...], says: str
+) -> None:
+    before = {path: path.stat().st_mtime_ns for path in trained[0].rglob("*")}
+    code, _, err = run("train", "--resume", trained[0], *arguments)
+    assert code == 2
+    assert says in err
+    assert "Traceback" not in err
+    assert {path: path.stat().st_mtime_ns for path in trained[0].rglob("*")} == before
+
+
+def test_another_scene_is_refused(trained: tuple[Path, str], tmp_path: Path) -> None:
+    content = write_transforms(tmp_path / "scene")
+    for i, frame in enumerate(content["frames"]):
+        Image.fromarray(picture(i, width=96, height=96)).save(
+            tmp_path / "scene" / frame["file_path"]
+        )
+    content |= {"w": 96, "h": 96}
+    save(tmp_path / "scene" / "transforms.json", content)
+    code, _, err = run("train", tmp_path / "scene", "--resume", trained[0])
+    assert code == 2
+    assert "scene is not what the training to be resumed has seen" in err
+
+
+def test_a_new_run_wants_scene_and_output(tmp_path: Path) -> None:
+    for arguments in ((), ("builtin:room",), ("--output", tmp_path / "run")):
+        code, _, err = run("train", *arguments)
+        assert code == 2
+        assert "SCENE" in err and "--output" in err and "--resume" in err
+
+
+SPOIL = """
+import sys
+from warpnerf.cli import main
+from warpnerf.training import trainer
+update = trainer.Trainer.update
+def spoiled(self):
+    update(self)
+    if self.steps_done == int(sys.argv[1]):
+        self.storage.values.fill_(float("nan"))
+trainer.Trainer.update = spoiled
+sys.exit(main.main(sys.argv[2:]))
+"""
+
+
+@pytest.mark.parametrize(("bad_step", "kept"), [(1, "Nothing was saved"), (4, "Step 3 is saved")])
+def test_what_is_not_finite_ends_the_run(tmp_path: Path, bad_step: int, kept: str) -> None:
+    folder = tmp_path / "run"
+    only = ("--content-distance", "2")  # no short training before it
+    arguments = ("train", *TINY, *only, "--output", str(folder), "--checkpoint-every", "1e-9")
+    process = subprocess.run(
+        [sys.executable, "-c", SPOIL, str(bad_step), *arguments],
+        capture_output=True,
+        text=True,
+        timeout=240,
+    )
+    assert process.returncode == 1
+    assert f"not finite after step {bad_step}" in process.stderr
+    assert kept in process.stderr
+    assert "Traceback" not in process.stderr
+    for path in Run(folder).checkpoints:
+        assert load_checkpoint(path).progress.step < bad_step
+
+
+def test_a_folder_that_is_trained_into_is_left_alone(trained: tuple[Path, str]) -> None:
+    folder = trained[0]
+    with Run(folder).only_writer():
+        for options in (("--resume", folder), (*TINY, "--output", folder, "--overwrite")):
+            code, _, err = run("train", *options)
+            assert code == 2 and f"process {os.getpid()} is training into this folder" in err
+    assert (folder / "field.safetensors").exists()
+
+
+def test_a_training_that_nobody_reads_goes_on(tmp_path: Path) -> None:
+    process = start("train", *TINY, "--steps", "30", "--output", tmp_path / "run")
+    assert process.stdout is not None and process.stderr is not None
+    assert process.stdout.readline().startswith("reading")
+    process.stdout.close()
+    err = process.stderr.read()
+    assert process.wait(timeout=240) == 0, err
+    assert "Traceback" not in err and "Broken pipe" not in err
+    assert (tmp_path / "run" / "metrics.json").exists()
+
+
+def test_what_is_odd_is_said_in_training(tmp_path: Path) -> None:
+    options = ("--steps", "3", "--content-distance", "5000", "--output", tmp_path / "run")
+    code, out, err = run("train", *TINY, *options)
+    assert code == 0, err
+    assert "warning: the content distance 5000 is " in out

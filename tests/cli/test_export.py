@@ -1,0 +1,111 @@
+"""`warpnerf export` on a tiny run: what it writes, says, and refuses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.exporting.test_cameras import ball_scene
+from tests.support import cli_process
+from tests.support.solid_fields import LEVEL, ball_field, read_ply
+from tests.support.tiny_scenes import write_transforms
+from warpnerf.checks import InputError
+from warpnerf.cli.export import export_command
+from warpnerf.config import TrainConfig
+from warpnerf.exporting.export import FORMATS, export
+from warpnerf.runs.run import Run
+from warpnerf.scenes.formats.load import load_scene
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run whose scene is the ball's, written by the command's own format."""
+    folder = tmp_path_factory.mktemp("export")
+    export(ball_field(), folder / "scene", scene=ball_scene(), level=LEVEL)
+    run = Run(folder / "run")
+    scene = load_scene(folder / "scene")
+    run.create(scene, str(folder / "scene"), 1, scene.content_distance, TrainConfig())
+    run.save_field(ball_field())
+    return folder / "run"
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("ending", [e for e in FORMATS if e not in (".html", "")])
+def test_every_ending_becomes_a_file(
+    run_folder: Path, tmp_path: Path, ending: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    target = tmp_path / f"BALL{ending.upper()}"
+    target.write_bytes(b"older")
+    assert export_command(run_folder, target, threads=1) == 0
+    assert len(target.read_bytes()) > 1000
+    assert [path.name for path in tmp_path.iterdir()] == [target.name]
+    said = capsys.readouterr().out
+    kind = FORMATS[ending]
+    assert f"nodes as {kind if kind.endswith('s') else 'a ' + kind}\n" in said
+    assert f"wrote {target}" in said
+    assert "10 of 10 training cameras" in said
+
+
+def test_options_reach_the_surface(run_folder: Path, tmp_path: Path) -> None:
+    whole, half = tmp_path / "whole.ply", tmp_path / "half.ply"
+    export_command(run_folder, whole, level=LEVEL, threads=1)
+    export_command(run_folder, half, level=LEVEL, crop=(-1, -1, -1, 0.1, 1, 1), threads=1)
+    points, _ = read_ply(half.read_bytes())
+    assert points["x"].max() <= 0.1 < read_ply(whole.read_bytes())[0]["x"].max()
+    assert np.hypot(*(points[c] - m for c, m in zip("xy", (0.1, -0.05), strict=True))).max() < 0.61
+
+
+@pytest.mark.parametrize(
+    ("file", "options", "says"),
+    [
+        ("ball.stl", {}, r"let the name end in .*\.glb.*, or in nothing for a folder"),
+        ("nowhere/ball.ply", {}, "its folder does not exist"),
+        ("folder.ply", {}, "is a folder"),
+        ("ball.ply", {"level": -1.0}, "level must be"),
+        ("ball.ply", {"level": 1e7}, "where it is .* to 400 per"),
+        ("ball.ply", {"crop": (5, 5, 5, 6, 6, 6)}, "lies outside of the field"),
+        ("ball.ply", {"crop": (1, 0, 0, 0, 1, 1)}, "the first below the second"),
+        ("ball.splat.ply", {"level": 3.0}, "level is of surfaces"),
+        ("ball.npz", {"min_size": 3.0}, "min_size is of surfaces"),
+        ("ball.npz", {"crop": (-0.01, 0, 0, 0.04, 1, 1)}, "fewer than two nodes"),
+        ("ball.ply", {"scene": "/no/such/place"}, "does not exist"),
+        ("ball.ply", {"device": "cuda:77"}, "device"),
+    ],
+)
+def test_bad_input_is_refused_and_nothing_is_written(
+    run_folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    file: str,
+    options: dict[str, Any],
+    says: str,
+) -> None:
+    def takes_long(*_: object) -> None:
+        pytest.fail("looks through all cameras first")
+
+    monkeypatch.setattr("warpnerf.exporting.export.visibility", takes_long)
+    (tmp_path / "folder.ply").mkdir()
+    before = contents(run_folder)
+    with pytest.raises(InputError, match=says):
+        export_command(run_folder, tmp_path / file, **options)
+    assert contents(run_folder) == before
+    assert [path.name for path in tmp_path.iterdir()] == ["folder.ply"]
+
+
+def test_what_is_no_run_ends_with_a_sentence(tmp_path: Path) -> None:
+    done = cli_process.run("export", tmp_path, tmp_path / "a.ply")
+    assert done.returncode == 2
+    assert done.stderr.strip().endswith("config.json does not exist; name the folder of a run.")
+
+
+def test_cameras_that_look_away_see_nothing_and_that_is_said(tmp_path: Path) -> None:
+    write_transforms(tmp_path / "scene", 6)
+    away = load_scene(tmp_path / "scene")
+    with pytest.raises(InputError, match="keep what is unseen"):
+        export(ball_field(), tmp_path / "a.ply", level=LEVEL, scene=away, min_size=2.5)

@@ -1,0 +1,55 @@
+"""`warpnerf inspect`: a table, JSON, and a plan."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from tests.support.tiny_scenes import write_transforms
+from warpnerf.checks import InputError
+from warpnerf.cli.inspect import InspectOptions, inspect_command
+
+
+def test_a_table_and_a_plan(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_transforms(tmp_path / "scene", 6)
+    plan = tmp_path / "plan.png"
+    assert (
+        inspect_command(
+            InspectOptions(scene=str(tmp_path / "scene"), output=plan), {"threads": ("3",)}
+        )
+        == 0
+    )
+    said = capsys.readouterr().out
+    assert said.startswith("scene\n  format")
+    assert "on 3 CPU threads" in said
+    assert said.endswith(f"wrote {plan}\n")
+    with Image.open(plan) as picture:
+        assert picture.size > (1000, 500)
+    assert {path.name for path in tmp_path.iterdir()} == {"scene", "plan.png"}
+
+
+def test_json(tmp_path: Path) -> None:
+    write_transforms(tmp_path / "scene", 6)
+    file = tmp_path / "facts.json"
+    options = InspectOptions(scene=str(tmp_path / "scene"), json=file)
+    assert inspect_command(options, {"march.near": ("50",)}) == 0
+    facts = json.loads(file.read_text())
+    assert facts["views"] == 6
+    assert any("the near plane begins 50" in finding for finding in facts["odd"])
+    with pytest.raises(InputError, match=r"--json .*its folder does not exist"):
+        inspect_command(
+            InspectOptions(scene=options.scene, json=tmp_path / "nowhere" / "facts.json")
+        )
+
+
+@pytest.mark.parametrize("output", ["plan.jpg", "nowhere/plan.png", "folder.png"])
+def test_a_plan_that_cannot_be_written_is_refused(tmp_path: Path, output: str) -> None:
+    write_transforms(tmp_path / "scene", 6)
+    (tmp_path / "folder.png").mkdir()
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(InputError, match=f"--output .*{output}"):
+        inspect_command(InspectOptions(scene=str(tmp_path / "scene"), output=tmp_path / output))
+    assert sorted(tmp_path.rglob("*")) == before

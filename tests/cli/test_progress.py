@@ -1,0 +1,45 @@
+"""Progress where there is no terminal: plain lines, not one for each report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from warpnerf.cli import progress
+from warpnerf.cli.progress import ProgressBar
+
+Lines = Callable[[list[tuple[float, float, str]]], list[str]]
+
+
+@pytest.fixture
+def lines_of(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Lines:
+    """What is printed of reports: seconds since the one before, fraction, words."""
+
+    def lines_of(reports: list[tuple[float, float, str]]) -> list[str]:
+        now = 100.0
+        monkeypatch.setattr(progress.time, "monotonic", lambda: now)
+        with ProgressBar("first") as bar:
+            for seconds, fraction, text in reports:
+                now += seconds
+                bar.report(fraction, text)
+        return capsys.readouterr().out.splitlines()
+
+    return lines_of
+
+
+def test_plain_lines_are_few_and_end_with_the_last(lines_of: Lines) -> None:
+    assert lines_of([(0.125, step / 100, f"step {step}") for step in range(1, 101)]) == [
+        "  1%  step 1",
+        " 41%  step 41  7 s left",
+        " 81%  step 81  2 s left",
+        "100%  step 100  0 s left",
+    ]
+
+
+def test_what_came_before_the_first_report_is_not_expected_again(lines_of: Lines) -> None:
+    """Half a minute of compiling, and a run that is resumed from its middle."""
+    assert lines_of([(30.0, 0.5, "step 50"), (10.0, 0.6, "step 60")]) == [
+        " 50%  step 50",
+        " 60%  step 60  40 s left",
+    ]

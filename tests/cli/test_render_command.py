@@ -1,0 +1,185 @@
+"""`warpnerf render` on a tiny run: what it writes, says, and refuses."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.support import cli_process
+from tests.support.tiny_fields import tiny_field
+from tests.support.tiny_scenes import ring, write_transforms
+from warpnerf.checks import InputError
+from warpnerf.cli import render
+from warpnerf.config import TrainConfig
+from warpnerf.media.recorded_path import Key, RecordedPath
+from warpnerf.runs.run import Run
+from warpnerf.scenes.formats.load import load_scene
+
+OF_RUN = {"scene", "device", "threads"}
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("render")
+    write_transforms(folder / "scene", 6)
+    run = Run(folder / "run")
+    scene = load_scene(folder / "scene")
+    run.create(scene, str(folder / "scene"), 1, scene.content_distance, TrainConfig())
+    run.save_field(tiny_field())
+    return folder / "run"
+
+
+def render_command(folder: Path, **options: Any) -> int:
+    of_run = {name: options.pop(name) for name in OF_RUN & options.keys()}
+    return render.render_command(folder, render.RenderOptions(**options), **of_run)
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("path", ["auto", "orbit", "through", "back"])
+def test_a_path_becomes_a_video(
+    run_folder: Path, tmp_path: Path, path: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    target = tmp_path / "frames"
+    options = {"fps": 10.0, "seconds": 0.5, "size": (30, 20), "threads": 1}
+    assert render_command(run_folder, path=path, output=target, **options) == 0
+    pictures = [Image.open(file) for file in sorted(target.iterdir())]
+    assert len(pictures) == 5
+    assert pictures[0].width == 2 * 30 + 4
+    assert np.asarray(pictures[0])[:20, :30].std() > 0.0
+    said = capsys.readouterr().out
+    assert f"path '{'orbit' if path == 'auto' else path}'" in said
+    assert "depth from" in said and "scene units" in said
+    assert "frame 5 of 5" in said
+    assert f"wrote {target}" in said
+
+
+def test_a_recorded_path_becomes_a_video_of_its_own_size_and_length(
+    run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    keys = [
+        Key(seconds=0.5 * i, fov=40.0, c2w=pose[:3].tolist()) for i, pose in enumerate(ring(5)[:3])
+    ]
+    file = tmp_path / "mine.json"
+    file.write_bytes(RecordedPath(width=30, height=20, keys=keys).to_json())
+    target = tmp_path / "frames"
+    assert render_command(run_folder, path=str(file), output=target, fps=10.0, threads=1) == 0
+    pictures = [Image.open(frame) for frame in sorted(target.iterdir())]
+    assert len(pictures) == 10 and pictures[0].width == 2 * 30 + 4
+    assert "path " + str(file) in capsys.readouterr().out
+    shown = np.asarray(pictures[-1])[:20, :30] / 255.0
+    field = Run(run_folder).load_field("cpu", 1)[0]
+    last = RecordedPath(width=30, height=20, keys=keys).cameras(10)[-1]
+    np.testing.assert_allclose(shown, field.render(last).rgb, atol=0.01)
+    assert shown.std() > 0.05
+    options: dict[str, Any] = {"seconds": 0.3, "size": (24, 12), "fps": 10.0, "threads": 1}
+    assert render_command(run_folder, path=str(file), **options) == 0
+    assert (run_folder / "mine.mp4").exists()
+
+
+@pytest.mark.parametrize(
+    ("path", "says"),
+    [
+        ("spiral", r"--path spiral is none of auto, orbit, through, back"),
+        ("no/such.json", "no/such.json"),
+    ],
+)
+def test_a_path_that_is_none_is_refused(run_folder: Path, path: str, says: str) -> None:
+    before = contents(run_folder)
+    with pytest.raises(InputError, match=says):
+        render_command(run_folder, path=path)
+    assert contents(run_folder) == before
+
+
+def test_by_default_the_video_goes_into_the_run(run_folder: Path) -> None:
+    assert render_command(run_folder, fps=10.0, seconds=0.3, depths=(1.0, 4.0), threads=1) == 0
+    assert (run_folder / "video.mp4").read_bytes()[4:8] == b"ftyp"
+
+
+def test_stills_are_those_of_the_split(run_folder: Path, tmp_path: Path) -> None:
+    assert render_command(run_folder, stills="test", output=tmp_path / "a", threads=1) == 0
+    assert [path.name for path in (tmp_path / "a").iterdir()] == ["images_000.png"]
+    assert Image.open(tmp_path / "a" / "images_000.png").width == 2 * 8 + 4
+    options = {"size": (31, 17), "output": tmp_path / "b", "threads": 1}
+    assert render_command(run_folder, stills="all", **options) == 0
+    assert len(list((tmp_path / "b").iterdir())) == 6
+    assert Image.open(tmp_path / "b" / "images_003.png").width == 2 * 31 + 4
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"seconds": 0.0}, "--seconds"),
+        ({"seconds": 1e9}, "frames, more than"),
+        ({"fps": float("nan")}, "frame rate"),
+        ({"size": (0, 9)}, "width"),
+        ({"depths": (3.0, 1.0)}, "range of depths"),
+        ({"distance": -1.0, "path": "back"}, "distance of the path"),
+        ({"scene": "/no/such/place"}, "does not exist"),
+        ({"output": "a", "stills": "val", "fps": None, "seconds": None}, "no 'val' views"),
+        ({"stills": "test", "seconds": None}, "--fps and --seconds are of a video"),
+        ({"stills": "test", "fps": None}, "--fps and --seconds are of a video"),
+        ({"output": "film.avi"}, r"\.mp4 or \.gif"),
+        (
+            {"output": "a.mp4", "stills": "test", "fps": None, "seconds": None},
+            "stills go into a folder",
+        ),
+        (
+            {"output": "nowhere/stills", "stills": "test", "fps": None, "seconds": None},
+            "folder above",
+        ),
+        ({"device": "cuda:77"}, "device"),
+    ],
+)
+def test_bad_options_are_refused_and_nothing_is_written(
+    run_folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    options: dict[str, Any],
+    says: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    chosen = {"output": Path("film.gif"), "fps": 10.0, "seconds": 0.3, **options}
+    chosen["output"] = Path(chosen["output"])
+    before = contents(run_folder)
+    with pytest.raises(InputError, match=says):
+        render_command(run_folder, **chosen)
+    assert contents(run_folder) == before
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_no_run_ends_with_a_sentence(tmp_path: Path) -> None:
+    done = cli_process.run("render", tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.strip().endswith("config.json does not exist; name the folder of a run.")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_ctrl_c_leaves_nothing_behind(run_folder: Path, tmp_path: Path) -> None:
+    target = tmp_path / "film.gif"
+    command = [sys.executable, "-m", "warpnerf", "render", str(run_folder), "--seconds", "600"]
+    process = subprocess.Popen(
+        [*command, "--output", str(target)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    while "frame" not in process.stdout.readline():  # the first report of a frame
+        assert process.poll() is None
+    time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=240)
+    assert process.returncode == 130
+    assert "Traceback" not in err
+    assert list(tmp_path.iterdir()) == []

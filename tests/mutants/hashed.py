@@ -1,0 +1,249 @@
+"""Mutants of a hash: how it is read, and the way that its gradients take."""
+
+from mutant import Mutant, of_host
+
+FILE, PACKS, DECODER = "fields/hashed.py", "fields/hashed_packs.py", "fields/decoder.py"
+HOST = "fields/hashed.py"
+ORACLE = "kernels/test_hashed.py::test_against_the_oracle[kind0-0.3]"
+FLAGS = "kernels/test_hashed.py::test_flags_are_those_of_pairs"
+NODES = "kernels/test_hashed.py::test_densities_at_nodes_are_what_is_read_there[0.3]"
+SHAPES = "kernels/test_hashed.py::test_levels_lie_one_behind_the_other"
+ACTIVE = "kernels/test_hashed.py::test_levels_are_read_as_the_lattice_grows"
+PLAIN = "kernels/test_hashed_packed.py::test_packs_against_the_plain_form[rgb-none]"
+OTHER = "kernels/test_hashed_packed.py::test_other_entries[deferred-2]"
+INACTIVE = "kernels/test_hashed_packed.py::test_levels_that_are_not_active"
+SEVERAL = "kernels/test_hashed_packed.py::test_one_worker_against_more"
+TILES = "kernels/test_hashed_packed.py::test_flags_cover_all_that_is_not_0"
+TRAINING = "fields/test_hashed_training.py"
+FREE = f"{TRAINING}::test_free_cells_are_those_of_less_opaque_nodes"
+EPSILON = f"{TRAINING}::test_adam_has_an_epsilon_of_its_own"
+
+MUTANTS = [
+    # the plain form
+    Mutant("begin_of_row: a prime", "fields/hashed_packs.py", "805459861", "805459863", ORACLE),
+    Mutant("begin_of_row: added, not xored", FILE, ") ^ (wp", ") + (wp", ORACLE),
+    Mutant(
+        "begin_of_row: levels on top of each other",
+        FILE,
+        "return level.begin + ",
+        "return ",
+        ORACLE,
+    ),
+    Mutant(
+        "begin_of_row: rows of one's own by x alone", FILE, "(i * level.size[1] + j)", "i", ORACLE
+    ),
+    Mutant(
+        "rows_around: rows along x for those along y",
+        FILE,
+        "begin_of_row(level, i, j + 1)",
+        "begin_of_row(level, i + 1, j)",
+        ORACLE,
+    ),
+    Mutant("share_of: x and y exchanged", FILE, "row >= 2", "row % 2 == 1", ORACLE),
+    Mutant(
+        "in_level: the lower entry alone",
+        FILE,
+        " + up * params.values[n + 1]\n        total",
+        "\n        total",
+        ORACLE,
+    ),
+    Mutant(
+        "adj_in_level: all for the lower entry",
+        FILE,
+        "(real(1.0) - up) * share)",
+        "share)",
+        ORACLE,
+    ),
+    Mutant(
+        "adj_in_level: one row not flagged",
+        FILE,
+        "gradient.touched[tile_of(n)]",
+        "gradient.touched[tile_of(at.entries[0])]",
+        FLAGS,
+    ),
+    Mutant(
+        "read: the first level again",
+        FILE,
+        "params.levels[m], position))",
+        "params.levels[0], position))",
+        ORACLE,
+    ),
+    Mutant(
+        "adj_read: one level's rows of the decoder for all",
+        FILE,
+        "row = (m * n_numbers + n) * columns",
+        "row = n * columns",
+        ORACLE,
+        2,
+        2,
+    ),
+    Mutant(
+        "node_densities: slabs begin at the first row",
+        FILE,
+        "(begin + row) // size[1]",
+        "row // size[1]",
+        f"{TRAINING}::test_densities_in_slabs",
+    ),
+    Mutant("node_densities: one level", FILE, "+= Density(raw)", "= Density(raw)", NODES),
+    Mutant("node_densities: steps of the level", FILE, "u = real(k) * step", "u = real(k)", NODES),
+    # packs
+    Mutant("corners_of: a row's hash", PACKS, "row(2, x + X_PRIMEu, y)", "row(2, x, y)", PLAIN),
+    Mutant(
+        "corners_of: levels on top of each other", PACKS, "node[2] + level.begin", "node[2]", PLAIN
+    ),
+    Mutant(
+        "corners_of: rows of one's own",
+        PACKS,
+        "(n / 2 * of_x + n % 2 * of_y)",
+        "(n % 2 * of_x + n / 2 * of_y)",
+        PLAIN,
+    ),
+    Mutant("corners_of: all stay", PACKS, "same &= node[axis] == before;", "", PLAIN),
+    Mutant("corners_of: what is no sample may be left", PACKS, "& active & active << 1", "", PLAIN),
+    Mutant(
+        "read_pack: the corners of the next level",
+        PACKS,
+        "= corners[level % 2]",
+        "= corners[(level + 1) % 2]",
+        PLAIN,
+    ),
+    Mutant("read_pack: inactive levels are left", PACKS, "features_of(r)[n] = 0.0f", ";", INACTIVE),
+    Mutant(
+        "read_pack: the lower node alone",
+        PACKS,
+        "both.hi - both.lo, both.lo)",
+        "both.lo - both.lo, both.lo)",
+        PLAIN,
+    ),
+    Mutant(
+        "add_level: all for the lower node",
+        PACKS,
+        "both.lo = adj - both.hi",
+        "both.lo = adj",
+        PLAIN,
+    ),
+    Mutant(
+        "add_level: cells begin with what was before",
+        PACKS,
+        "begins ? pair_vec(0.0f) : sums[n]",
+        "sums[n]",
+        PLAIN,
+    ),
+    Mutant(
+        "add_level: a cell's samples each by themselves",
+        PACKS,
+        "if (corners.stays >> (lane + 1) & 1) continue;",
+        "",
+        PLAIN,
+    ),
+    Mutant("add_pair: set, not added", PACKS, "*pair = *pair + sum", "*pair = sum", PLAIN),
+    Mutant(
+        "add_pair: not flagged",
+        PACKS,
+        "flags[(unsigned)entry / TILE] = 1;  //",
+        "flags[0] = 1;  //",
+        TILES + "[1]",
+    ),
+    Mutant(
+        "add_between: not flagged",
+        PACKS,
+        "if (low || high) flags",
+        "if (false) flags",
+        TILES + "[8]",
+    ),
+    Mutant(
+        "add_between: the upper entry by both",
+        PACKS,
+        "high = first <= entry + 1 &&",
+        "high = first <= entry &&",
+        SEVERAL + "[8]",
+    ),
+    Mutant(
+        "add_between: the lower entry alone",
+        PACKS,
+        "if (high) one[1]",
+        "if (false) one[1]",
+        SEVERAL + "[8]",
+    ),
+    Mutant(
+        "add_level: parts without the last",
+        PACKS,
+        "/ parts / TILE + 1) * TILE",
+        "/ parts / TILE) * TILE - TILE",
+        SEVERAL + "[8]",
+    ),
+    Mutant(
+        "owner_of: levels of no one",
+        PACKS,
+        "n_workers - 1 - place : place",
+        "n_workers - place : place",
+        SEVERAL + "[2]",
+    ),
+    Mutant(
+        "own_after: the first alone",
+        PACKS,
+        "while (++level < n_active)",
+        "while (++level < 1)",
+        SEVERAL + "[2]",
+    ),
+    Mutant(
+        "adj_read_pack: no record",
+        PACKS,
+        "if (n_workers == 1 || !n_rows) return;",
+        "return;",
+        SEVERAL + "[2]",
+    ),
+    Mutant(
+        "records: one's own as well", PACKS, "if (sender == worker) return;", "", SEVERAL + "[2]"
+    ),
+    Mutant(
+        "records: the first of them again",
+        PACKS,
+        "(const float*)&records[k]",
+        "(const float*)&records[0]",
+        SEVERAL + "[2]",
+    ),
+    Mutant(
+        "records: corners of the one before",
+        PACKS,
+        "add_level(corners[here]",
+        "add_level(corners[next]",
+        SEVERAL + "[2]",
+    ),
+    Mutant(
+        "records: half of the numbers",
+        PACKS,
+        "n < n_inputs; n += LANES",
+        "n < LANES; n += LANES",
+        SEVERAL + "[2]",
+    ),
+    Mutant("begin: not transposed", DECODER, "to[o * PADDED + n]", "to[n * DECODED + o]", PLAIN),
+    Mutant(
+        "add_products: more inputs than there are", DECODER, "if (n < n_here) put", "put", OTHER
+    ),
+    # the host
+    of_host(
+        "rows at the table's end",
+        HOST,
+        "kind.table + z if is_hashed",
+        "kind.table if is_hashed",
+        SHAPES,
+    ),
+    of_host("levels begin anywhere", HOST, "-(-end // ALIGNED) * ALIGNED", "end + 1", SHAPES),
+    of_host("all levels from the start", HOST, "max(1.0, wider)", "1.0", ACTIVE),
+    of_host("another box", HOST, 'raise ValueError("the box of a hash is fixed")', "pass", ACTIVE),
+    of_host(
+        "nodes bound what lies between",
+        "fields/occupancy.py",
+        "storage.kind.seen_share * alpha_min",
+        "alpha_min",
+        FREE,
+    ),
+    of_host(
+        "one epsilon for all",
+        "training/optim.py",
+        "config.epsilon if epsilon is None else epsilon",
+        "config.epsilon",
+        EPSILON,
+    ),
+]

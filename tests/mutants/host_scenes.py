@@ -1,0 +1,111 @@
+"""Mutants of what the host makes of scenes: where cameras look, lenses, what they see."""
+
+from mutant import of_host
+
+AS_MUCH = "scenes/test_points.py::test_a_camera_counts_as_much_as_another"
+OWN = "scenes/test_points.py::test_distances_are_each_camera_s_own"
+FEW = "scenes/test_points.py::test_too_few_points_tell_nothing"
+TRACK = "scenes/test_points.py::test_a_track_tells_what_is_seen_and_else_the_picture"
+BOTH = "training/test_coarse.py::test_the_box_around_a_common_focus_stays"
+LARGEST = "scenes/test_lens.py::test_a_fisheye_sees_as_far_aside_as_its_polynomial_rises"
+OFFSET = "scenes/test_points.py::test_an_off_centre_principal_point_counts"
+WIDE = "scenes/test_points.py::test_a_fisheye_lens_sees_by_the_angle"
+CIRCLE = "scenes/test_overlap.py::test_cameras_around_a_thing_all_see_it"
+AXES = "scenes/test_focus.py::test_focus_minimises_squared_distance_to_the_axes"
+OBJECT_BOX = "scenes/test_focus.py::test_box_of_an_object_is_what_the_larger_field_of_view_spans"
+OUTWARD = "scenes/test_focus.py::test_cameras_that_look_outward_fall_back_to_their_spread"
+UP = "scenes/test_focus.py::test_up_is_found_in_upright_photographs_that_all_look_down"
+AIMED = "scenes/test_focus.py::test_share_of_cameras_aimed_at_a_point"
+NDC = "scenes/test_frustum.py::test_coordinates_and_back"
+DEPTHS = "scenes/test_depths.py::test_depth_is_along_the_ray"
+UNKNOWN = "scenes/test_depths.py::test_what_is_not_known_is_not_finite"
+WIDTHS = "scenes/test_space.py::test_widths_are_those_of_the_contraction_s_own_jacobian"
+FRUSTUM = "scenes/test_space.py::test_widths_in_a_frustum_are_those_of_its_coordinates"
+WIDE_BOX = "scenes/test_space.py::test_in_a_box_a_voxel_is_as_wide_as_its_edge_has_pixels"
+AS_MUCH_SEEN = "scenes/test_space.py::test_each_camera_weighs_as_much_however_much_it_sees"
+TABLE = "scenes/test_space_plan.py::test_a_table_in_a_room_gets_a_box_of_its_own"
+LEAST = "scenes/test_space_plan.py::test_the_plan_is_that_of_the_least_error_and_does_not_depend_on_the_voxels"
+FOLLOWS = "scenes/test_space_plan.py::test_a_scene_s_space_follows_its_configuration"
+NODES = "exporting/test_sight.py::test_node_coordinates_are_those_that_kernels_read"
+MESH = "exporting/test_mesh.py::test_folded_space_comes_out_in_scene_units"
+BEHIND = "scenes/test_frustum.py::test_node_coordinates_are_those_that_kernels_read"
+BLOCKS = "scenes/test_masks.py::test_a_pixel_that_stands_for_several_counts_if_all_do"
+
+POINTS, FOCUS, OVERLAP, FISHEYE = (
+    "scenes/extent/points.py",
+    *(f"scenes/cameras/{name}.py" for name in ("focus", "overlap", "fisheye")),
+)
+
+SPACES = "model/spaces.py"
+SPACE, SPACE_PLAN, OBSERVATIONS = (
+    f"scenes/{name}.py" for name in ("extent/space", "extent/space_plan", "cameras/observations")
+)
+
+MUTANTS = [
+    of_host("widths: no bend", SPACES, "k = np.where(n > 1.0, (ahead - s) / (n * ahead), 0.0)", "k = 0.0 * n", WIDTHS),
+    of_host("widths: across as ahead", SPACES, "s, ahead = self.shrink(n, placed.border),", "s, ahead = self.ahead(n, placed.border),", WIDTHS),
+    of_host("widths: depth counts whole", SPACE, "(1.0 - depth_share * depth_share)", "0.0", WIDTHS),
+    of_host("widths: the norm of the box", SPACES, "np.linalg.norm(q, axis=1)", "np.abs(q).max(axis=1)", WIDTHS),
+    of_host("widths: depth in a frustum", SPACES, "w * w / (frustum.depth * frustum.near)", "w / frustum.depth", FRUSTUM),
+    of_host("space: no border outside", SPACES, "return (1.0 + b - b / n) / n", "return 1.0 / n", NODES),
+    of_host("space: near where c is outermost", SPACES, "return b / np.maximum(1.0 + b - m, 0.0)", "return m", MESH),
+    of_host("space: what is behind cameras is ahead", SPACES, "nan=-1e6", "nan=0.0", BEHIND),
+    of_host("outline: twice as far", SPACES, "* times <= 1.0", "* times <= 2.0",
+            "scenes/test_space.py::test_outside_of_an_outline_voxels_are_as_much_wider"),
+    of_host("spaces: any may have a name", SPACES, "kind.name == \"auto\" or type(", "False and type(",
+            "kernels/test_seams.py::test_names_of_spaces_are_given_once"),
+    of_host("widths: no pixels", SPACE, "* observations.pixels", "", WIDE_BOX),
+    of_host("the shell is no space", SPACE, "* (1.0 + self.border)", "", "scenes/test_space.py::test_a_shell_takes_its_part_of_the_voxels"),
+    of_host("a camera by its places", OBSERVATIONS, "1.0 / max(1, len(places))", "1.0", AS_MUCH_SEEN),
+    of_host("a camera's all", OBSERVATIONS, "PER_CAMERA = (4, 40)", "PER_CAMERA = (4, 4000)", AS_MUCH_SEEN),
+    of_host("wrong matches count", OBSERVATIONS, "NEAR, FAR = 0.1, 4.0", "NEAR, FAR = 0.0, 400.0",
+            "scenes/test_space.py::test_matches_far_from_the_median_of_their_camera_are_left_out"),
+    of_host("the worst plan", SPACE_PLAN, "np.argmin(errors)", "np.argmax(errors)", TABLE),
+    of_host("small voxels for nothing", SPACE_PLAN, "PRICE = 0.8", "PRICE = 80.0", TABLE),
+    of_host("boxes around everything", SPACE_PLAN, "yield middle - half, middle + half",
+            "yield middle - 100.0 * half, middle + 100.0 * half", TABLE),
+    of_host("a given box is planned", SPACE_PLAN, "    if box:\n", "    if True:\n",
+            "scenes/test_space_plan.py::test_what_is_given_stays"),
+    of_host("any gain is one", SPACE_PLAN, "errors[0] - MIN_GAIN", "errors[0] + 100.0",
+            "scenes/test_space_plan.py::test_a_box_that_is_hardly_worse_than_the_best_is_kept"),
+    of_host("unseen boxes", SPACE_PLAN, "        _require_seen(scene, low, high)\n", "",
+            "scenes/test_space_plan.py::test_a_box_that_no_camera_sees_is_refused"),
+    of_host("content forgotten", SPACE_PLAN, "return replace(space, content=content)", "return space", FOLLOWS),
+    of_host("blur of no power", SPACE_PLAN, "BLUR_POWER = 1.25", "BLUR_POWER = 0.05", TABLE),
+    of_host("a camera by its points", POINTS, "1.0 / max(len(a), FEW)", "1.0", AS_MUCH),
+    of_host("all that are far behind", POINTS, "BACKGROUND = 4.0", "BACKGROUND = 4000.0",
+            "scenes/test_points.py::test_wrong_points_change_little"),
+    of_host("one distance for all", POINTS, "distances = np.where(np.isfinite(own), own, content_distance)",
+            "distances = np.full(len(own), content_distance)", OWN),
+    of_host("mean of all cameras", POINTS, "np.nanmedian(own[list(training)])", "np.nanmedian(own)", OWN),
+    of_host("few points tell", POINTS, "len(a) >= FEW else", "len(a) > FEW else", FEW),
+    of_host("few cameras tell", POINTS, "MIN_SHARE = 0.5", "MIN_SHARE = 0.2", FEW),
+    of_host("behind the camera", POINTS, "points[(points - camera.position) @ camera.forward > 0.0]", "points", TRACK),
+    of_host("found boxes for all", POINTS, "box_max=observed.box_max if scene.guessed else scene.box_max",
+            "box_max=observed.box_max", BOTH),
+    of_host("fisheye: up to 85 degrees", FISHEYE, "if falls.any() else math.pi",
+            "if falls.any() else math.radians(85.0)", LARGEST),
+    of_host("fisheye: a little less", FISHEYE, "MIN_SLOPE = 0.01", "MIN_SLOPE = 0.2", LARGEST),
+    of_host("fisheye: as the table says", FISHEYE, "for _ in range(3):", "for _ in range(0):", LARGEST),
+    of_host("fisheye: slope of the first term", FISHEYE, "t2 * (3.0 * k1", "t2 * (k1", LARGEST),
+    of_host("in picture: the middle", OVERLAP, "camera.cx + camera.fx * x", "0.5 * camera.width + camera.fx * x", OFFSET),
+    of_host("in picture: upside down", OVERLAP, "camera.cy - camera.fy * y", "camera.cy + camera.fy * y", OFFSET),
+    of_host("in picture: a fisheye as a plane", OVERLAP, "np.arctan2(aside, -z) / aside", "-1.0 / z", WIDE),
+    of_host("content behind", OVERLAP, "return camera.position + distance *", "return camera.position - distance *", CIRCLE),
+    of_host("focus: along the axes", FOCUS, "np.eye(3) - axes[:, :, None]", "np.eye(3) + axes[:, :, None]", AXES),
+    of_host("focus: behind cameras", FOCUS, "if np.mean(depths > 0.0) >= MIN_SHARE_IN_FRONT:", "if True:", OUTWARD),
+    of_host("box: the smaller field of view", FOCUS, "max(camera.width / camera.fx, camera.height / camera.fy) / 2",
+            "min(camera.width / camera.fx, camera.height / camera.fy) / 2", OBJECT_BOX),
+    of_host("up: level", FOCUS, "directions[:, 0] * np.sign(directions[:, 0] @ mean)",
+            "directions[:, 2] * np.sign(directions[:, 2] @ mean)", UP),
+    of_host("up: the cameras' own", FOCUS, "return normal if level and normal @ mean > 0.5 else mean", "return mean", UP),
+    of_host("aimed: the whole picture", FOCUS, "u < -0.25 * camera.width * z", "u < -0.5 * camera.width * z", AIMED),
+    of_host("ndc: depth as it is", "scenes/extent/frustum.py", "self.depth * (1.0 - self.near / w)", "1.0 - self.near / w", NDC),
+    of_host("depth: along the axis", "scenes/images/depths.py", "np.divide(along, cosine,", "np.divide(along, np.ones_like(cosine),",
+            DEPTHS),
+    of_host("depth: no unit", "scenes/images/depths.py", ".astype(np.float64) * self.unit", ".astype(np.float64)", DEPTHS),
+    of_host("depth: none is none", "scenes/images/depths.py", " & (along > 0.0)", "", UNKNOWN),
+    of_host("masks: any of a block", "scenes/images/masks.py", "blocks.all(axis=(1, 3))", "blocks.any(axis=(1, 3))", BLOCKS),
+    of_host("masks: transparent counts", "scenes/images/masks.py", "        white &= image[..., 3] > 127\n", "        pass\n",
+            "scenes/test_masks.py::test_every_kind_of_image_is_a_mask"),
+]  # fmt: skip

@@ -1,0 +1,115 @@
+"""A folder without a scene: what it holds, and the one command for it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.support.tiny_scenes import picture, write_transforms
+from warpnerf.checks import InputError
+from warpnerf.scenes.formats import contents
+from warpnerf.scenes.formats.contents import is_unposed, photographs_in, what_is_there
+from warpnerf.scenes.formats.load import load_scene
+
+
+def photographs(folder: Path, n: int = 4, ending: str = "jpg") -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for k in range(n):
+        Image.fromarray(picture(k)).save(folder / f"{k}.{ending}")
+
+
+def empty_file(name: str) -> Callable[[Path], None]:
+    def make(folder: Path) -> None:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).touch()
+
+    return make
+
+
+def half_a_model(folder: Path) -> None:
+    """That poses are taken from, or nothing: others are not estimated unasked."""
+    photographs(folder / "images")
+    empty_file("sparse/0/cameras.bin")(folder)
+    assert not is_unposed(folder)
+
+
+def two_scenes(folder: Path) -> None:
+    write_transforms(folder / "a")
+    write_transforms(folder / "b")
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (photographs, "holds 4 photographs without poses; .*`warpnerf pose .*s --output SCENE`"),
+        (lambda f: photographs(f / "images"), "holds 4 photographs without poses"),
+        (lambda f: photographs(f, 2), "holds 2 photographs, and poses need at least 3"),
+        (lambda f: photographs(f, 1), "holds 1 photograph, and"),
+        (lambda f: photographs(f / "day 1"), r"its folder day 1 .* pose '.*day 1' --output"),
+        (empty_file("walk.MOV"), r"holds the video walk\.MOV; .*`warpnerf pose .*walk\.MOV "),
+        (empty_file("a.HEIC"), "holds 1 photographs as HEIC; convert them to JPEG"),
+        (lambda f: write_transforms(f / "room"), "its folder room holds one; use .*s/room"),
+        (two_scenes, r"2 of its folders hold one each \(first: a\); use .*s/a"),
+        (empty_file("sparse/0/cameras.bin"), "its COLMAP model lacks sparse/0/images.bin"),
+        (half_a_model, r"lacks sparse/0/images\.bin; .* again, or .* `warpnerf pose .*s --output"),
+        (empty_file("images.txt"), r"its COLMAP model lacks cameras\.txt"),
+        (empty_file("database.db"), "a database of COLMAP but no model"),
+        (empty_file("notes.odt"), "neither poses nor photographs nor a video"),
+        (lambda f: None, "it is empty"),
+    ],
+)
+def test_what_a_folder_without_a_scene_holds(
+    tmp_path: Path, make: Callable[[Path], object], says: str
+) -> None:
+    folder = tmp_path / "s"
+    folder.mkdir()
+    make(folder)
+    with pytest.raises(InputError, match=rf"s: no scene found: .*{says}"):
+        load_scene(folder)
+
+
+def test_what_is_missing_is_installed_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(contents.importlib.util, "find_spec", lambda name: None)
+    photographs(tmp_path)
+    assert '`pip install "warpnerf[sfm]"` and `warpnerf pose' in what_is_there(tmp_path)
+
+
+def test_a_video_is_no_scene_but_one_can_be_made_of_it(tmp_path: Path) -> None:
+    (tmp_path / "a b.mp4").touch()
+    with pytest.raises(InputError, match=r"is a video, .*`warpnerf pose '.*a b\.mp4' --output"):
+        load_scene(tmp_path / "a b.mp4")
+
+
+def test_photographs_directly_in_a_folder_come_before_those_in_images(tmp_path: Path) -> None:
+    photographs(tmp_path / "images", ending="png")
+    (tmp_path / "images" / ".hidden.png").touch()
+    assert [path.name for path in photographs_in(tmp_path)] == [f"{k}.png" for k in range(4)]
+    photographs(tmp_path, 3)
+    assert [path.name for path in photographs_in(tmp_path)] == ["0.jpg", "1.jpg", "2.jpg"]
+
+
+def test_what_poses_can_be_estimated_of(tmp_path: Path) -> None:
+    photographs(tmp_path / "photos")
+    photographs(tmp_path / "few", 2)
+    write_transforms(tmp_path / "scene")
+    np.save(tmp_path / "few" / "poses_bounds.npy", np.zeros((2, 17)))
+    (tmp_path / "walk.mp4").touch()
+    unposed = {path.name for path in tmp_path.iterdir() if is_unposed(path)}
+    assert unposed == {"photos", "walk.mp4"}
+    assert not is_unposed(tmp_path / "nowhere.mp4")
+
+
+def test_an_exported_volume_does_not_make_photographs_a_scene(tmp_path: Path) -> None:
+    photographs(tmp_path)
+    np.savez(tmp_path / "volume.npz", density=np.zeros((2, 2, 2)))
+    assert is_unposed(tmp_path)
+    with pytest.raises(InputError, match="it holds 4 photographs without poses"):
+        load_scene(tmp_path)
+    np.savez(tmp_path / "volume.npz", images=np.zeros(1), poses=np.zeros(1), focal=1.0)
+    assert not is_unposed(tmp_path)

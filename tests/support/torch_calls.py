@@ -1,0 +1,60 @@
+"""render_rays on problems, in a tensor's type and on its device."""
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.support.problems import Problem, make_problem
+from warpnerf.rendering.steps import Steps
+from warpnerf.torch import March, RenderedRays, render_rays
+
+
+def problem(seed: int, **changes: Any) -> Problem:
+    steps = Steps(near=0.07, far=2.9, step=0.11)
+    return make_problem(seed, steps=steps, **changes)
+
+
+def call(p: Problem, raw: Tensor, scaling: Any = "none", **changes: Any) -> RenderedRays:
+    """render_rays on a problem, in raw's type and on its device."""
+
+    def like_raw(values: Any) -> Tensor:
+        return torch.tensor(values, dtype=raw.dtype, device=raw.device)
+
+    march = {name: changes.pop(name) for name in ("step", "near", "far") if name in changes}
+    options: dict[str, Any] = {
+        "step": March(p.steps.step, p.steps.near, p.steps.far)._replace(**march),
+        "density_shift": p.density_shift,
+        "background": like_raw(p.background),
+        "scaling": scaling,
+        "content_distance": like_raw(p.content_distance),
+    }
+    return render_rays(
+        raw,
+        like_raw(p.origins),
+        like_raw(p.directions),
+        (like_raw(p.box_min), like_raw(p.box_max)),
+        **options | changes,
+    )
+
+
+def gradient(p: Problem, raw: Tensor, scaling: str = "none") -> Any:
+    out = call(p, raw, scaling)
+    adjoints = [
+        torch.tensor(a, dtype=raw.dtype, device=raw.device)
+        for a in (p.adj_rgb, p.adj_opacity, p.adj_depth)
+    ]
+    return torch.autograd.grad(out, raw, adjoints)[0].cpu().numpy()
+
+
+def torch_device(device: str) -> str:
+    if device == "cpu":
+        return device
+    if not torch.cuda.is_available():
+        pytest.skip("this torch has no CUDA")
+    return device
+
+
+def tensor(values: Any, device: str, dtype: torch.dtype = torch.float64) -> Tensor:
+    return torch.tensor(values, dtype=dtype, device=torch_device(device))

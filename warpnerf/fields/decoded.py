@@ -1,0 +1,53 @@
+"""Storages whose entries a learned matrix decodes to the numbers of a sample."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import warp as wp
+from warpnerf_kernels.base.types import real
+from warpnerf_kernels.fields.decoder import columns_of, padded
+
+from warpnerf.fields.gradients import zero_weights
+from warpnerf.fields.storage import ReadAtNodes
+from warpnerf.runtime.parallel import Workers
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Decoded(ReadAtNodes):
+    """Entries, and a decoder; see fields.decoder of the kernels."""
+
+    n_floats: int
+    """Numbers of a sample."""
+    n_decoded: int
+    """How many of these are not padding."""
+    by_sample: bool
+    """Whether the head works on samples."""
+    decoder: wp.array
+    """[n_inputs * columns] row by row."""
+
+    @property
+    def n_columns(self) -> int:
+        """Columns of the decoder."""
+        return columns_of(self.n_floats)
+
+    @cached_property
+    def struct(self) -> Any:
+        """Its arrays as kernels take them."""
+        return self.struct_with(wp.zeros((0, 0), dtype=real, device=self.decoder.device))
+
+    def struct_for(self, workers: Workers) -> Any:
+        """The same, and a transposed decoder of each worker."""
+        n_inputs = self.decoder.size // self.n_columns
+        return self.struct_with(zero_weights(self.n_decoded * padded(n_inputs), workers))
+
+    @abstractmethod
+    def struct_with(self, transposed: wp.array) -> Any:
+        """Its arrays as kernels take them.
+
+        Args:
+            transposed: [n_workers, n_decoded * padded inputs] scratch of the vector form.
+        """

@@ -1,0 +1,242 @@
+"""A hash: tables of entries by level of resolution, and their decoder."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import warp as wp
+from warpnerf_kernels.base.parts import Encoding
+from warpnerf_kernels.base.types import real, vec3, vector
+from warpnerf_kernels.fields import hashed
+from warpnerf_kernels.fields.decoder import columns_of
+from warpnerf_kernels.optim import adam
+
+from warpnerf.fields.decoded import Decoded
+from warpnerf.fields.gradients import Gradients, zero_entries, zero_head_weights, zero_weights
+from warpnerf.fields.lattice import Lattice
+from warpnerf.fields.parameters import Parameter
+from warpnerf.fields.storage import Storage, allocate_nodes, require_shapes
+from warpnerf.model.interface import Model
+from warpnerf.model.storage_kinds import Hash, StorageKind
+from warpnerf.optim_config import OptimConfig
+from warpnerf.runtime.parallel import NODES, Workers
+
+LIMIT = 1e-4
+"""Of the numbers of entries before the first update, to both sides of 0."""
+
+ALIGNED = 16
+"""Levels begin at multiples of so many entries, whole tiles and cache lines."""
+
+ROW_ALIGNED = 4
+"""Hashed rows begin at multiples of so many entries, so that most tiles belong to one of them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LevelShape:
+    """A level's lattice and entries."""
+
+    edges: np.ndarray
+    """Cells along the field's edges, [3], not whole numbers but along the longest."""
+    size: tuple[int, int, int]
+    """Nodes."""
+    is_hashed: bool
+    """Whether there are fewer entries than nodes."""
+    begin: int
+    """Of its entries."""
+    end: int
+    """One past the last."""
+
+
+def level_shapes(kind: Hash, lattice: Lattice) -> list[LevelShape]:
+    """Levels over the field of a lattice, coarsest first."""
+    shapes: list[LevelShape] = []
+    edges = lattice.box_max - lattice.box_min
+    begin = 0
+    for resolution in kind.resolutions:
+        cells = resolution * edges / edges.max()
+        x, y, z = (max(1, math.ceil(n - 1e-6)) + 1 for n in cells)
+        is_hashed = x * y * z > kind.table
+        # A row that begins at the table's end still has room.
+        n = kind.table + z if is_hashed else x * y * z
+        end = begin + n
+        shapes.append(
+            LevelShape(edges=cells, size=(x, y, z), is_hashed=is_hashed, begin=begin, end=end)
+        )
+        begin = -(-end // ALIGNED) * ALIGNED
+    return shapes
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Hashed(Decoded):
+    """Tables of entries, and the matrix that decodes them; see fields.hashed of the kernels."""
+
+    kind: Hash
+    values: wp.array
+    """[n_entries] vectors, level by level."""
+
+    @classmethod
+    def first(
+        cls, kind: StorageKind, model: Model, lattice: Lattice, seed: int, device: wp.Device
+    ) -> Hashed:
+        """Entries of next to nothing, and a random matrix."""
+        assert isinstance(kind, Hash)
+        rng, n_inputs = np.random.default_rng(seed), kind.levels * kind.features
+        n_entries = level_shapes(kind, lattice)[-1].end
+        limit = math.sqrt(3.0 / n_inputs)
+        decoder = np.zeros((n_inputs, columns_of(model.n_floats)), np.float32)
+        decoder[:, : 1 + model.n_features] = rng.uniform(
+            -limit, limit, (n_inputs, 1 + model.n_features)
+        )
+        values = rng.uniform(-LIMIT, LIMIT, (n_entries, kind.features)).astype(np.float32)
+        tensors = {"values": values, "decoder": decoder}
+        return cls.from_tensors(kind, model, lattice, tensors, device)
+
+    @classmethod
+    def from_tensors(
+        cls,
+        kind: StorageKind,
+        model: Model,
+        lattice: Lattice,
+        tensors: dict[str, np.ndarray],
+        device: wp.Device,
+    ) -> Hashed:
+        """From [n_entries, features] values and the decoder."""
+        assert isinstance(kind, Hash)
+        shapes = {
+            "values": (level_shapes(kind, lattice)[-1].end, kind.features),
+            "decoder": (kind.levels * kind.features, columns_of(model.n_floats)),
+        }
+        require_shapes(tensors, shapes)
+        values = allocate_nodes(shapes["values"][0], vector(kind.features), device)
+        values.assign(tensors["values"])
+        return cls(
+            kind=kind,
+            lattice=lattice,
+            n_floats=model.n_floats,
+            n_decoded=1 + model.n_features,
+            by_sample=model.by_sample,
+            values=values,
+            decoder=wp.array(tensors["decoder"].ravel(), dtype=real, device=device),
+        )
+
+    def tensors(self) -> dict[str, np.ndarray]:
+        """Entries, and the decoder row by row."""
+        n_inputs = self.kind.levels * self.kind.features
+        return {
+            "values": self.values.numpy(),
+            "decoder": self.decoder.numpy().reshape(n_inputs, -1),
+        }
+
+    def copied_to(self, device: wp.Device) -> Hashed:
+        """The same with arrays of its own."""
+        values = allocate_nodes(self.values.shape[0], self.values.dtype, device)
+        wp.copy(values, self.values)
+        return replace(self, values=values, decoder=wp.clone(self.decoder, device=device))
+
+    @property
+    def encoding(self) -> Encoding:
+        """Entries of all levels, decoded."""
+        kind = self.kind
+        return hashed.hashed(
+            *(kind.features, kind.levels, self.n_floats, self.n_decoded, self.by_sample)
+        )
+
+    @property
+    def n_active(self) -> int:
+        """How many levels are read: all on the final lattice, and on one whose voxels are wider
+        those that are coarser than the finest by as much, at least."""
+        wider = float(self.lattice.voxel_size.min()) * self.density_scale  # than the final ones
+        finest = 1.01 * self.kind.finest / max(1.0, wider)
+        return max(1, sum(n <= finest for n in self.kind.resolutions))
+
+    def struct_with(self, transposed: wp.array) -> Any:
+        """Its arrays as kernels take them."""
+        struct = hashed.hash_type(self.kind.features)()
+        struct.values, struct.decoder, struct.transposed = self.values, self.decoder, transposed
+        levels = [self._level(shape) for shape in level_shapes(self.kind, self.lattice)]
+        struct.levels = wp.array(levels, dtype=hashed.Level, device=self.decoder.device)
+        struct.n_active, struct.width = self.n_active, self.kind.features
+        struct.n_decoded = self.n_decoded
+        return struct
+
+    def _level(self, shape: LevelShape) -> Any:
+        level, middle = hashed.Level(), 0.5 * shape.edges
+        level.size, level.middle = wp.vec3i(*shape.size), vec3(*middle)
+        level.to_nodes = vec3(*(middle / (1.0 + self.lattice.border)))
+        level.begin = shape.begin
+        level.mask = self.kind.table - ROW_ALIGNED if shape.is_hashed else 0
+        return level
+
+    def densities_of_planes(self, workers: Workers, first: int, n: int) -> wp.array:
+        """Those that are read there."""
+        lattice, (_, y, z) = self.lattice, self.lattice.size
+        values = allocate_nodes(n * y * z, vector(1), workers.device)
+        workers.launch(
+            hashed.node_densities_kernel(self.kind.features),
+            n * y,
+            *(self.struct, self.n_columns, wp.vec3i(*lattice.size), 1.0 + lattice.border),
+            *(first * y, values),
+            at_once=max(1, NODES // (8 * z)),
+        )
+        return values
+
+    @classmethod
+    def kernels(cls, kind: StorageKind, model: Model) -> list[wp.Kernel]:
+        """Of its densities and of its optimiser."""
+        assert isinstance(kind, Hash)
+        return [
+            *super().kernels(kind, model),
+            hashed.node_densities_kernel(kind.features),
+            adam.adam_kernel(kind.features),
+        ]
+
+    def parameters(self, model: Model, optim: OptimConfig) -> tuple[Parameter, ...]:
+        """Entries: Adam where rays have been; the decoder, which all rays share."""
+        kind = self.kind
+        return (
+            Parameter(
+                name="values",
+                values=self.values,
+                rule=kind.rules["values"],
+                learning_rates=np.full(kind.features, kind.learning_rate),
+                gradient=("values", "touched"),
+                epsilon=kind.epsilon,
+            ),
+            Parameter(
+                name="decoder",
+                values=self.decoder,
+                rule=kind.rules["decoder"],
+                learning_rates=np.array([kind.learning_rate_decoder]),
+                gradient=("decoder",),
+                epsilon=kind.epsilon,
+            ),
+        )
+
+    def gradients(self, model: Model, workers: Workers) -> Gradients:
+        """As large as its entries, with flags of tiles that hold any; of the decoder, copies."""
+        return Gradients.of(
+            self.encoding.Gradient,
+            zero_entries(self.values.shape[0], self.values.dtype, workers, large_pages=True)
+            | {"decoder": zero_weights(self.decoder.size, workers)}
+            | zero_head_weights(model, workers),
+        )
+
+    def resized(self, workers: Workers, lattice: Lattice) -> Hashed:
+        """The same entries, of which more are read where the lattice is finer.
+
+        Raises:
+            ValueError: The other's box is another one: entries are tied to theirs.
+        """
+        corners = ((self.lattice.box_min, lattice.box_min), (self.lattice.box_max, lattice.box_max))
+        if not all(np.array_equal(ours, theirs) for ours, theirs in corners):
+            raise ValueError("the box of a hash is fixed")
+        return replace(self, lattice=lattice)
+
+    def resized_moments(
+        self, parameter: str, moments: wp.array, other: Storage, workers: Workers
+    ) -> wp.array:
+        """The same: entries do not depend on the lattice."""
+        return moments

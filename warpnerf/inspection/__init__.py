@@ -1,0 +1,1 @@
+"""What a scene is before anybody trains on it."""

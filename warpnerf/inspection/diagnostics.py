@@ -1,0 +1,198 @@
+"""Scene diagnostics: photographs, cameras and lenses that are unlike others, maybe by mistake."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+
+from warpnerf.checks import InputError
+from warpnerf.evaluation.evaluate import require_measurable
+from warpnerf.runtime.memory import usable_cores
+from warpnerf.scenes.cameras.camera import Camera
+from warpnerf.scenes.cameras.focus import find_focus, share_aimed_at, up_direction
+from warpnerf.scenes.formats.survey import Survey
+from warpnerf.scenes.scene import Scene, View
+
+MANY_TIMES = 20.0
+"""A content distance so many times the estimate, or as small a part of it, is likely a mistake."""
+
+FAR_OFF = 10.0
+"""A camera this many times the median distance away from the median place is likely a mistake."""
+
+OFF_CENTRE = 0.3
+"""Of the image's width or height, from the middle to the principal point: no lens is so far off."""
+SHORT = 0.15
+"""Focal length as a share of the image's width: 147 degrees, which no lens but a fisheye sees."""
+
+ESTIMATES_FIRST = (
+    "training of 500 steps or more looks for better ones first, but with DVGO's presets"
+)
+"""What may become of guesses where it has not."""
+
+
+def diagnostics(
+    scene: Scene,
+    found: Survey,
+    content_distance: float,
+    near: float,
+    *,
+    looked: bool,
+    threads: int | None = None,
+) -> list[str]:
+    """Diagnostics of a scene: what may be a mistake, besides what it warns of.
+
+    Args:
+        scene: As it was loaded.
+        found: In its files.
+        content_distance: That training will use, scene units.
+        near: The near plane that training will use, scene units.
+        looked: Whether training has looked for content distance and box: what it has not found
+            it will not find.
+        threads: That look at photographs; None: one per usable core.
+
+    Returns:
+        A sentence each.
+
+    Raises:
+        InputError: An image is damaged.
+    """
+    odd = list(found.diagnostics) + _odd_images(scene, threads)
+    times = content_distance / scene.content_distance
+    if not 1.0 / MANY_TIMES <= times <= MANY_TIMES:
+        odd.append(
+            f"the content distance {content_distance:.4g} is {times:.4g} times what the cameras "
+            f"suggest, {scene.content_distance:.4g} scene units: the scaling will "
+            + ("have no effect" if times < 1.0 else "hold back everything that is seen")
+        )
+    cameras = scene.training_cameras
+    if not found.built_in:  # they look everywhere, and know their true distances
+        odd += _odd_directions(cameras, scene, content_distance, looked)
+    odd += _odd_places(scene) + _odd_lenses(scene)
+    nearest = max(near, _distance_to_box(scene))
+    if nearest >= content_distance:
+        why = "the near plane" if nearest == near else "the box"
+        odd.append(
+            f"the scaling has nothing to do: {why} begins {nearest:.4g} scene units "
+            "from the cameras, but gradients are only scaled nearer than the content distance "
+            f"{content_distance:.4g}"
+        )
+    return odd
+
+
+def _odd_images(scene: Scene, threads: int | None) -> list[str]:
+    """Photographs that show nothing, or too little to be measured; each is looked at once."""
+    odd = []
+    with ThreadPoolExecutor(threads or usable_cores()) as pool:
+        shows_nothing = pool.map(_is_of_one_colour, scene.views)
+        empty = [v.name for v, so in zip(scene.views, shows_nothing, strict=True) if so]
+    if empty:
+        odd.append(
+            f"of one colour throughout: {len(empty)} of {len(scene.views)} images (first: "
+            f"{empty[0]}), which show nothing that could be trained on"
+        )
+    if scene.splits.get("test"):
+        try:
+            require_measurable(scene, "test")
+        except InputError as error:
+            odd.append(str(error).removesuffix("."))
+    return odd
+
+
+def _is_of_one_colour(view: View) -> bool:
+    image = view.image
+    sample = image[:: max(1, len(image) // 32), :: max(1, image.shape[1] // 32)]
+    return bool((sample == image[0, 0]).all() and (image == image[0, 0]).all())
+
+
+def common_focus(cameras: Sequence[Camera]) -> np.ndarray | None:
+    """The point that most cameras have in the middle of their image."""
+    focus = find_focus(cameras)
+    return None if focus.guessed else focus.point
+
+
+def _odd_directions(
+    cameras: Sequence[Camera], scene: Scene, content_distance: float, looked: bool
+) -> list[str]:
+    """Cameras that have nothing in common to look at, unless points tell what they see."""
+    odd = []
+    given = content_distance != scene.content_distance
+    guesses = "the box is a guess" if given else "content distance and box are guesses"
+    way_out = "poses with points, as COLMAP writes them"
+    way_out = f"give {way_out}" if given else f"give a distance, or {way_out}"
+    aimed = share_aimed_at(cameras, find_focus(cameras).point)
+    turned = [_turned(camera) for camera in cameras]
+    if common_focus(cameras) is None and common_focus(turned) is not None:
+        odd.append(
+            "all cameras look away from the point that they surround: if they should look at it, "
+            "the poses are in OpenCV axes (looking along +z); negate their y and z columns"
+        )
+    elif common_focus(cameras) is None and scene.content_distances is None:
+        odd.append(
+            f"no common focus: {aimed:.0%} of the training cameras have one point in the middle of "
+            f"their image, so {guesses}: {way_out if looked else ESTIMATES_FIRST}"
+        )
+    return odd
+
+
+def _turned(camera: Camera) -> Camera:
+    """The same camera, had its pose been in OpenCV axes."""
+    return replace(camera, c2w=camera.c2w * np.array([1.0, -1.0, -1.0, 1.0]))
+
+
+def _odd_places(scene: Scene) -> list[str]:
+    """Cameras that stand on their heads, or far away from all others."""
+    odd = []
+    up = up_direction(scene.cameras)
+    rolled = [view.name for view in scene.views if view.camera.c2w[:, 1] @ up < -0.3]
+    if rolled:
+        odd.append(
+            f"upside down against the others: {len(rolled)} of {len(scene.views)} cameras (first: "
+            f"{rolled[0]})"
+        )
+    places = np.array([camera.position for camera in scene.cameras])
+    away = np.linalg.norm(places - np.median(places, axis=0), axis=1)
+    limit = FAR_OFF * float(np.median(away))
+    lost = [view.name for view, far in zip(scene.views, away, strict=True) if far > limit]
+    if lost:
+        odd.append(
+            f"far away from all others: {len(lost)} of {len(places)} cameras (first: {lost[0]}), "
+            "which may be wrongly posed"
+        )
+    return odd
+
+
+def _odd_lenses(scene: Scene) -> list[str]:
+    """Lenses as hardly any photograph has them: numbers in other units, perhaps."""
+    odd = []
+    aside, wide = [], []
+    for view in scene.views:
+        camera = view.camera
+        shares = np.array([camera.cx / camera.width, camera.cy / camera.height])
+        if np.abs(shares - 0.5).max() > OFF_CENTRE:
+            aside.append(view.name)
+        if not camera.fisheye and min(camera.fx, camera.fy) < SHORT * camera.width:
+            wide.append(view.name)
+    if aside:
+        odd.append(
+            f"principal point far from the middle of the image: {len(aside)} of "
+            f"{len(scene.views)} cameras (first: {aside[0]}); cx and cy are pixels from its left "
+            "and top edge"
+        )
+    if wide:
+        odd.append(
+            f"focal length below {SHORT:g} of the image's width: {len(wide)} of {len(scene.views)} "
+            f"cameras (first: {wide[0]}); it is given in pixels"
+        )
+    return odd
+
+
+def _distance_to_box(scene: Scene) -> float:
+    """From the nearest training camera to what is sampled, scene units."""
+    if scene.unbounded:
+        return 0.0
+    places = np.array([camera.position for camera in scene.training_cameras])
+    outside = np.maximum(0.0, np.maximum(scene.box_min - places, places - scene.box_max))
+    return float(np.linalg.norm(outside, axis=1).min())

@@ -1,0 +1,88 @@
+"""What is minimised: a small frozen value, refused when wrong, as those of ``warpnerf.config``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from warpnerf.checks import InputError, require_at_least, require_one_of, require_positive
+
+HUBER_DELTA = 0.1
+
+
+WEIGHTS_OF_LOSSES = ("distortion", "entropy", "opacity", "sample_colour", "near_clip")
+"""Fields of LossConfig that weigh a loss."""
+
+OPACITY = 1e-3
+"""What ``LossConfig.opacity`` is by auto."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LossConfig:
+    """What training minimises: the mean over rays of the photometric loss, which is a sum over the
+    three channels, and of the others, each times its weight. A weight of 0 leaves a loss out.
+
+    Systems that take the mean over the channels give a third of these weights, but for near_clip.
+    """
+
+    photometric: Literal["squared", "huber"] = "squared"
+    """The photometric loss of a ray's colour against its pixel. huber: as squared up to huber_delta
+    in a channel, from there on a line."""
+    huber_delta: float = HUBER_DELTA
+    """Where that line begins, of colours in [0, 1]."""
+    distortion: float = 0.0
+    """Weight of the distortion loss: density concentrates along a ray. Distances count as
+    t / (D + t), with D the content distance in use; with auto and per-camera, the scene's."""
+    entropy: float = 0.0
+    """Weight of the entropy of the remaining light: a ray ends at something opaque, or meets
+    nothing."""
+    opacity: float | Literal["auto"] = 0.0
+    """Weight of -log of the opacity of rays: each ends at something opaque. For photographs without
+    alpha, whose pixels all show something; auto: 0.001, but 0 for objects with alpha, and where a
+    background is given (``TrainConfig.losses_for``)."""
+    sample_colour: float = 0.0
+    """Weight of the squared errors of the colours of single samples. For models that have such:
+    all but deferred."""
+    near_clip: float = 0.0
+    """Weight of the sum of raw densities nearer to the camera than near_clip_distance, as DVGO
+    pushes them down; for comparison. DVGO does not divide by the rays of a step: its weight 1 is
+    3 rays_per_step here."""
+    near_clip_distance: float = 0.0
+    """How near that is, scene units."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be minimised."""
+        require_one_of("loss.photometric", self.photometric, ("squared", "huber"))
+        require_positive("loss.huber_delta", self.huber_delta)
+        if isinstance(self.opacity, str) and self.opacity != "auto":
+            raise InputError(f"loss.opacity must be auto or a number, not {self.opacity!r}.")
+        for name in (*WEIGHTS_OF_LOSSES, "near_clip_distance"):
+            if name != "opacity" or self.opacity != "auto":
+                require_at_least(f"loss.{name}", getattr(self, name), 0.0)
+        if self.photometric != "huber" and self.huber_delta != HUBER_DELTA:
+            raise InputError(
+                f"loss.huber_delta is {self.huber_delta:g}, but loss.photometric is squared; set "
+                "that to huber, or leave huber_delta out."
+            )
+        if self.near_clip == 0.0 and self.near_clip_distance > 0.0:
+            raise InputError(
+                "loss.near_clip_distance does nothing while loss.near_clip is 0; give both, or "
+                "leave near_clip_distance out."
+            )
+        if self.near_clip > 0.0 and self.near_clip_distance == 0.0:
+            raise InputError(
+                "loss.near_clip needs loss.near_clip_distance, the distance up to which raw "
+                "densities are pushed down; give both, or leave near_clip at 0."
+            )
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Which losses there are besides the squared error; kernels are compiled for them."""
+        huber = ("huber",) if self.photometric == "huber" else ()
+        return huber + tuple(name for name in WEIGHTS_OF_LOSSES if getattr(self, name) != 0.0)
+
+
+USUAL_LOSSES = LossConfig(distortion=0.01, entropy=1e-3, opacity="auto")
+"""What trainings minimise by default. Without the entropy of remaining light, colours of an MLP
+make up for walls that stay soft; without opacity, the background makes up for what is as dark as
+it."""

@@ -1,0 +1,329 @@
+"""What fields are stored in: kinds with a name, and what of them is known without a device.
+
+A kind is a frozen value, as a model is; ``warpnerf.fields.storage`` says what it becomes on a
+device.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, ClassVar, TypeVar
+
+from warpnerf.checks import (
+    InputError,
+    require_at_least,
+    require_one_of,
+    require_positive,
+    require_whole,
+)
+from warpnerf.model import registry
+from warpnerf.model.interface import Load, Model, loader
+
+NUMBER_BYTES = 12
+"""Memory that a number takes in training: value, two moments together, and gradient, 4 each."""
+LOOK_BYTES = 3
+"""Memory of a look for free space, for each node, where nodes are not stored."""
+MAX_WIDTH = 128
+"""Numbers of an entry of planes, or of all levels of a hash together, at most."""
+MAX_CELLS = 1 << 15
+"""Of a level of a hash along an edge: positions in it are float32."""
+MAX_TABLE = 1 << 24
+"""Entries of a level, at most: all levels together are counted by int32."""
+
+
+class StorageKind(ABC):
+    """How raw values are stored over space, as it is configured."""
+
+    name: ClassVar[str]
+    """What files call it."""
+    box_is_fixed: ClassVar[bool] = False
+    """Whether what is stored is tied to the box, so that this never becomes tighter."""
+    seen_share: ClassVar[float] = 1.0
+    """What counts as visible at a node, as a share of ``TrainConfig.alpha_min``: 1 where nothing
+    between nodes can be denser than they are."""
+    own_rates: ClassVar[bool] = False
+    """Whether it has learning rates of its own, so that those of the numbers that it stands for, of
+    densities, colours and features, do nothing."""
+    own_epsilon: ClassVar[bool] = False
+    """Whether Adam has another epsilon for all of it, so that ``OptimConfig.epsilon`` is for others
+    only."""
+    smoothed: ClassVar[bool] = True
+    """Whether total variation smooths it, so that what is configured of that does something."""
+
+    @property
+    @abstractmethod
+    def rules(self) -> Mapping[str, str]:
+        """The arrays that are learned, by their names in files, and the name of the rule of the
+        optimiser that updates each."""
+
+    @abstractmethod
+    def encoding(self, load: Load, model: Model) -> Any:
+        """The part that reads it.
+
+        Args:
+            load: The kernels' modules, in the precision that is wanted.
+            model: Reads ``n_floats`` numbers at a sample, sample by sample if it is ``by_sample``.
+
+        Returns:
+            ``warpnerf_kernels.base.parts.Encoding``.
+        """
+
+    @abstractmethod
+    def training_bytes(self, model: Model, size: tuple[int, int, int]) -> int:
+        """Memory that training takes on a lattice of so many nodes along each axis."""
+
+    @property
+    def relative_time(self) -> float:
+        """How long a step of training takes, about, over one with a dense grid."""
+        return 1.0
+
+    def in_words(self, model: Model, size: tuple[int, int, int]) -> str:
+        """What needs that memory."""
+        return f"a {self.name} field over {size[0]} x {size[1]} x {size[2]} nodes"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dense(StorageKind):
+    """A value at each node, trilinear in between."""
+
+    name: ClassVar[str] = "dense"
+
+    @property
+    def rules(self) -> Mapping[str, str]:
+        """One array of nodes."""
+        return {"values": "nodes"}
+
+    def encoding(self, load: Load, model: Model) -> Any:
+        """A dense grid of the model's numbers."""
+        return load("fields.dense").dense(model.n_floats, model.by_sample)
+
+    def training_bytes(self, model: Model, size: tuple[int, int, int]) -> int:
+        """Of each node."""
+        return math.prod(size) * model.n_floats * NUMBER_BYTES
+
+    def in_words(self, model: Model, size: tuple[int, int, int]) -> str:
+        """A grid, and what a node has."""
+        grid = f"a grid of {size[0]} x {size[1]} x {size[2]} nodes"
+        return f"{grid} of {model.n_floats} numbers"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Vm(StorageKind):
+    """Three planes and three lines of vectors, and a matrix that decodes their products: TensoRF's
+    VM decomposition (vector-matrix). Memory grows with the square of the nodes along an axis."""
+
+    name: ClassVar[str] = "vm"
+    own_rates: ClassVar[bool] = True
+    density: int = 4
+    """Density components: numbers of an entry whose products start out as the raw density."""
+    appearance: int = 12
+    """Appearance components: the other numbers of an entry, for colour. Density and appearance
+    together are a multiple of 16."""
+    learning_rate: float = 0.1
+    """Adam's learning rate of planes and lines, at the start."""
+    learning_rate_decoder: float = 5e-3
+    """Adam's learning rate of the decoder matrix, at the start."""
+    sparsity: float = 0.0
+    """Weight of TensoRF's L1 loss: the mean magnitude of density components of planes and lines,
+    where rays have been."""
+
+    def __post_init__(self) -> None:
+        """Refuse a configuration for which there are no kernels."""
+        require_whole("field.density", self.density, 1)
+        require_whole("field.appearance", self.appearance, 1)
+        if self.width % 16 or self.width > MAX_WIDTH:
+            raise InputError(
+                f"field.density and field.appearance must be a multiple of 16 together, up to "
+                f"{MAX_WIDTH}, not {self.density} + {self.appearance}: numbers of an entry are "
+                "worked on sixteen at a time."
+            )
+        require_positive("field.learning_rate", self.learning_rate)
+        require_positive("field.learning_rate_decoder", self.learning_rate_decoder)
+        require_at_least("field.sparsity", self.sparsity, 0.0)
+        registry.keep_plain(self, "field")
+
+    @property
+    def width(self) -> int:
+        """Numbers of an entry."""
+        return self.density + self.appearance
+
+    @property
+    def relative_time(self) -> float:
+        """By benchmarks/factors.py."""
+        return 0.6 + 0.06 * self.width
+
+    @property
+    def rules(self) -> Mapping[str, str]:
+        """Planes, lines, decoder."""
+        return {"planes": "nodes", "lines": "lines", "decoder": "weights"}
+
+    def encoding(self, load: Load, model: Model) -> Any:
+        """Products of planes and lines, decoded to the model's numbers."""
+        factors = load("fields.factors").factors
+        return factors(self.width, model.n_floats, 1 + model.n_features, model.by_sample)
+
+    def training_bytes(self, model: Model, size: tuple[int, int, int]) -> int:
+        """Of each entry of planes; and of a look for free space, which is for all nodes."""
+        x, y, z = size
+        return (x * y + x * z + y * z) * self.width * NUMBER_BYTES + x * y * z * LOOK_BYTES
+
+    def in_words(self, model: Model, size: tuple[int, int, int]) -> str:
+        """Planes, and what an entry has."""
+        x, y, z = size
+        return f"a field of planes over {x} x {y} x {z} nodes with entries of {self.width} numbers"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hash(StorageKind):
+    """Tables of entries by level of resolution, and a matrix that decodes them: Instant-NGP's hash,
+    by rows. Memory does not grow with the nodes of the lattice."""
+
+    name: ClassVar[str] = "hash"
+    box_is_fixed: ClassVar[bool] = True
+    own_rates: ClassVar[bool] = True
+    own_epsilon: ClassVar[bool] = True
+    smoothed: ClassVar[bool] = False
+    seen_share: ClassVar[float] = 0.4
+    levels: int = 6
+    """Levels of resolution, from the coarsest to the finest by equal factors. Fine ones are
+    switched on as the lattice grows."""
+    features: int = 4
+    """Numbers of an entry: 2, 4 or 8."""
+    coarsest: int = 32
+    """Cells of the first level along the longest edge of what is trained."""
+    finest: int = 1024
+    """Cells of the last level."""
+    table: int = 1 << 17
+    """Entries of a level, at most, a power of two; where a level has more nodes, nodes share
+    them."""
+    learning_rate: float = 0.1
+    """Adam's learning rate of entries, at the start."""
+    learning_rate_decoder: float = 0.01
+    """Adam's learning rate of the decoder matrix, at the start."""
+    epsilon: float = 1e-12
+    """Adam's, in place of ``OptimConfig.epsilon``: entries of fine levels get small gradients."""
+
+    def __post_init__(self) -> None:
+        """Refuse a configuration for which there are no kernels."""
+        require_whole("field.levels", self.levels, 2)
+        require_whole("field.features", self.features, 1)
+        if self.features not in (2, 4, 8):
+            raise InputError(f"field.features must be 2, 4 or 8, not {self.features}.")
+        if self.levels * self.features > MAX_WIDTH:
+            raise InputError(
+                f"field.levels times field.features must be at most {MAX_WIDTH}, not "
+                f"{self.levels} x {self.features}; use fewer of one."
+            )
+        require_whole("field.coarsest", self.coarsest, 1)
+        require_whole("field.finest", self.finest, self.coarsest)
+        if self.finest > MAX_CELLS:
+            raise InputError(f"field.finest must be at most {MAX_CELLS}, not {self.finest}.")
+        require_whole("field.table", self.table, 16)
+        if self.table & (self.table - 1) or self.table > MAX_TABLE:
+            raise InputError(
+                f"field.table must be a power of two, up to {MAX_TABLE}, not {self.table}."
+            )
+        require_positive("field.learning_rate", self.learning_rate)
+        require_positive("field.learning_rate_decoder", self.learning_rate_decoder)
+        require_positive("field.epsilon", self.epsilon)
+        registry.keep_plain(self, "field")
+
+    @property
+    def resolutions(self) -> tuple[int, ...]:
+        """Cells of each level along the longest edge."""
+        between = max(1, self.levels - 1)
+        ratio = self.finest / self.coarsest
+        return tuple(round(self.coarsest * ratio ** (n / between)) for n in range(self.levels))
+
+    @property
+    def relative_time(self) -> float:
+        """By benchmarks/factors.py."""
+        return 0.6 + 0.4 * self.levels
+
+    @property
+    def rules(self) -> Mapping[str, str]:
+        """Entries, decoder."""
+        return {"values": "nodes", "decoder": "weights"}
+
+    def encoding(self, load: Load, model: Model) -> Any:
+        """Entries of all levels, decoded to the model's numbers."""
+        return load("fields.hashed").hashed(
+            *(self.features, self.levels, model.n_floats, 1 + model.n_features, model.by_sample)
+        )
+
+    def training_bytes(self, model: Model, size: tuple[int, int, int]) -> int:
+        """Of each entry, as in a cube; and of a look for free space, which is for all nodes."""
+        entries = sum(min(self.table, (n + 1) ** 3) + n for n in self.resolutions)
+        return entries * self.features * NUMBER_BYTES + math.prod(size) * LOOK_BYTES
+
+    def in_words(self, model: Model, size: tuple[int, int, int]) -> str:
+        """Levels, and what an entry has."""
+        return f"a hash of {self.levels} levels with up to {self.table} entries of {self.features}"
+
+
+DENSE = Dense()
+
+STORAGE_KINDS: dict[str, type[StorageKind]] = {kind.name: kind for kind in (Dense, Vm, Hash)}
+"""By name."""
+
+
+@cache
+def parts_of(model: Model, precision: str, stored: StorageKind = DENSE) -> Any:
+    """A model's parts in float32 or float64, with the encoding of what its field is stored in.
+
+    Raises:
+        ValueError: A part is another one each time, so that nothing made of it is found again.
+    """
+    load = loader(precision)
+
+    def made() -> Any:
+        return model.parts(load)._replace(encoding=stored.encoding(load, model))
+
+    parts = made()
+    for name, part, again in zip(parts._fields, parts, made(), strict=True):
+        if part != again:
+            raise ValueError(
+                f"model {model.name!r}, field {stored.name!r}: each call makes another part "
+                f"{name!r}; decorate the function that makes it with functools.cache"
+            )
+    return parts
+
+
+AnyKind = TypeVar("AnyKind", bound=type[StorageKind])
+
+
+def register(kind: AnyKind) -> AnyKind:
+    """Make a kind of storage known by its name, to files and configurations; a decorator.
+
+    Args:
+        kind: The class. What it is configured by are numbers with defaults.
+
+    Raises:
+        ValueError: Another one has that name.
+    """
+    return registry.add(STORAGE_KINDS, kind.name, kind, "storage")
+
+
+def storage_of(name: str) -> StorageKind:
+    """The storage of a name, as it is configured by default.
+
+    Raises:
+        InputError: There is none.
+    """
+    require_one_of("field", name, tuple(STORAGE_KINDS))
+    return STORAGE_KINDS[name]()
+
+
+def from_json(tree: Any) -> StorageKind:
+    """The kind that ``registry.to_json`` wrote.
+
+    Raises:
+        ValueError: It is none that this version knows.
+    """
+    kind = registry.from_json(STORAGE_KINDS, tree, "storage", {})
+    assert isinstance(kind, StorageKind)
+    return kind

@@ -1,0 +1,1 @@
+"""Trainings side by side, for people to look at."""

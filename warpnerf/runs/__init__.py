@@ -1,0 +1,1 @@
+"""The folder of a training: its files, checkpoints, pictures, and its photographs, read again."""

@@ -1,0 +1,111 @@
+"""config.json in a run's folder: what was trained, on what, and how."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from warpnerf.config import TrainConfig
+from warpnerf.config_json import config_from_json, config_to_json, decode
+from warpnerf.media.pictures import picture_files
+from warpnerf.scenes.files import read_json
+from warpnerf.scenes.scene import Scene
+
+
+class FoundExtent(msgspec.Struct, frozen=True):
+    """What the short trainings found, in scene units; see ``training.coarse``."""
+
+    content_distance: float
+    box_min: tuple[float, float, float]
+    box_max: tuple[float, float, float]
+
+
+class RunConfig(msgspec.Struct, frozen=True):
+    """What config.json says, as far as it is read again."""
+
+    scene: str
+    """Path, in the file relative to the run's folder if it lies there; or built-in name."""
+    downscale: int
+    """Pixels of the photographs averaged, in each direction."""
+    content_distance: float
+    """The one in use, scene units."""
+    train: TrainConfig
+    """What was requested."""
+    masks: str | None = None
+    """Absolute path of the folder of masks that was given for all photographs; None: none was."""
+    pictures: list[str] | None = None
+    """File names of the pictures in test/; None in runs of the version before, which wrote all."""
+    found: FoundExtent | None = None
+    """In place of the scene's own extent, where the cameras did not tell."""
+
+    def as_trained(self, scene: Scene) -> Scene:
+        """A scene, as it was read, with the extent that the run has found for it."""
+        if self.found is None:
+            return scene
+        return replace(
+            scene,
+            content_distance=self.found.content_distance,
+            box_min=np.array(self.found.box_min),
+            box_max=np.array(self.found.box_max),
+            guessed=False,
+        )
+
+
+def pictures_of(scene: Scene) -> list[str]:
+    """``RunConfig.pictures`` of a scene."""
+    return sorted(picture_files([view.name for view in scene.views]).values())
+
+
+def describe(
+    scene: Scene,
+    stored: str,
+    downscale: int,
+    content_distance: float,
+    config: TrainConfig,
+    masks: str | None,
+    found: bool,
+) -> dict[str, Any]:
+    """What config.json says of a run that begins; some of it only for those who open it.
+
+    Args:
+        scene: Photographs and extent, as trained on.
+        stored: Its place, as ``RunConfig.scene`` has it.
+        downscale: See ``RunConfig``.
+        content_distance: See ``RunConfig``.
+        config: What was requested.
+        masks: See ``RunConfig``.
+        found: Whether short trainings found the scene's extent.
+    """
+    extent = {"box_min": scene.box_min.tolist(), "box_max": scene.box_max.tolist()}
+    content = {
+        "scene": stored,
+        "downscale": downscale,
+        "masks": masks,
+        "content_distance": content_distance,
+        **extent,
+        "notes": [*scene.warnings, *scene.notes],
+        "pictures": pictures_of(scene),
+        "train": config_to_json(config),
+    }
+    if found:
+        content["found"] = {"content_distance": scene.content_distance, **extent}
+    return content
+
+
+def read_run_config(path: Path) -> RunConfig:
+    """Read config.json.
+
+    Raises:
+        InputError: It is not what ``describe`` gave.
+    """
+
+    def prepare(tree: Any) -> Any:
+        if isinstance(tree, dict) and isinstance(tree.get("train"), dict):
+            return tree | {"train": config_from_json(tree["train"])}
+        return tree
+
+    return read_json(path, RunConfig, prepare, decode)

@@ -1,0 +1,27 @@
+"""Whose process this is: the command's own, or one that uses the package as a library.
+
+What a whole process shares is set in the command's only: how much Warp says, the folder of its
+cache, standard error, how threads of OpenMP wait.
+"""
+
+from __future__ import annotations
+
+import os
+
+_own = False
+
+
+def make_own() -> None:
+    """Call this process the command's own, before anything is loaded that uses OpenMP.
+
+    Its threads, of FLIP and of torch, would spin between two short tasks, and take the cores from
+    those that have work. A policy of the user's stays.
+    """
+    global _own
+    _own = True
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+
+def is_own() -> bool:
+    """Whether it is."""
+    return _own

@@ -1,0 +1,1 @@
+"""How far a scene reaches: points, boxes, contracted space, and how fine voxels are."""

@@ -1,0 +1,1 @@
+"""Files of captures, read to a scene: a module for each format."""

@@ -1,0 +1,407 @@
+"""From the frames of a scene file to a Scene: find the images, split, read, estimate."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from warpnerf.checks import InputError
+from warpnerf.runtime.memory import usable_cores
+from warpnerf.scenes.cameras.camera import Camera
+from warpnerf.scenes.cameras.focus import estimate_extent
+from warpnerf.scenes.cameras.lens import Lens
+from warpnerf.scenes.cameras.undistort import seen_pixels
+from warpnerf.scenes.extent.points import Points, extent_by_points
+from warpnerf.scenes.files import exists, find_image
+from warpnerf.scenes.images.depths import Depth, DepthFile, read_depth
+from warpnerf.scenes.images.images import exif_orientation, image_shape
+from warpnerf.scenes.images.masks import Mask, PackedMask, masks_of_folder, read_mask
+from warpnerf.scenes.images.photographs import Keeping, Photograph, keep
+from warpnerf.scenes.scene import Scene, View
+
+LITTLE = 0.1
+"""Share of the pixels that masks leave, below which they are likely to be inverted."""
+
+POSED = "pose.json"
+"""Lies beside a scene that `warpnerf pose` wrote, whose poses are those of the stored pixels."""
+
+HOLD_OUT = 8
+"""Without a split in the file every 8th image is for testing, as in LLFF and Mip-NeRF 360."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Frame:
+    """One entry of a scene file, checked, its image found but not read."""
+
+    name: str
+    """The image's path relative to the scene's folder, with /."""
+    path: Path
+    """The image."""
+    c2w: np.ndarray
+    """[3, 4] float64, OpenGL axes, scene units."""
+    lens: Lens
+    mask: Mask | None = None
+    """Which pixels count; None: all."""
+    depth: DepthFile | None = None
+    """True depth; None: not known."""
+    image: np.ndarray | None = None
+    """As a view has it, where it was read already; None: it is in ``path``."""
+    bounds: tuple[float, float] | None = None
+    """Depth of the nearest and of the farthest content, scene units; None: not known."""
+
+
+def find_images(
+    folder: Path, file: Path, file_paths: Sequence[str]
+) -> tuple[dict[int, Path], list[str]]:
+    """Find the images of a scene file's frames; leave out the missing ones and the repeated ones.
+
+    Returns:
+        The image of each frame that is kept, by the frame's index, and warnings of the others.
+
+    Raises:
+        InputError: A path leaves the folder, or no image is there.
+    """
+    found: dict[int, Path] = {}
+    seen: set[Path] = set()
+    missing: list[str] = []
+    repeated: list[str] = []
+    for index, file_path in enumerate(file_paths):
+        path = find_image(folder, file_path, field=f"{file}: $.frames[{index}].file_path")
+        if path is None:
+            missing.append(file_path)
+        elif path in seen:
+            repeated.append(file_path)
+        else:
+            found[index] = path
+            seen.add(path)
+    if not file_paths:
+        raise InputError(f"{file}: $.frames: is empty; a scene needs posed images.")
+    if not found:
+        raise InputError(
+            f"{file}: $.frames[0].file_path: no image of {len(missing)} frames is in the folder "
+            f"(first: {missing[0]}); put the images next to the file."
+        )
+    warnings = []
+    if missing:
+        warnings.append(
+            f"{file.name}: left out {len(missing)} of {len(file_paths)} frames for want of an "
+            f"image (first: {missing[0]})"
+        )
+    if repeated:
+        warnings.append(
+            f"{file.name}: left out {len(repeated)} of {len(file_paths)} frames for naming an "
+            f"image again (first: {repeated[0]})"
+        )
+    return found, warnings
+
+
+def assemble(
+    *,
+    folder: Path,
+    file: Path,
+    frames: Sequence[Frame],
+    splits: Mapping[str, set[str]],
+    warnings: Sequence[str],
+    downscale: int,
+    masks: Path | None,
+    keeping: Keeping,
+    points: Points | None = None,
+) -> Scene:
+    """Read the images and make the scene.
+
+    Args:
+        folder: The scene's folder; its name is the scene's.
+        file: The scene file, for messages.
+        frames: Frames with different names.
+        splits: Names for "train", "test" and "val"; what is left out is filled in, see
+            ``complete_splits``.
+        warnings: Those so far; the result's begin with them.
+        downscale: Edge of the blocks of pixels that become one.
+        masks: Folder of masks, which take the place of those that frames have.
+        keeping: Where the images' pixels are kept, and how many threads read them.
+        points: Of the scene's surfaces, where there are some; tracks go by names of frames.
+
+    Raises:
+        InputError: An image, a mask, the split or the placement of the cameras is of no use.
+    """
+    frames = sorted(frames, key=lambda frame: frame.name)
+    complete, notes = complete_splits(file, [frame.name for frame in frames], splits)
+    used = set().union(*complete.values())
+    frames = [frame for frame in frames if frame.name in used]
+    if masks is not None:
+        found = masks_of_folder(masks, [frame.name for frame in frames])
+        frames = [replace(frame, mask=mask) for frame, mask in zip(frames, found, strict=True)]
+
+    # Decoders release the interpreter lock. The first error cancels what is not yet read.
+    with ThreadPoolExecutor(keeping.threads or usable_cores()) as pool:
+        read = list(pool.map(lambda frame: _read_frame(frame, downscale), frames))
+        turned = list(pool.map(_may_lie, frames))
+    left = [entry for entry in read if entry is not None]
+    complete, mask_warnings = _without_masked(file, frames, left, complete)
+    notes += _mask_notes(left)
+    kept = keep([entry.photograph for entry in left], keeping, file=file, downscale=downscale)
+    views = [
+        View(
+            name=entry.name,
+            camera=entry.camera,
+            image=image,
+            depth=entry.depth,
+            mask=entry.mask,
+        )
+        for entry, image in zip(left, kept.images, strict=True)
+    ]
+
+    index = {view.name: i for i, view in enumerate(views)}
+    indices = {
+        split: tuple(sorted(index[name] for name in names)) for split, names in complete.items()
+    }
+    training = [views[i] for i in indices["train"]]
+    unbounded = sum(kept.see_through[i] for i in indices["train"]) < len(training) / 2
+    transparent = {view.name for view, see in zip(views, kept.see_through, strict=True) if see}
+    try:
+        extent = estimate_extent([view.camera for view in training], unbounded=unbounded)
+    except InputError as error:
+        place = _field(file, "$.frames[].transform_matrix")
+        raise InputError(f"{file}:{place} {error}") from None
+    observed = None
+    if points is not None:
+        extent, observed = extent_by_points(extent, points, views, indices["train"], unbounded)
+    return Scene(
+        name=folder.resolve().name,
+        views=views,
+        splits=indices,
+        box_min=extent.box_min,
+        box_max=extent.box_max,
+        unbounded=unbounded,
+        content_distance=extent.content_distance,
+        content_distances=None if observed is None else observed.distances,
+        guessed=extent.guessed and observed is None,
+        near_content=None if observed is None else observed.near_content,
+        observations=None if observed is None else observed.observations,
+        points=None if observed is None or points is None else points.sample,
+        bounds=_bounds(frames, views),
+        notes=(*notes, *kept.notes, *extent.notes),
+        warnings=(
+            *(*warnings, *mask_warnings, *_diagnostics(views, complete, transparent)),
+            *_turned_warning(
+                folder, [frame.name for frame, lies in zip(frames, turned, strict=True) if lies]
+            ),
+        ),
+    )
+
+
+def _bounds(frames: Sequence[Frame], views: Sequence[View]) -> np.ndarray | None:
+    """The bounds of views, [n_views, 2], if all frames have some."""
+    given = {frame.name: frame.bounds for frame in frames if frame.bounds is not None}
+    if len(given) < len(frames):
+        return None
+    return np.array([given[view.name] for view in views])
+
+
+def complete_splits(
+    file: Path, names: Sequence[str], splits: Mapping[str, set[str]]
+) -> tuple[dict[str, set[str]], list[str]]:
+    """Fill in the splits that a file leaves out.
+
+    Without a training split, it is all images of no other split. Without a test split, every 8th
+    training image is for testing instead, counted by name from the first.
+
+    Returns:
+        Names for "train" and "test", and "val" where it is given; notes.
+
+    Raises:
+        InputError: No image is left to train on.
+    """
+    notes = []
+    given = {split: set(members) for split, members in splits.items() if members}
+    train = given.get("train", set(names) - set().union(*given.values()))
+    test = given.get("test", set())
+    if not test:
+        test = set(sorted(train)[::HOLD_OUT])
+        train = train - test
+        notes.append(f"the file has no test split: every {HOLD_OUT}th image is for testing")
+    if not train:
+        raise InputError(
+            f"{file}:{_field(file, '$.frames')} no image is left to train on, as {len(test)} of "
+            f"{len(names)} is for testing; add photographs."
+        )
+    complete = {"train": train, "test": test}
+    if "val" in given:
+        complete["val"] = given["val"]
+    unused = set(names) - set().union(*complete.values())
+    if unused:
+        notes.append(
+            f"in no split and not used: {len(unused)} of {len(names)} images (first: {min(unused)})"
+        )
+    return complete, notes
+
+
+def _field(file: Path, field: str) -> str:
+    """A field for messages, where the file is one that has fields."""
+    return f" {field}:" if file.suffix == ".json" else ""
+
+
+def _without_masked(
+    file: Path, frames: Sequence[Frame], read: Sequence[_Read], splits: dict[str, set[str]]
+) -> tuple[dict[str, set[str]], list[str]]:
+    """The splits without images of which masks leave nothing, and warnings of what masks leave.
+
+    Raises:
+        InputError: No training image is left.
+    """
+    left = {view.name for view in read}
+    gone = [frame.name for frame in frames if frame.name not in left]
+    splits = {split: names & left for split, names in splits.items()}
+    if not splits["train"]:
+        raise InputError(
+            f"{file}: the masks leave no pixel of any training image; white pixels count, black "
+            "ones are ignored, so invert the masks if they are the other way round."
+        )
+    warnings = []
+    if gone:
+        warnings.append(
+            f"left out {len(gone)} of {len(frames)} images of which masks leave no pixel (first: "
+            f"{gone[0]})"
+        )
+    share = _share_kept(read)
+    if share < LITTLE:
+        warnings.append(
+            f"masks leave {share:.1%} of the pixels: white ones count, black ones are ignored, so "
+            "invert the masks if they are the other way round"
+        )
+    return splits, warnings
+
+
+def _mask_notes(read: Sequence[_Read]) -> list[str]:
+    """That there are masks, and what they leave."""
+    masked = sum(view.mask is not None for view in read)
+    if not masked:
+        return []
+    return [
+        f"{masked} of {len(read)} images have pixels that are ignored; {_share_kept(read):.1%} "
+        "of all pixels count"
+    ]
+
+
+def _share_kept(read: Sequence[_Read]) -> float:
+    pixels = sum(view.camera.width * view.camera.height for view in read)
+    count = sum(
+        view.camera.width * view.camera.height if view.mask is None else view.mask.count
+        for view in read
+    )
+    return count / pixels
+
+
+def _may_lie(frame: Frame) -> bool:
+    """Whether a photograph is shown turned, and the file does not say what its stored size is."""
+    orientation = 1 if frame.image is not None else exif_orientation(frame.path)
+    stated = frame.lens.values.get("w"), frame.lens.values.get("h")
+    on_side = orientation >= 5
+    return orientation != 1 and not (on_side and None not in stated and stated[0] != stated[1])
+
+
+def _turned_warning(folder: Path, names: Sequence[str]) -> list[str]:
+    if not names or exists(folder / POSED):
+        return []
+    return [
+        f"stored turned, with an EXIF rotation that is not applied: {len(names)} images (first: "
+        f"{names[0]}); right if their poses are those of the stored pixels, as COLMAP's are, else "
+        "save the images upright"
+    ]
+
+
+def _diagnostics(
+    views: Sequence[View], splits: Mapping[str, set[str]], transparent: set[str]
+) -> list[str]:
+    """Warnings of photographs that can be used, and yet are likely not what was meant."""
+    warnings = []
+    if 0 < len(transparent) < len(views):
+        warnings.append(
+            f"transparent pixels in only {len(transparent)} of {len(views)} images (first: "
+            f"{min(transparent)}): the scene is trained to be empty there; where something is to "
+            "be ignored instead, give masks, by --masks"
+        )
+    shared = splits["train"] & splits["test"]
+    if shared:
+        warnings.append(
+            f"used for training and for testing: {len(shared)} of {len(views)} images (first: "
+            f"{min(shared)}), so test scores are too good"
+        )
+    sizes = {(view.camera.width, view.camera.height): view.name for view in reversed(views)}
+    if len(sizes) > 1:
+        shown = ", ".join(f"{name} {w}x{h}" for (w, h), name in sorted(sizes.items())[:2])
+        warnings.append(
+            f"images of {len(sizes)} sizes (first: {shown}): each frame needs a lens of its own "
+            "if the lens is given in pixels"
+        )
+    copies = _copies(views)
+    if copies:
+        warnings.append(
+            f"the same photograph from the same place: {len(copies)} of {len(views)} images "
+            f"(first: {copies[0][1]} is {copies[0][0]} again)"
+        )
+    return warnings
+
+
+def _copies(views: Sequence[View]) -> list[tuple[str, str]]:
+    """Pairs of names whose poses and pixels are the same, each view with the first of its kind."""
+    pairs = []
+    first_at: dict[bytes, list[View]] = {}
+    for view in views:
+        others = first_at.setdefault(view.camera.c2w.tobytes(), [])
+        again = next((o for o in others if np.array_equal(o.image, view.image)), None)
+        if again is None:
+            others.append(view)
+        else:
+            pairs.append((again.name, view.name))
+    return pairs
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Read:
+    """A frame, all of which is read but its photograph."""
+
+    name: str
+    camera: Camera
+    photograph: Photograph
+    depth: Depth | None
+    mask: PackedMask | None
+
+
+def _read_frame(frame: Frame, downscale: int) -> _Read | None:
+    """What belongs to a frame; None where its mask leaves no pixel of it."""
+    shape = image_shape(frame.path) if frame.image is None else frame.image.shape
+    height, width, channels = shape
+    whole = frame.lens.camera(width=width, height=height, c2w=frame.c2w, image=frame.name)
+    if downscale > min(width, height):
+        raise InputError(
+            f"downscale is {downscale}, but {frame.path} has {width}x{height} pixels; choose a "
+            "smaller factor."
+        )
+    camera = whole if downscale == 1 else whole.downscaled(downscale)
+    mask = seen_pixels(camera)
+    if frame.mask is not None:
+        given = read_mask(frame.mask, width=width, height=height, downscale=downscale)
+        mask = given if mask is None else mask & given
+    if mask is not None and not mask.any():
+        return None
+    if mask is not None and mask.all():
+        mask = None
+    photograph = Photograph(
+        path=frame.path,
+        shape=(camera.height, camera.width, channels),
+        downscale=downscale,
+        image=frame.image,
+    )
+    depth = None if frame.depth is None else read_depth(frame.depth, whole, downscale)
+    return _Read(
+        name=frame.name,
+        camera=camera,
+        photograph=photograph,
+        depth=depth,
+        mask=None if mask is None else PackedMask.of(mask),
+    )

@@ -1,0 +1,68 @@
+"""Blender / NeRF-synthetic: one file of frames per split, RGBA images with straight alpha.
+
+``transforms_train.json``, and where they exist ``transforms_test.json`` and
+``transforms_val.json``, take the same keys as a transforms.json; mostly there is only
+``camera_angle_x``, and the image's extension is left out.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from warpnerf.scenes.files import exists
+from warpnerf.scenes.formats.assemble import Frame, assemble
+from warpnerf.scenes.formats.transforms import read_frames
+from warpnerf.scenes.images.photographs import KEEPING, Keeping
+from warpnerf.scenes.scene import Scene
+
+SPLITS = ("train", "val", "test")
+
+
+def split_file(split: str) -> str:
+    """Return the file name that holds a split."""
+    return f"transforms_{split}.json"
+
+
+def load_blender(
+    folder: Path,
+    *,
+    downscale: int = 1,
+    masks: Path | None = None,
+    keeping: Keeping = KEEPING,
+) -> Scene:
+    """Load a scene from transforms_train.json and its siblings.
+
+    Without transforms_test.json every 8th training image is for testing.
+
+    Args:
+        folder: The scene's folder; image paths are relative to it and stay inside it.
+        downscale: Edge of the blocks of pixels that become one.
+        masks: Folder of masks for all photographs.
+        keeping: Where the images' pixels are kept.
+
+    Raises:
+        InputError: Something in the files or the images is wrong; the message names it.
+    """
+    frames: dict[str, Frame] = {}
+    splits: dict[str, set[str]] = {}
+    warnings: list[str] = []
+    for split in SPLITS:
+        file = folder / split_file(split)
+        if split != "train" and not exists(file):
+            continue
+        _, found, found_warnings = read_frames(file)
+        # An image in two files keeps the first file's pose.
+        for frame in found:
+            frames.setdefault(frame.name, frame)
+        splits[split] = {frame.name for frame in found}
+        warnings += found_warnings
+    return assemble(
+        folder=folder,
+        file=folder / split_file("train"),
+        frames=list(frames.values()),
+        splits=splits,
+        warnings=warnings,
+        downscale=downscale,
+        masks=masks,
+        keeping=keeping,
+    )

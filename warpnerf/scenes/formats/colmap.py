@@ -1,0 +1,450 @@
+"""COLMAP's sparse models, binary and text: cameras and poses of the photographs next to them.
+
+cameras.bin, images.bin or cameras.txt, images.txt lie in sparse/0, sparse or colmap/sparse/0, and
+photographs in images/, or smaller ones in images_2/, images_4/, ... Poses are world to camera in
+OpenCV axes, and pixels have their centres at halves, as here. Counts in the files are believed only
+as far as the file is long.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import struct
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warpnerf.checks import InputError
+from warpnerf.scenes.cameras.lens import Lens
+from warpnerf.scenes.cameras.poses import check_pose
+from warpnerf.scenes.extent.points import Points
+from warpnerf.scenes.files import (
+    exists,
+    find_image,
+    photograph_folder,
+    printable,
+    require_regular_file,
+)
+from warpnerf.scenes.formats.assemble import Frame, assemble
+from warpnerf.scenes.formats.colmap_points import read_points
+from warpnerf.scenes.images.images import image_size
+from warpnerf.scenes.images.masks import mask_in
+from warpnerf.scenes.images.photographs import KEEPING, Keeping
+from warpnerf.scenes.scene import Scene
+
+MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", ".")
+"""Where a model is looked for in a scene's folder, in this order."""
+
+PARAMETERS = {
+    "SIMPLE_PINHOLE": ("fl", "cx", "cy"),
+    "PINHOLE": ("fl_x", "fl_y", "cx", "cy"),
+    "SIMPLE_RADIAL": ("fl", "cx", "cy", "k1"),
+    "RADIAL": ("fl", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "FULL_OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "OPENCV_FISHEYE": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4"),
+    "SIMPLE_RADIAL_FISHEYE": ("fl", "cx", "cy", "k1"),
+    "RADIAL_FISHEYE": ("fl", "cx", "cy", "k1", "k2"),
+    "SIMPLE_FISHEYE": ("fl", "cx", "cy"),
+    "FISHEYE": ("fl_x", "fl_y", "cx", "cy"),
+}
+"""Of the lenses that are read, in the order of the files."""
+
+MODEL_NAMES = (
+    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"),
+    *("FULL_OPENCV", "FOV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE"),
+    *("RAD_TAN_THIN_PRISM_FISHEYE", "SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE"),
+    "EUCM",
+)
+"""By their numbers in cameras.bin."""
+
+
+SAME = 0.02
+"""Largest difference of two cameras that are one: in spreads of all, and of unit vectors."""
+MIN_SAME = 0.5
+"""Share of a scene's cameras that must be a model's for the model's points to be the scene's."""
+
+
+@dataclass(frozen=True)
+class _Camera:
+    """A lens of a model."""
+
+    model: str
+    width: int
+    height: int
+    parameters: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class _Image:
+    """A posed photograph of a model."""
+
+    number: int
+    name: str
+    camera: int
+    rotation: tuple[float, float, float, float]
+    """World to camera, quaternion w, x, y, z."""
+    translation: tuple[float, float, float]
+
+
+def find_model(folder: Path) -> Path | None:
+    """The folder of a model that belongs to a scene's folder.
+
+    Args:
+        folder: The scene's.
+
+    Returns:
+        Where cameras and images are; None where there is no model.
+    """
+    for name in MODEL_FOLDERS:
+        if model_kind(folder / name) is not None:
+            return folder / name
+    return None
+
+
+def model_kind(folder: Path) -> str | None:
+    """Whether a folder holds a model: "bin", "txt" or None."""
+    for kind in ("bin", "txt"):
+        if exists(folder / f"cameras.{kind}") and exists(folder / f"images.{kind}"):
+            return kind
+    return None
+
+
+def scene_folder(model: Path) -> Path:
+    """The scene's folder that a model's folder belongs to: the one that holds the photographs.
+
+    Where there are none, the one that they should be in.
+    """
+    model = model.resolve()
+    folders = (model, *list(model.parents)[:3])
+    for folder in folders:
+        if photograph_folder(folder) is not None:
+            return folder
+    names = ("colmap", "sparse", "0")  # of folders in a scene's that lead to its model
+    return next((folder for folder in folders if folder.name not in names), model)
+
+
+def load_colmap(
+    model: Path,
+    *,
+    downscale: int = 1,
+    masks: Path | None = None,
+    keeping: Keeping = KEEPING,
+) -> Scene:
+    """Load a scene from a sparse model.
+
+    Every 8th photograph is for testing. Box and content distance are those of the model's points,
+    where it has some.
+
+    Args:
+        model: Folder of cameras.bin and images.bin, or of cameras.txt and images.txt.
+        downscale: Edge of the blocks of pixels that become one.
+        masks: Folder of masks for all photographs.
+        keeping: Where the images' pixels are kept.
+
+    Returns:
+        The scene; distances are the model's.
+
+    Raises:
+        InputError: A file is damaged, a lens is not modelled, or no photograph is there.
+    """
+    kind = model_kind(model)
+    if kind is None:
+        raise InputError(f"{model}: holds no COLMAP model: cameras and images, .bin or .txt.")
+    camera_file, image_file = model / f"cameras.{kind}", model / f"images.{kind}"
+    for file in (camera_file, image_file):
+        require_regular_file(file)
+    read_cameras, read_images = (
+        (_cameras_of_bytes, _images_of_bytes)
+        if kind == "bin"
+        else (_cameras_of_text, _images_of_text)
+    )
+    cameras, images = read_cameras(camera_file), read_images(image_file)
+    folder = scene_folder(model)
+    photographs = photograph_folder(folder)
+    if photographs is None:
+        raise InputError(
+            f"{folder}: the model's photographs are not there; put them into {folder / 'images'}."
+        )
+    frames: list[Frame] = []
+    missing: list[str] = []
+    for image in images:
+        field = f"{image_file}: image {printable(image.name[:80])!r}"
+        path = find_image(photographs, image.name, field=field)
+        if path is None:
+            missing.append(printable(image.name[:80]))
+            continue
+        if image.camera not in cameras:
+            raise InputError(f"{field}: its camera {image.camera} is not in {camera_file.name}.")
+        camera, reduced = cameras[image.camera], photographs.name != "images"
+        lens = _lens(camera_file, image.camera, camera, path, reduced)
+        mask = mask_in(folder / "masks", image.name)
+        pose = _pose(image, field)
+        frames.append(Frame(name=image.name, path=path, c2w=pose, lens=lens, mask=mask))
+    if not frames:
+        raise InputError(
+            f"{image_file}: none of the model's {len(images)} photographs is in {photographs} "
+            f"(first: {missing[0] if missing else 'none'}); put them there."
+        )
+    warnings = []
+    stated = 0 if kind == "bin" else _stated_images(image_file)
+    if stated > len(images):
+        warnings.append(
+            f"{image_file.name}: says that it lists {stated} images, but lists {len(images)}: if "
+            "it was not shortened on purpose, export it again"
+        )
+    if missing:
+        warnings.append(
+            f"{image_file.name}: left out {len(missing)} of {len(images)} images for want of a "
+            f"photograph (first: {missing[0]})"
+        )
+    return assemble(
+        folder=folder,
+        file=image_file,
+        frames=frames,
+        splits={},
+        warnings=warnings,
+        downscale=downscale,
+        masks=masks,
+        keeping=keeping,
+        points=read_points(model, {image.number: image.name for image in images}, folder),
+    )
+
+
+def points_beside(folder: Path, frames: Sequence[Frame]) -> tuple[Points | None, str]:
+    """Points of a model that lies in the folder of a scene with cameras from elsewhere.
+
+    Args:
+        folder: The scene's.
+        frames: Of the scene.
+
+    Returns:
+        The points, with tracks by names of frames, where the model's cameras are the scene's; else
+        None, and why a model that is there is not used.
+    """
+    model = find_model(folder)
+    if model is None:
+        return None, ""
+    place = model.relative_to(folder).as_posix()
+    try:
+        kind = model_kind(model)
+        images = (_images_of_bytes if kind == "bin" else _images_of_text)(model / f"images.{kind}")
+        by_name = {image.name.replace("\\", "/").rpartition("/")[2]: image for image in images}
+        pairs = [(f, by_name[f.path.name]) for f in frames if f.path.name in by_name]
+        poses = np.array([_pose(image, f"{model}: {image.name}") for _, image in pairs])
+        if len(pairs) < MIN_SAME * len(frames) or not _same_cameras(
+            np.array([frame.c2w for frame, _ in pairs]), poses
+        ):
+            return None, f"the points of {place} are not used: its cameras are others"
+        names = {image.number: frame.name for frame, image in pairs}
+        return read_points(model, names, folder), ""
+    except InputError as error:
+        return None, f"the points of {place} are not used: {error}"
+
+
+def _same_cameras(ours: np.ndarray, theirs: np.ndarray) -> bool:
+    """Whether poses [n, 3, 4] are the same, but for rounding and a few."""
+    spread = np.linalg.norm(ours[:, :, 3] - ours[:, :, 3].mean(axis=0), axis=1).mean()
+    apart = np.linalg.norm(ours[:, :, 3] - theirs[:, :, 3], axis=1)
+    turned = np.abs(ours[:, :, :3] - theirs[:, :, :3]).max(axis=(1, 2))
+    return bool(np.mean((apart < SAME * spread) & (turned < SAME)) > MIN_SAME)
+
+
+def _pose(image: _Image, field: str) -> np.ndarray:
+    """Camera to world, [3, 4], OpenGL axes."""
+    w, x, y, z = image.rotation
+    length = math.sqrt(w * w + x * x + y * y + z * z)
+    if not (math.isfinite(length) and length > 1e-6):
+        raise InputError(f"{field}: its quaternion {image.rotation} is none; export it again.")
+    w, x, y, z = (value / length for value in (w, x, y, z))
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused below
+        position = -rotation.T @ np.array(image.translation)
+    c2w = np.concatenate([rotation.T * [1.0, -1.0, -1.0], position[:, None]], axis=1)
+    return check_pose(c2w.tolist(), field=field)
+
+
+def _lens(file: Path, number: int, camera: _Camera, photograph: Path, reduced: bool) -> Lens:
+    """A camera as a lens for a photograph, which is smaller than the model says if reduced."""
+    place = f"camera {number}"
+    if camera.model not in PARAMETERS:
+        raise InputError(
+            f"{file}: {place}: the lens {printable(camera.model[:40])} is not modelled; undistort "
+            "the images to a pinhole camera (colmap image_undistorter)."
+        )
+    names = PARAMETERS[camera.model]
+    if len(camera.parameters) != len(names):
+        raise InputError(
+            f"{file}: {place}: a {camera.model} has {len(names)} parameters, not "
+            f"{len(camera.parameters)}."
+        )
+    values: dict[str, float] = {}
+    for name, value in zip(names, camera.parameters, strict=True):
+        if not math.isfinite(value):
+            raise InputError(f"{file}: {place}: {name} is not a finite number; export it again.")
+        if name == "fl":
+            values["fl_x"] = values["fl_y"] = value
+        else:
+            values[name] = value
+    if min(values["fl_x"], values["fl_y"]) <= 0.0 or min(camera.width, camera.height) < 1:
+        raise InputError(f"{file}: {place}: its size and focal lengths must be above 0.")
+    size = camera.width, camera.height
+    if reduced:
+        width, height = image_size(photograph)
+        # Sides are rounded to whole pixels, so that one may be off by one.
+        if abs(width / camera.width * camera.height - height) <= 1.0:
+            size = width, height
+    across, along = size[0] / camera.width, size[1] / camera.height
+    for name, factor in (("fl_x", across), ("cx", across), ("fl_y", along), ("cy", along)):
+        values[name] *= factor
+    values |= {"w": size[0], "h": size[1]}
+    return Lens(
+        file=file,
+        values=values,
+        fields={name: f"{place}: {name}" for name in values},
+        fisheye=camera.model.endswith("FISHEYE"),
+    )
+
+
+class _Bytes:
+    """A binary file, read from its beginning; what is beyond its end is refused."""
+
+    def __init__(self, file: Path) -> None:
+        self._file = file
+        self._data = file.read_bytes()
+        self._at = 0
+
+    def take(self, format: str) -> tuple[Any, ...]:
+        """Numbers, by a format of ``struct`` without the order of bytes."""
+        size = struct.calcsize("<" + format)
+        self._require(size)
+        values = struct.unpack_from("<" + format, self._data, self._at)
+        self._at += size
+        return values
+
+    def count(self, least: int, what: str) -> int:
+        """A number of things that take at least so many bytes each."""
+        (n,) = self.take("Q")
+        if n * least > len(self._data) - self._at:
+            raise InputError(
+                f"{self._file}: is damaged: it counts {n} {what}, but ends before; export it again."
+            )
+        return int(n)
+
+    def text(self) -> str:
+        """Up to the next zero byte."""
+        end = self._data.find(b"\0", self._at)
+        if end < 0:
+            self._require(len(self._data))
+        text = self._data[self._at : end].decode("utf-8", "replace")
+        self._at = end + 1
+        return text
+
+    def skip(self, size: int) -> None:
+        """Leave out so many bytes."""
+        self._require(size)
+        self._at += size
+
+    def _require(self, size: int) -> None:
+        if self._at + size > len(self._data):
+            raise InputError(
+                f"{self._file}: is damaged: it ends after {len(self._data)} bytes, within an "
+                "entry; export it again."
+            )
+
+
+def _cameras_of_bytes(file: Path) -> dict[int, _Camera]:
+    data = _Bytes(file)
+    cameras = {}
+    for _ in range(data.count(24, "cameras")):
+        number, model, width, height = data.take("IiQQ")
+        if not 0 <= model < len(MODEL_NAMES):
+            raise InputError(f"{file}: camera {number}: its lens has the unknown number {model}.")
+        name = MODEL_NAMES[model]
+        parameters = PARAMETERS.get(name)
+        if parameters is None:
+            raise InputError(
+                f"{file}: camera {number}: the lens {name} is not modelled; undistort the images "
+                "to a pinhole camera (colmap image_undistorter)."
+            )
+        cameras[number] = _Camera(name, width, height, data.take(f"{len(parameters)}d"))
+    return cameras
+
+
+def _images_of_bytes(file: Path) -> list[_Image]:
+    data = _Bytes(file)
+    images = []
+    for _ in range(data.count(4 + 7 * 8 + 4 + 1 + 8, "images")):
+        (number,) = data.take("I")
+        values = data.take("7d")
+        (camera,) = data.take("I")
+        name = data.text()
+        data.skip(24 * data.count(24, "points of an image"))
+        images.append(_Image(number, name, camera, values[:4], values[4:]))
+    return images
+
+
+def _lines(file: Path) -> list[tuple[int, str]]:
+    """Lines with their numbers, without comments; empty lines stay, they mean something."""
+    try:
+        text = file.read_text(encoding="utf-8")
+    except UnicodeDecodeError:
+        raise InputError(f"{file}: is no text in UTF-8; export it again.") from None
+    lines = enumerate(text.splitlines(), 1)
+    return [(number, line.strip()) for number, line in lines if not line.lstrip().startswith("#")]
+
+
+def _parsed(file: Path, number: int, what: str, parse: Callable[[], Any]) -> Any:
+    try:
+        return parse()
+    except (ValueError, IndexError):
+        raise InputError(f"{file}: line {number}: is no {what} as COLMAP writes it.") from None
+
+
+def _cameras_of_text(file: Path) -> dict[int, _Camera]:
+    cameras = {}
+    for number, line in _lines(file):
+        if not line:
+            continue
+        words = line.split()
+
+        def parse(words: list[str] = words) -> tuple[int, _Camera]:
+            camera = _Camera(words[1], int(words[2]), int(words[3]), tuple(map(float, words[4:])))
+            return int(words[0]), camera
+
+        key, camera = _parsed(file, number, "camera", parse)
+        cameras[key] = camera
+    return cameras
+
+
+def _stated_images(file: Path) -> int:
+    """How many images a comment of COLMAP's says there are; 0 where there is none."""
+    comment = re.search(r"^# Number of images: (\d{1,9})\b", file.read_text("utf-8"), re.MULTILINE)
+    return int(comment[1]) if comment else 0
+
+
+def _images_of_text(file: Path) -> list[_Image]:
+    images = []
+    lines = _lines(file)
+    while lines and not lines[-1][1]:
+        lines.pop()
+    for number, line in lines[::2]:  # each is followed by a line of its points
+        words = line.split(maxsplit=9)
+
+        def parse(words: list[str] = words) -> _Image:
+            w, x, y, z, *translation = map(float, words[1:8])
+            a, b, c = translation
+            return _Image(int(words[0]), words[9], int(words[8]), (w, x, y, z), (a, b, c))
+
+        images.append(_parsed(file, number, "image", parse))
+    return images

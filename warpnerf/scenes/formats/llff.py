@@ -1,0 +1,97 @@
+"""LLFF's poses_bounds.npy: poses and one focal length of the photographs next to it, by name.
+
+Each row holds a matrix [3, 5], camera to world with axes down, right, backward and, in its last
+column, height, width and focal length in pixels of the original photographs; then two bounds of
+depth, between which what the photograph shows lies.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from warpnerf.checks import InputError
+from warpnerf.scenes.cameras.lens import Lens
+from warpnerf.scenes.cameras.poses import check_pose
+from warpnerf.scenes.files import photograph_folder
+from warpnerf.scenes.formats.assemble import Frame, assemble
+from warpnerf.scenes.images.arrays import read_npy
+from warpnerf.scenes.images.photographs import KEEPING, Keeping
+from warpnerf.scenes.scene import Scene
+
+FILE = "poses_bounds.npy"
+ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".ppm")
+
+
+def load_llff(
+    folder: Path,
+    *,
+    downscale: int = 1,
+    masks: Path | None = None,
+    keeping: Keeping = KEEPING,
+) -> Scene:
+    """Load a scene from poses_bounds.npy. Every 8th photograph is for testing.
+
+    Args:
+        folder: The scene's folder, with images/ or images_4/, images_8/, ...
+        downscale: Edge of the blocks of pixels that become one.
+        masks: Folder of masks for all photographs.
+        keeping: Where the images' pixels are kept.
+
+    Returns:
+        The scene; distances are the file's.
+
+    Raises:
+        InputError: The file is damaged, or there are more or fewer photographs than poses.
+    """
+    file = folder / FILE
+    rows = read_npy(file)
+    if rows.ndim != 2 or rows.shape[1] != 17:
+        raise InputError(f"{file}: must hold an array [n, 17], not {list(rows.shape)}.")
+    if not np.isfinite(rows).all():
+        raise InputError(f"{file}: must hold finite numbers only; export it again.")
+    photographs = photograph_folder(folder)
+    if photographs is None:
+        raise InputError(f"{folder}: its photographs are not there; put them into images/.")
+    paths = sorted(p for p in photographs.iterdir() if p.suffix.lower() in ENDINGS)
+    if len(paths) != len(rows):
+        raise InputError(
+            f"{file}: holds {len(rows)} poses, but {photographs} {len(paths)} photographs; LLFF "
+            "pairs them by order, so none may be missing."
+        )
+    frames = []
+    for number, (row, path) in enumerate(zip(rows.astype(np.float64), paths, strict=True)):
+        place = f"row {number}"
+        matrix = row[:15].reshape(3, 5)
+        down, right, backward, position, size = matrix.T
+        height, width, focal = size.tolist()
+        if min(height, width, focal) <= 0.0:
+            raise InputError(f"{file}: {place}: height, width and focal length must be above 0.")
+        pose = np.stack([right, -down, backward, position], axis=1)
+        # As angles of view, which hold for reduced photographs as well.
+        angles = {
+            "camera_angle_x": 2.0 * math.atan(0.5 * width / focal),
+            "camera_angle_y": 2.0 * math.atan(0.5 * height / focal),
+        }
+        fields = dict.fromkeys(angles, f"{place}: focal length")
+        frames.append(
+            Frame(
+                name=path.name,
+                path=path,
+                c2w=check_pose(pose.tolist(), field=f"{file}: {place}"),
+                lens=Lens(file=file, values=angles, fields=fields),
+                bounds=(float(row[15]), float(row[16])),
+            )
+        )
+    return assemble(
+        folder=folder,
+        file=file,
+        frames=frames,
+        splits={},
+        warnings=(),
+        downscale=downscale,
+        masks=masks,
+        keeping=keeping,
+    )

@@ -1,0 +1,224 @@
+"""transforms.json as instant-ngp and nerfstudio write it.
+
+``transform_matrix`` is camera to world in OpenGL axes, as everywhere in this project; distances are
+used as the file has them. ``aabb_scale``, ``scale`` and ``offset`` place the scene in instant-ngp's
+own unit cube, ``applied_transform`` tells where the poses came from: neither changes the picture.
+``applied_scale`` says how many of the file's units a metre is, and so what depth files mean.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from warpnerf.checks import InputError
+from warpnerf.scenes.cameras.lens import LensFields, read_lens
+from warpnerf.scenes.cameras.poses import check_pose
+from warpnerf.scenes.extent.points import Points, usable
+from warpnerf.scenes.files import exists, find_image, printable, read_json, resolve_inside
+from warpnerf.scenes.formats.assemble import Frame, assemble, find_images
+from warpnerf.scenes.formats.colmap import points_beside
+from warpnerf.scenes.formats.ply import read_ply
+from warpnerf.scenes.images.depths import DEFAULT_UNIT, DepthFile
+from warpnerf.scenes.images.masks import Mask, mask_beside
+from warpnerf.scenes.images.photographs import KEEPING, Keeping
+from warpnerf.scenes.scene import Scene
+
+IGNORED = {
+    "white_transparent": "white stays opaque",
+    "black_transparent": "black stays opaque",
+    "mask_color": "that colour stays opaque",
+    "rolling_shutter": "each image is taken at one instant",
+}
+"""Keys that would change the picture, and what happens without them."""
+
+
+class PictureKeys(LensFields):
+    """A lens, and the keys that are named in a warning because they are not used."""
+
+    white_transparent: object = None
+    black_transparent: object = None
+    mask_color: object = None
+    rolling_shutter: object = None
+
+
+class FrameEntry(PictureKeys, kw_only=True):
+    """One posed image."""
+
+    file_path: str
+    transform_matrix: list[list[float]]
+    mask_path: str | None = None
+    depth_file_path: str | None = None
+
+
+class TransformsFile(PictureKeys, kw_only=True):
+    """The whole file; other keys are allowed and not read."""
+
+    frames: list[FrameEntry]
+    ply_file_path: str | None = None
+    mask_path: str | None = None
+    depth_unit_scale_factor: float = DEFAULT_UNIT
+    applied_scale: float = 1.0
+    train_filenames: list[str] | None = None
+    val_filenames: list[str] | None = None
+    test_filenames: list[str] | None = None
+
+
+def load_transforms(
+    file: Path,
+    *,
+    downscale: int = 1,
+    masks: Path | None = None,
+    keeping: Keeping = KEEPING,
+) -> Scene:
+    """Load a scene from a transforms.json.
+
+    The split is the file's ``{train,val,test}_filenames``, else every 8th image is for testing. Box
+    and content distance are those of the points of a COLMAP model in the folder whose cameras are
+    the same, or that ``ply_file_path`` names, where there are such.
+
+    Args:
+        file: The file; image paths in it are relative to its folder and stay inside it.
+        downscale: Edge of the blocks of pixels that become one.
+        masks: Folder of masks for all photographs.
+        keeping: Where the images' pixels are kept.
+
+    Raises:
+        InputError: Something in the file or its images is wrong; the message names it.
+    """
+    folder = file.parent
+    data, frames, warnings = read_frames(file)
+    unused = folder / "masks"
+    if masks is None and unused.is_dir() and not any(frame.mask for frame in frames):
+        warnings.append(
+            f"{unused} is not used, as no frame has a mask_path; --masks {unused} ignores what is "
+            "black there"
+        )
+    names = {frame.name for frame in frames}
+    splits: dict[str, set[str]] = {}
+    for split in ("train", "val", "test"):
+        listed = getattr(data, f"{split}_filenames") or []
+        members, absent = _listed_names(folder, file, split, listed, names)
+        if listed and not members:
+            raise InputError(
+                f"{file}: $.{split}_filenames: names no image that is among the frames (first: "
+                f"{listed[0]}); correct the list or remove it."
+            )
+        if absent:
+            warnings.append(
+                f"{file.name}: not among the frames: {len(absent)} of {len(listed)} "
+                f"{split}_filenames (first: {absent[0]})"
+            )
+        splits[split] = members
+    points, why_not = _points(file, data.ply_file_path, frames)
+    if why_not:
+        warnings.append(why_not)
+    return assemble(
+        folder=folder,
+        file=file,
+        frames=frames,
+        splits=splits,
+        warnings=warnings,
+        downscale=downscale,
+        masks=masks,
+        keeping=keeping,
+        points=points,
+    )
+
+
+def _points(
+    file: Path, ply_file_path: str | None, frames: Sequence[Frame]
+) -> tuple[Points | None, str]:
+    """The points of a COLMAP model with the same cameras, else those that the file names.
+
+    The model comes first because its points have tracks: which photograph sees which.
+
+    Returns:
+        The points, or None; and a warning if there are some that are not used.
+    """
+    beside, why_not = points_beside(file.parent, frames)
+    if ply_file_path is None or (beside is not None and beside.tracks is not None):
+        return beside, why_not
+    path = resolve_inside(file.parent, ply_file_path, field=f"{file}: $.ply_file_path")
+    if not exists(path):
+        return None, f"{file.name}: ply_file_path {printable(ply_file_path)} is not there"
+    positions = read_ply(path)
+    positions = positions[usable(positions)]
+    return Points(positions=positions, tracks=None, source=ply_file_path), ""
+
+
+def read_frames(file: Path) -> tuple[TransformsFile, list[Frame], list[str]]:
+    """Read a file of frames and check everything but the images' pixels.
+
+    Returns:
+        The file's content, the frames whose images are there, and warnings of the others.
+
+    Raises:
+        InputError: As ``load_transforms``.
+    """
+    data = read_json(file, TransformsFile)
+    found, warnings = find_images(file.parent, file, [entry.file_path for entry in data.frames])
+    unit = data.depth_unit_scale_factor * data.applied_scale
+    if not (unit > 0.0 and math.isfinite(unit)):
+        raise InputError(
+            f"{file}: $.depth_unit_scale_factor: {data.depth_unit_scale_factor:g} with an "
+            f"applied_scale of {data.applied_scale:g} is no unit of depth; give numbers above 0."
+        )
+    frames = []
+    lost: dict[str, list[str]] = {"mask_path": [], "depth_file_path": []}
+    for index, path in found.items():
+        entry = data.frames[index]
+        place = f"$.frames[{index}]"
+        mask = _named_file(file, place, "mask_path", entry.mask_path, lost)
+        if mask is None and not entry.mask_path:
+            mask = _named_file(file, "$", "mask_path", data.mask_path, lost)
+        depth = _named_file(file, place, "depth_file_path", entry.depth_file_path, lost)
+        frames.append(
+            Frame(
+                name=path.relative_to(file.parent).as_posix(),
+                path=path,
+                c2w=check_pose(entry.transform_matrix, field=f"{file}: {place}.transform_matrix"),
+                lens=read_lens(file, [(place, entry), ("$", data)]),
+                mask=mask_beside(path) if mask is None else Mask(mask),
+                depth=None if depth is None else DepthFile(depth, unit),
+            )
+        )
+    for key, names in lost.items():
+        if names:
+            warnings.append(
+                f"{file.name}: the {key} of {len(names)} of {len(data.frames)} frames leads to no "
+                f"file (first: {names[0]})"
+            )
+    for key, consequence in IGNORED.items():
+        if getattr(data, key) or any(getattr(entry, key) for entry in data.frames):
+            warnings.append(f"{file.name}: {key} is not used: {consequence}")
+    return data, frames, warnings
+
+
+def _named_file(
+    file: Path, place: str, key: str, text: str | None, lost: dict[str, list[str]]
+) -> Path | None:
+    """The file that a key names, if it does; one that is not there is added to the lost ones."""
+    if not text:
+        return None
+    path = find_image(file.parent, text, field=f"{file}: {place}.{key}")
+    if path is None:
+        lost[key].append(text)
+    return path
+
+
+def _listed_names(
+    folder: Path, file: Path, split: str, listed: Sequence[str], names: set[str]
+) -> tuple[set[str], list[str]]:
+    """Sort a list of file names into those of frames, by frame name, and the others."""
+    members: set[str] = set()
+    absent: list[str] = []
+    for index, text in enumerate(listed):
+        path = find_image(folder, text, field=f"{file}: $.{split}_filenames[{index}]")
+        name = path.relative_to(folder).as_posix() if path else None
+        if name in names:
+            members.add(str(name))
+        else:
+            absent.append(text)
+    return members, absent

@@ -1,0 +1,1 @@
+"""Photographs, masks and depths, and where their pixels are kept."""

@@ -1,0 +1,151 @@
+"""Masks: images that are white where a photograph's pixels count, black where they are ignored."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from warpnerf.checks import InputError
+from warpnerf.scenes.images.images import read_image
+
+SUFFIXES = (".png", ".jpg", ".jpeg")
+"""Of masks, which are named after a photograph or its stem."""
+
+
+@dataclass(frozen=True)
+class Mask:
+    """A mask that was found, not read yet."""
+
+    path: Path
+    """Of the image."""
+    white_counts: bool = True
+    """False for those of instant-ngp, where white is ignored."""
+
+
+@dataclass(frozen=True, eq=False)
+class PackedMask:
+    """Which pixels count, a bit for each."""
+
+    bits: np.ndarray
+    """[n] uint8, row by row."""
+    shape: tuple[int, int]
+    """H, W."""
+    count: int
+    """Of pixels that count."""
+
+    @staticmethod
+    def of(mask: np.ndarray) -> PackedMask:
+        """Pack a mask [H, W] bool."""
+        rows, columns = mask.shape
+        return PackedMask(np.packbits(mask), (rows, columns), int(np.count_nonzero(mask)))
+
+    def read(self) -> np.ndarray:
+        """[H, W] bool."""
+        n_pixels = self.shape[0] * self.shape[1]
+        return np.unpackbits(self.bits, count=n_pixels).view(np.bool_).reshape(self.shape)
+
+
+def mask_beside(photograph: Path) -> Mask | None:
+    """instant-ngp's mask of a photograph, dynamic_mask_NAME.png in the same folder."""
+    path = photograph.with_name(f"dynamic_mask_{photograph.stem}.png")
+    return Mask(path, white_counts=False) if os.path.isfile(path) else None  # noqa: PTH113
+
+
+def mask_in(folder: Path, name: str) -> Mask | None:
+    """The mask of a photograph in a folder of masks, as COLMAP has it: NAME.jpg.png or NAME.png.
+
+    Args:
+        folder: Of masks.
+        name: The photograph's path relative to the folder of photographs, with /.
+    """
+    relative = PurePosixPath(name)
+    if relative.is_absolute() or ".." in relative.parts:
+        return None
+    stem = relative.with_suffix("")
+    for path in (f"{name}.png", *(f"{stem}{suffix}" for suffix in SUFFIXES), name):
+        if os.path.isfile(folder / path):  # noqa: PTH113, never raises
+            return Mask(folder / path)
+    return None
+
+
+def masks_of_folder(folder: Path, names: Sequence[str]) -> list[Mask | None]:
+    """Find the masks of a scene's photographs in a folder that was given for all.
+
+    Args:
+        folder: Of masks; its structure is that of the photographs' folder.
+        names: Of the photographs, relative to the scene's folder, with /.
+
+    Returns:
+        One for each photograph; None where there is none.
+
+    Raises:
+        InputError: The folder does not exist, or holds no mask of these photographs.
+    """
+    if not folder.is_dir():
+        raise InputError(f"--masks {folder}: is no folder; name the folder of the masks.")
+    if not os.access(folder, os.R_OK | os.X_OK):
+        raise InputError(f"--masks {folder}: cannot be read; give access to it.")
+    parents = {PurePosixPath(name).parent.as_posix() for name in names}
+    common = os.path.commonpath(parents).replace(os.sep, "/")
+    found = []
+    for name in names:
+        inside = PurePosixPath(name).relative_to(common).as_posix()
+        found.append(mask_in(folder, inside) or mask_in(folder, name))
+    if not any(found):
+        stem = PurePosixPath(names[0]).stem
+        raise InputError(
+            f"--masks {folder}: holds no mask of {len(names)} photographs (first: {names[0]}); "
+            f"name them after the photographs: {PurePosixPath(names[0]).name}.png or {stem}.png."
+        )
+    return found
+
+
+def read_mask(mask: Mask, *, width: int, height: int, downscale: int) -> np.ndarray:
+    """Read a mask for a photograph, of its size or a whole number of times as large.
+
+    White is more than half of the largest value that a pixel can have, in any channel, where it is
+    opaque; where no pixel has more than 1 of 255, it is 1. A pixel that stands for several counts
+    if all of them do.
+
+    Args:
+        mask: To read.
+        width: Pixels in a row of the photograph, as it is stored.
+        height: Its rows.
+        downscale: Edge of the blocks of the photograph's pixels that become one. Masks may have
+            the size that it then has.
+
+    Returns:
+        [height // downscale, width // downscale] bool, true where a pixel counts.
+
+    Raises:
+        InputError: It cannot be read, or has another size.
+    """
+    image = read_image(mask.path)
+    # Ten times as fast as the maximum along an axis.
+    rgb = np.maximum(np.maximum(image[..., 0], image[..., 1]), image[..., 2])
+    white = rgb > (127 if rgb.max() > 1 else 0)
+    if image.shape[2] == 4:
+        white &= image[..., 3] > 127
+    counts = white if mask.white_counts else rgb == 0
+    rows, columns = counts.shape
+    small = (height // downscale, width // downscale)
+    if (rows, columns) == small:
+        return counts
+    times = round(columns / width)
+    if times < 1 or (rows // times, columns // times) != (height, width):
+        raise InputError(
+            f"{mask.path}: has {columns}x{rows} pixels, but its photograph {width}x{height}; make "
+            "the mask as large as the photograph."
+        )
+    return _all_of_blocks(counts, times * downscale, small)
+
+
+def _all_of_blocks(counts: np.ndarray, edge: int, size: tuple[int, int]) -> np.ndarray:
+    """Whether all pixels of each block do; those at the right and bottom that fill none are cut."""
+    rows, columns = size
+    blocks = counts[: rows * edge, : columns * edge].reshape(rows, edge, columns, edge)
+    return np.asarray(blocks.all(axis=(1, 3)))

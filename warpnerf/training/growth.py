@@ -1,0 +1,120 @@
+"""Progressive growing: the first grid of a training, and its upsampling to more voxels."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import warp as wp
+
+from warpnerf.config import TrainConfig
+from warpnerf.fields.lattice import Lattice
+from warpnerf.fields.occupancy import FreeCells
+from warpnerf.fields.parameters import Parameter
+from warpnerf.fields.storage import Storage, require_memory
+from warpnerf.fields.storages import class_of
+from warpnerf.model.interface import Model
+from warpnerf.runtime.parallel import Workers
+from warpnerf.scenes.extent.space import grid_size
+from warpnerf.training.optim import OPTIMISERS
+from warpnerf.training.plan import TrainingPlan
+
+
+def require_room(plan: TrainingPlan, device: wp.Device) -> None:
+    """Raise InputError if training the final field of a plan does not fit the device's memory."""
+    config = plan.config
+    require_memory(config.field, _model(config), plan.stages[-1].size, device)
+
+
+def first_storage(plan: TrainingPlan, device: wp.Device) -> Storage:
+    """What the field is stored in before the first update.
+
+    Args:
+        plan: Of the training.
+        device: Where it lies.
+
+    Raises:
+        ValueError: Its parameters are others than its kind's ``rules`` say.
+    """
+    config, space = plan.config, plan.space
+    voxel = float(space.voxel_edges(plan.stages[-1].size).min())
+    lattice = Lattice.over(space, plan.stages[0].size)
+    storage = class_of(config.field).first(
+        config.field, _model(config), lattice, config.seed, device
+    )
+    found = {p.name: p.rule for p in storage.parameters(_model(config), config.optim)}
+    if list(found.items()) != list(config.field.rules.items()):
+        raise ValueError(
+            f"field {config.field.name!r}: its storage has the parameters {found}, by name and "
+            f"rule, but its kind's rules are {dict(config.field.rules)}"
+        )
+    return replace(
+        storage,
+        # softplus(shift) is the optical depth of a voxel of the final lattice.
+        density_shift=math.log(math.expm1(-math.log1p(-config.grid.alpha_init))),
+        density_scale=1.0 / voxel,
+    )
+
+
+def occupied_box(lattice: Lattice, free: FreeCells) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of the box around what is occupied, [3] each; never larger than before.
+
+    Args:
+        lattice: Not in contracted space.
+        free: What of it is not occupied.
+    """
+    box_min, box_max = lattice.box_min, lattice.box_max
+    occupied = free.occupied_range()
+    if occupied is None:
+        return box_min, box_max
+    edges = box_max - box_min
+    return box_min + occupied[0] * edges, box_min + occupied[1] * edges
+
+
+def grown_storage(
+    storage: Storage,
+    box: tuple[np.ndarray, np.ndarray],
+    nodes: int,
+    shift: float,
+    workers: Workers,
+) -> Storage:
+    """The same field upsampled to more nodes.
+
+    Args:
+        storage: As it stands.
+        box: Corners of the new lattice's box, within this one's.
+        nodes: How many it has, about.
+        shift: Taken from all raw densities, before their activation.
+        workers: Where to work.
+    """
+    tight = replace(storage.lattice, box_min=box[0], box_max=box[1])
+    grown = storage.resized(workers, Lattice.over(tight, grid_size(tight.extent, nodes)))
+    return replace(grown, density_shift=grown.density_shift - shift)
+
+
+def grown_states(
+    states: dict[str, dict[str, wp.array]],
+    parameters: tuple[Parameter, ...],
+    storage: Storage,
+    grown: Storage,
+    workers: Workers,
+) -> dict[str, dict[str, wp.array]]:
+    """Optimiser state, carried over to a grown lattice.
+
+    Args:
+        states: Of each parameter, by its name.
+        parameters: Those before.
+        storage: Before.
+        grown: Afterwards.
+        workers: Where to work.
+    """
+    return {
+        p.name: OPTIMISERS[p.rule].resized(p.name, states[p.name], storage, grown, workers)
+        for p in parameters
+    }
+
+
+def _model(config: TrainConfig) -> Model:
+    assert isinstance(config.model, Model)
+    return config.model

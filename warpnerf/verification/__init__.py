@@ -1,0 +1,1 @@
+"""Gradients and whole trainings, checked on the machine where they are to run."""
