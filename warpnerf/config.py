@@ -74,7 +74,7 @@ def _checked_box(box: object) -> tuple[float, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class GridConfig:
-    """The voxel grid over the scene's box."""
+    """The voxel grid: resolution, bounding box, contraction of unbounded space, growth."""
 
     voxels: int = 160**3
     """Nodes of the final grid, in all. It grows from step 200 on: a shorter training keeps the grid
@@ -135,7 +135,7 @@ class GridConfig:
             self.require_planes_used(self.contraction)
 
     def require_planes_used(self, contraction: Contraction) -> None:
-        """Raise InputError where ``planes`` is given, but does nothing.
+        """Raise InputError where ``planes``, of NDC depth, is given, but does nothing.
 
         Args:
             contraction: The grid's, decided.
@@ -147,7 +147,8 @@ class GridConfig:
             )
 
     def grows_at(self, kind: SceneKind) -> tuple[float, ...]:
-        """``grow_at``, decided for a kind of scene.
+        """When the voxel grid grows, as shares of the training: ``grow_at``, decided for a kind of
+        scene.
 
         Args:
             kind: object, bounded or unbounded.
@@ -158,7 +159,7 @@ class GridConfig:
         return GROW_AT[kind] if isinstance(self.grow_at, str) else self.grow_at
 
     def nodes_after(self, grown: int, kind: SceneKind) -> int:
-        """How many nodes a grid has, about, that has grown so often.
+        """About how many voxel grid nodes there are after so many steps of growth.
 
         Args:
             grown: At most as often as ``grows_at`` has shares.
@@ -172,7 +173,7 @@ class GridConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class MarchConfig:
-    """How rays are stepped."""
+    """Ray marching: step length, its growth with the distance, near and far."""
 
     step_voxels: float = 1.0
     """Step length, in voxel edges."""
@@ -218,7 +219,7 @@ class MarchConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig:
-    """One training run: by default the preset fast."""
+    """The configuration of a training run: by default the preset fast."""
 
     steps: int = 4000
     """Batches of rays to draw. Each adds to the gradient by which the grid is updated, see
@@ -269,7 +270,7 @@ class TrainConfig:
     grid: GridConfig = field(default_factory=GridConfig)
     """The voxel grid."""
     march: MarchConfig = field(default_factory=MarchConfig)
-    """How rays are stepped."""
+    """Ray marching."""
     optim: OptimConfig = field(default_factory=OptimConfig)
     """Adam, its schedule, and regularisation."""
     loss: LossConfig = USUAL_LOSSES
@@ -284,7 +285,7 @@ class TrainConfig:
     defaults."""
 
     def losses_for(self, kind: SceneKind) -> LossConfig:
-        """``loss``, decided for a kind of scene.
+        """The loss weights: ``loss``, decided for a kind of scene.
 
         Args:
             kind: object, bounded or unbounded.

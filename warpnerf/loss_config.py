@@ -77,7 +77,7 @@ class LossConfig:
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """Which losses there are besides the squared error; kernels are compiled for them."""
+        """Which loss terms there are besides the squared error; kernels are compiled for them."""
         huber = ("huber",) if self.photometric == "huber" else ()
         return huber + tuple(name for name in WEIGHTS_OF_LOSSES if getattr(self, name) != 0.0)
 

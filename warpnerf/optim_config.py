@@ -40,7 +40,7 @@ def model_rates(model: Model) -> tuple[str, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class OptimConfig:
-    """Adam, its schedule, and regularisation."""
+    """The optimiser, Adam: learning rates and their decay, and total variation regularisation."""
 
     learning_rate_density: float = 0.5
     """How far an update of one step moves raw densities, about, at the start; one of n steps moves
@@ -109,7 +109,7 @@ class OptimConfig:
                 raise InputError(f"optim.{name} must lie in [0, 1), not {getattr(self, name)}.")
 
     def accumulates_at(self, kind: SceneKind) -> tuple[float, ...]:
-        """``accumulate_at``, decided for a kind of scene.
+        """When gradient accumulation doubles: ``accumulate_at``, decided for a kind of scene.
 
         Args:
             kind: object, bounded or unbounded.

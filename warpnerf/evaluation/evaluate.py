@@ -72,7 +72,8 @@ class ImageMetrics:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """The figures of all views of a split, and those of the space before the training cameras."""
+    """Image metrics of all views of a split, PSNR, SSIM and others, and floater metrics before the
+    training cameras."""
 
     images: tuple[ImageMetrics, ...]
     """In the scene's order."""
@@ -81,7 +82,7 @@ class Evaluation:
 
     @property
     def mean(self) -> dict[str, float]:
-        """Means over the images that have a figure, by name."""
+        """Mean image metrics over the images that have one, by name."""
         means = {}
         for name in HEADINGS:
             values = [getattr(image, name) for image in self.images]
@@ -91,7 +92,8 @@ class Evaluation:
         return means
 
     def to_json(self) -> str:
-        """{"mean": {"psnr": ..., ...}, "floaters": {...}, "images": [{"name": ..., ...}, ...]}."""
+        """Metrics as JSON: {"mean": {"psnr": ..., ...}, "floaters": {...}, "images": [{"name": ...,
+        ...}, ...]}."""
         images = [
             {key: value for key, value in vars(image).items() if value is not None}
             for image in self.images

@@ -43,7 +43,8 @@ def export(
     min_size: float | None = None,
     on_camera: Callable[[int], None] | None = None,
 ) -> Path:
-    """Write a field for other programs, as the ending of the name says.
+    """Export a field as a mesh, point cloud, Gaussian splats, volume or page, as the ending of the
+    name says.
 
     .glb, .obj, .ply: a mesh with colours at its vertices. .points.ply: its vertices, with normals
     and colours. .splat.ply: Gaussian splats. .html: a page that shows these without a network;

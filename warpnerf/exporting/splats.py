@@ -52,7 +52,7 @@ FIRST_HARMONIC = 0.28209479177387814
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Splats:
-    """Gaussians with one colour each."""
+    """Gaussian splats with one colour each."""
 
     centres: np.ndarray
     """[n, 3] float32, scene units."""

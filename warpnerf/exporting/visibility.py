@@ -47,7 +47,7 @@ class Visibility:
     """[X, Y, Z, 3] float32: the same sum of the pixels' colours."""
 
     def rgb_at(self, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The mean colour of the pixels that see a place.
+        """The mean RGB colour of the pixels that see a place.
 
         Args:
             nodes: [n, 3] node coordinates.

@@ -59,7 +59,8 @@ class Cost:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Inspection:
-    """What was understood of a scene, and diagnostics: what may be wrong with it."""
+    """A scene's summary and diagnostics: cameras, extent, training memory and time, what may be
+    wrong."""
 
     scene: Scene
     """As it was loaded."""
@@ -78,24 +79,24 @@ class Inspection:
 
     @property
     def space(self) -> Space:
-        """That the grid of the first of the trainings that were asked about fills."""
+        """The bounding box and contraction that the first training's voxel grid fills."""
         return next(iter(self.costs.values())).plan.space
 
     @property
     def widths(self) -> np.ndarray:
-        """How many pixels wide its voxels are at each of ``scene.observations``, [n]."""
+        """Voxel width in pixels at each of ``scene.observations``, [n]."""
         assert self.scene.observations is not None
         voxels = next(iter(self.costs.values())).plan.config.grid.voxels
         return self.space.voxel_widths(self.scene.observations, voxels)
 
     @property
     def oddities(self) -> tuple[str, ...]:
-        """The former name of diagnostics."""
+        """The deprecated name of ``diagnostics``."""
         warn_renamed("Inspection.oddities", "diagnostics")
         return self.diagnostics
 
     def facts(self) -> dict[str, Any]:
-        """All of it in plain numbers and texts, for JSON."""
+        """A dictionary of plain numbers and texts, for JSON."""
         scene = self.scene
         lenses = scene.cameras
         return {
@@ -151,7 +152,7 @@ class Inspection:
         }
 
     def to_json(self) -> str:
-        """The facts."""
+        """The facts as JSON."""
         return json.dumps(self.facts(), indent=2) + "\n"
 
     def __str__(self) -> str:

@@ -62,11 +62,11 @@ class RecordedPath(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
     @property
     def seconds(self) -> float:
-        """How long it takes."""
+        """The duration in seconds."""
         return self.keys[-1].seconds - self.keys[0].seconds
 
     def to_json(self) -> bytes:
-        """The content of the file."""
+        """The camera path as JSON, the content of its file."""
         return msgspec.json.format(msgspec.json.encode(self), indent=1) + b"\n"
 
     def cameras(self, n_frames: int, size: tuple[int, int] | None = None) -> list[Camera]:

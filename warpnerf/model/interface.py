@@ -1,4 +1,4 @@
-"""What a model has to say: of which parts it is made, and what of them is trained and how.
+"""The interface of radiance models: the kernels' parts, and what of them is trained and how.
 
 A model is a frozen value. It names the parts that ``warpnerf_kernels.launch.assembly`` puts
 together. ``warpnerf.model.models`` has those of the package.
@@ -21,7 +21,8 @@ Load = Callable[[str], ModuleType]
 
 
 class Rates(Protocol):
-    """What ``warpnerf.optim_config.OptimConfig`` says of learning rates and total variation."""
+    """Learning rates and total variation weights, as ``warpnerf.optim_config.OptimConfig`` has
+    them."""
 
     @property
     def learning_rate_density(self) -> float: ...  # noqa: D102
@@ -45,14 +46,14 @@ class Model(ABC):
 
     @property
     def relative_time(self) -> float:
-        """How long a step of training takes, about; rgb's is 1.
+        """Training time of a step relative to the model rgb, about.
 
         That is what its nodes cost, by benchmarks/models.py; a model with an MLP adds it.
         """
         return 0.72 + 0.07 * self.n_floats
 
     def keep_plain(self) -> None:
-        """Make each field of a frozen dataclass a plain int, float or bool, as its default is.
+        """Convert NumPy scalars in the fields of a frozen dataclass to plain int, float or bool.
 
         So what files hold of it is read back as the same. For ``__post_init__``.
 
@@ -73,7 +74,7 @@ class Model(ABC):
 
     @abstractmethod
     def parts(self, load: Load) -> Any:
-        """What the model is made of, besides the encoding, which is its storage's.
+        """The kernels' parts: head, sampler and losses; the encoding is its storage's.
 
         Args:
             load: The kernels' modules, in the precision that is wanted.
@@ -129,7 +130,7 @@ class Model(ABC):
         return self.parts(load).losses.on_samples.Params()
 
     def most_steps(self, steps: Any, length: float) -> int:
-        """How many steps a ray can take, at most: workers make room for as many.
+        """The most samples that ray marching takes along a ray: workers make room for as many.
 
         Args:
             steps: What is configured, ``warpnerf.rendering.steps.Steps``.
@@ -154,7 +155,8 @@ class Model(ABC):
         return np.zeros(0, np.float32) if layout is None else uniform_weights(layout, seed, 1.0)
 
     def learning_rates(self, optim: Rates) -> np.ndarray:
-        """How far an update moves each number that is read at a sample, about, at the start.
+        """Initial learning rates of the numbers that are read at a sample: about how far an update
+        moves each.
 
         Args:
             optim: What is configured for all models.
@@ -168,7 +170,7 @@ class Model(ABC):
         return rates
 
     def variation(self, optim: Rates) -> np.ndarray:
-        """How much each number that is read at a sample is smoothed by total variation.
+        """Total variation weights of the numbers that are read at a sample.
 
         Args:
             optim: What is configured for all models.
@@ -183,14 +185,14 @@ class Model(ABC):
 
 
 def n_weights(model: Model) -> int:
-    """Weights of a model's head; 0 without an MLP."""
+    """The number of MLP weights in a model's head; 0 without an MLP."""
     layout = model.layout(loader("float32"))
     return 0 if layout is None else int(layout.n_weights)
 
 
 @cache
 def loader(precision: str) -> Load:
-    """The kernels' modules in float32 or float64; the same object each time, so a key for caches.
+    """Load kernel modules in float32 or float64; the same object each time, so a key for caches.
 
     Args:
         precision: float32 or float64.
@@ -205,7 +207,8 @@ def loader(precision: str) -> Load:
 
 
 def uniform_weights(layout: Any, seed: int, of_output: float) -> np.ndarray:
-    """Weights between +-1 / sqrt(inputs of their layer), the output's that times a factor.
+    """Uniform initial MLP weights within +-1 / sqrt(inputs of the layer), the output's that times a
+    factor.
 
     So are hidden biases; the output's are 0. That is how torch.nn.Linear begins, and DVGO.
     """

@@ -31,11 +31,11 @@ class Rgb(Model):
 
     @property
     def n_features(self) -> int:
-        """Red, green, blue."""
+        """How many raw features a sample has: red, green, blue."""
         return 3
 
     def parts(self, load: Load) -> Any:
-        """A sigmoid."""
+        """The kernels' parts: a head that is a sigmoid of RGB."""
         return load("launch.assembly").Parts(head=load("heads.rgb").rgb())
 
 
@@ -60,17 +60,18 @@ class SphericalHarmonics(Model):
 
     @property
     def n_features(self) -> int:
-        """Three for each harmonic."""
+        """How many raw features a sample has: three for each spherical harmonic."""
         return int(3 * (self.degree + 1) ** 2)
 
     def parts(self, load: Load) -> Any:
-        """The harmonics."""
+        """The kernels' parts: a head that evaluates spherical harmonics."""
         return load("launch.assembly").Parts(
             head=load("heads.sh").sh(self.degree),
         )
 
     def learning_rates(self, optim: Rates) -> np.ndarray:
-        """The first harmonic is a constant of 0.28: its rate moves colours as far as rgb's."""
+        """Learning rates of density and harmonics. The first is a constant of 0.28: its rate moves
+        colours as far as rgb's."""
         rates = super().learning_rates(optim)
         rates[1:4] = optim.learning_rate_rgb / 0.2820948
         rates[4 : 1 + self.n_features] = self.learning_rate_sh
@@ -137,16 +138,16 @@ class Deferred(_WithMlp):
 
     @property
     def relative_time(self) -> float:
-        """That of its nodes, and of an MLP once a ray."""
+        """Training time relative to rgb: that of its nodes, and of an MLP once a ray."""
         return super().relative_time + 1e-4 * self.multiplications()
 
     @property
     def n_features(self) -> int:
-        """Diffuse colour, specular features."""
+        """How many raw features a sample has: diffuse colour, specular features."""
         return 3 + self.specular
 
     def parts(self, load: Load) -> Any:
-        """A head of rays."""
+        """The kernels' parts: a deferred MLP head, evaluated once a ray."""
         return load("launch.assembly").Parts(
             head=load("heads.deferred").deferred(
                 self.n_features, self.frequencies, self.width, self.hidden_layers
@@ -154,17 +155,18 @@ class Deferred(_WithMlp):
         )
 
     def layout(self, load: Load) -> Any:
-        """The MLP sees all channels and the direction of view."""
+        """The MLP's layout: its inputs are all channels and the viewing direction."""
         return load("heads.deferred").layout_of(
             self.n_features, self.frequencies, self.width, self.hidden_layers
         )
 
     def first_weights(self, seed: int) -> np.ndarray:
-        """Uniform; the output layer a tenth of that, so that diffuse colour is learned first."""
+        """Initial MLP weights: uniform; the output layer a tenth of that, so that diffuse colour is
+        learned first."""
         return uniform_weights(self.layout(loader("float32")), seed, 0.1)
 
     def learning_rates(self, optim: Rates) -> np.ndarray:
-        """Those of density, of diffuse colour and of specular features."""
+        """Learning rates of density, of diffuse colour and of specular features."""
         rates = super().learning_rates(optim)
         rates[4 : 1 + self.n_features] = self.learning_rate_features
         return rates
@@ -202,21 +204,22 @@ class PerSample(_WithMlp):
 
     @property
     def relative_time(self) -> float:
-        """That of its nodes, and of an MLP for each sample."""
+        """Training time relative to rgb: that of its nodes, and of an MLP for each sample."""
         return super().relative_time + 5.5e-4 * self.multiplications()
 
     @property
     def n_features(self) -> int:
-        """As many as are configured."""
+        """How many raw features a sample has: as many as are configured."""
         return self.features
 
     @property
     def n_floats(self) -> int:
-        """At least 8: the first four of a node are read lane by lane, the others by sample."""
+        """Numbers of a sample, padded to at least 8: kernels read the first four of a node lane by
+        lane, the others by sample."""
         return max(8, super().n_floats)
 
     def parts(self, load: Load) -> Any:
-        """A head of samples."""
+        """The kernels' parts: an MLP head, evaluated for each sample."""
         return load("launch.assembly").Parts(
             head=load("heads.per_sample").per_sample(
                 self.features,
@@ -229,18 +232,19 @@ class PerSample(_WithMlp):
         )
 
     def layout(self, load: Load) -> Any:
-        """The MLP sees the features that are not colour, and the direction of view."""
+        """The MLP's layout: its inputs are the features that are not colour, and the viewing
+        direction."""
         return load("heads.per_sample").layout_of(
             self.features, self.frequencies, self.width, self.hidden_layers, self.residual
         )
 
     def first_weights(self, seed: int) -> np.ndarray:
-        """Uniform; with the residual, the output layer a tenth of that."""
+        """Initial MLP weights: uniform; with the residual, the output layer a tenth of that."""
         layout = self.layout(loader("float32"))
         return uniform_weights(layout, seed, 0.1 if self.residual else 1.0)
 
     def learning_rates(self, optim: Rates) -> np.ndarray:
-        """Those of density, of colour, and of features that the MLP sees."""
+        """Learning rates of density, of colour, and of features that the MLP sees."""
         rates = super().learning_rates(optim)
         begin = 4 if self.residual else 1
         rates[begin : 1 + self.n_features] = self.learning_rate_features

@@ -71,8 +71,8 @@ class Marched(SamplerKind):
 
 @dataclass(frozen=True, kw_only=True)
 class Resampled(SamplerKind):
-    """Intervals drawn for each ray from what a small grid of densities proposes, as Mip-NeRF 360
-    has them."""
+    """Proposal sampling, as in Mip-NeRF 360: intervals drawn for each ray from the histogram of a
+    small density grid."""
 
     name: ClassVar[str] = "resampled"
     samples: int = 32
@@ -106,24 +106,24 @@ class Resampled(SamplerKind):
 
     @property
     def stored(self) -> ProposedDensity:
-        """What the proposal's grid holds."""
+        """The storage of the proposal network: a small dense density grid."""
         return ProposedDensity(learning_rate=self.learning_rate_proposal)
 
     def part(self, load: Load) -> Any:
-        """Intervals of each ray."""
+        """The kernels' sampler: intervals of each ray."""
         return load("sampling.resampled").INTERVALS
 
     def samples_of(self, marched: float) -> float:
-        """A sample in each interval, and a quarter of one for a bin."""
+        """Samples per ray, by cost: one in each interval, and a quarter of one for a bin."""
         return self.samples + 0.25 * self.bins
 
     def training_bytes(self, n_rays: int) -> int:
-        """The proposal's grid, histograms and intervals of rays."""
+        """Training memory in bytes: the proposal's grid, histograms and intervals of rays."""
         grid = self.voxels * self.stored.n_floats * NUMBER_BYTES
         return grid + n_rays * 4 * (4 * self.bins + 2 * self.samples + 4)
 
     def anneal(self, fraction: float) -> float:
-        """How far the proposal is annealed.
+        """The annealing exponent of proposal weights.
 
         Source: Barron et al. 2022 (Mip-NeRF 360), eq. 18, with a slope of 10.
 
@@ -139,7 +139,7 @@ class Resampled(SamplerKind):
         return max(1e-3, 10.0 * share / (9.0 * share + 1.0))
 
     def is_due(self, update: int, fraction: float) -> bool:
-        """Whether the proposal learns in an update.
+        """Whether the proposal network is trained in an update.
 
         Args:
             update: Which one, from 0 on.

@@ -88,33 +88,33 @@ class StorageKind(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class Dense(StorageKind):
-    """A value at each node, trilinear in between."""
+    """Dense voxel grid: a value at each node, trilinear interpolation in between."""
 
     name: ClassVar[str] = "dense"
 
     @property
     def rules(self) -> Mapping[str, str]:
-        """One array of nodes."""
+        """The tensors that are stored: one array of grid nodes."""
         return {"values": "nodes"}
 
     def encoding(self, load: Load, model: Model) -> Any:
-        """A dense grid of the model's numbers."""
+        """The kernels' encoding: a dense grid of the model's numbers."""
         return load("fields.dense").dense(model.n_floats, model.by_sample)
 
     def training_bytes(self, model: Model, size: tuple[int, int, int]) -> int:
-        """Of each node."""
+        """Training memory in bytes: values, gradient and Adam's moments of each node."""
         return math.prod(size) * model.n_floats * NUMBER_BYTES
 
     def in_words(self, model: Model, size: tuple[int, int, int]) -> str:
-        """A grid, and what a node has."""
+        """A description in words: a voxel grid, and what a node has."""
         grid = f"a grid of {size[0]} x {size[1]} x {size[2]} nodes"
         return f"{grid} of {model.n_floats} numbers"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Vm(StorageKind):
-    """Three planes and three lines of vectors, and a matrix that decodes their products: TensoRF's
-    VM decomposition (vector-matrix). Memory grows with the square of the nodes along an axis."""
+    """TensoRF's vector-matrix (VM) decomposition: three planes and three lines of vectors, and a
+    matrix that decodes their products. Memory grows with the square of the nodes along an axis."""
 
     name: ClassVar[str] = "vm"
     own_rates: ClassVar[bool] = True
@@ -148,39 +148,40 @@ class Vm(StorageKind):
 
     @property
     def width(self) -> int:
-        """Numbers of an entry."""
+        """VM components of an entry: how many numbers it has."""
         return self.density + self.appearance
 
     @property
     def relative_time(self) -> float:
-        """By benchmarks/factors.py."""
+        """Training time relative to a dense grid, by benchmarks/factors.py."""
         return 0.6 + 0.06 * self.width
 
     @property
     def rules(self) -> Mapping[str, str]:
-        """Planes, lines, decoder."""
+        """The tensors that are stored: planes, lines, decoder."""
         return {"planes": "nodes", "lines": "lines", "decoder": "weights"}
 
     def encoding(self, load: Load, model: Model) -> Any:
-        """Products of planes and lines, decoded to the model's numbers."""
+        """The kernels' encoding: products of planes and lines, decoded to the model's numbers."""
         factors = load("fields.factors").factors
         return factors(self.width, model.n_floats, 1 + model.n_features, model.by_sample)
 
     def training_bytes(self, model: Model, size: tuple[int, int, int]) -> int:
-        """Of each entry of planes; and of a look for free space, which is for all nodes."""
+        """Training memory in bytes: of each entry of planes; and of a look for free space, which is
+        for all nodes."""
         x, y, z = size
         return (x * y + x * z + y * z) * self.width * NUMBER_BYTES + x * y * z * LOOK_BYTES
 
     def in_words(self, model: Model, size: tuple[int, int, int]) -> str:
-        """Planes, and what an entry has."""
+        """A description in words: TensoRF planes, and what an entry has."""
         x, y, z = size
         return f"a field of planes over {x} x {y} x {z} nodes with entries of {self.width} numbers"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Hash(StorageKind):
-    """Tables of entries by level of resolution, and a matrix that decodes them: Instant-NGP's hash,
-    by rows. Memory does not grow with the nodes of the lattice."""
+    """Multiresolution hash encoding, by rows: Instant-NGP's tables of entries, and a matrix that
+    decodes them. Memory does not grow with the nodes of the lattice."""
 
     name: ClassVar[str] = "hash"
     box_is_fixed: ClassVar[bool] = True
@@ -234,34 +235,36 @@ class Hash(StorageKind):
 
     @property
     def resolutions(self) -> tuple[int, ...]:
-        """Cells of each level along the longest edge."""
+        """Hash grid resolution of each level: cells along the longest edge."""
         between = max(1, self.levels - 1)
         ratio = self.finest / self.coarsest
         return tuple(round(self.coarsest * ratio ** (n / between)) for n in range(self.levels))
 
     @property
     def relative_time(self) -> float:
-        """By benchmarks/factors.py."""
+        """Training time relative to a dense grid, by benchmarks/factors.py."""
         return 0.6 + 0.4 * self.levels
 
     @property
     def rules(self) -> Mapping[str, str]:
-        """Entries, decoder."""
+        """The tensors that are stored: hash table entries, decoder."""
         return {"values": "nodes", "decoder": "weights"}
 
     def encoding(self, load: Load, model: Model) -> Any:
-        """Entries of all levels, decoded to the model's numbers."""
+        """The kernels' encoding: hash table entries of all levels, decoded to the model's
+        numbers."""
         return load("fields.hashed").hashed(
             *(self.features, self.levels, model.n_floats, 1 + model.n_features, model.by_sample)
         )
 
     def training_bytes(self, model: Model, size: tuple[int, int, int]) -> int:
-        """Of each entry, as in a cube; and of a look for free space, which is for all nodes."""
+        """Training memory in bytes: of each entry, as in a cube; and of a look for free space,
+        which is for all nodes."""
         entries = sum(min(self.table, (n + 1) ** 3) + n for n in self.resolutions)
         return entries * self.features * NUMBER_BYTES + math.prod(size) * LOOK_BYTES
 
     def in_words(self, model: Model, size: tuple[int, int, int]) -> str:
-        """Levels, and what an entry has."""
+        """A description in words: hash grid levels, and what an entry has."""
         return f"a hash of {self.levels} levels with up to {self.table} entries of {self.features}"
 
 

@@ -28,7 +28,8 @@ PROPOSED = 1 << 14
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Rendering:
-    """What a camera or a set of rays sees; [...] is [H, W] or [n_rays]."""
+    """A rendering: RGB, opacity and depth of a camera or a set of rays; [...] is [H, W] or
+    [n_rays]."""
 
     rgb: np.ndarray
     """[..., 3] float32 in [0, 1], background included."""
@@ -40,7 +41,7 @@ class Rendering:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Field:
-    """A trained scene."""
+    """A trained radiance field."""
 
     model: Model
     """What it holds, and how that becomes colour."""
@@ -61,11 +62,11 @@ class Field:
 
     @property
     def lattice(self) -> Lattice:
-        """Its nodes and the space that they fill."""
+        """The voxel lattice: its nodes and the space that they fill."""
         return self.storage.lattice
 
     def copied_to(self, device: wp.Device) -> Field:
-        """The same with arrays of its own.
+        """A deep copy: the same field with arrays of its own.
 
         Args:
             device: Where they lie.
@@ -83,7 +84,7 @@ class Field:
         )
 
     def render(self, camera: Camera) -> Rendering:
-        """Look through a camera.
+        """Render a camera's image: colour, opacity and depth by volume rendering.
 
         Args:
             camera: Any camera in the scene's coordinates.
@@ -100,7 +101,7 @@ class Field:
         return self._rendering(seen, (camera.height, camera.width))
 
     def render_rays(self, origins: np.ndarray, directions: np.ndarray) -> Rendering:
-        """Look along rays.
+        """Render rays: colour, opacity and depth by volume rendering.
 
         Args:
             origins: [n_rays, 3], scene units.

@@ -58,7 +58,7 @@ WITHOUT_PLAN = "warpnerf-training-7"
 
 
 def save_field(path: str | Path, field: Field) -> None:
-    """Write a field to a file, replacing an older one in a single step.
+    """Save a radiance field as a safetensors file, replacing an older one in a single step.
 
     Args:
         path: Of the file; its folder exists.
@@ -71,7 +71,8 @@ def save_field(path: str | Path, field: Field) -> None:
 
 
 def save_checkpoint(path: str | Path, state: TrainingState) -> None:
-    """Write all that a training needs to resume, likewise.
+    """Save a checkpoint: all that a training needs to resume, replacing an older one in a single
+    step.
 
     Args:
         path: Of the file; its folder exists.
@@ -97,7 +98,7 @@ def save_checkpoint(path: str | Path, state: TrainingState) -> None:
 
 
 def load_field(path: str | Path, device: str = "cpu", threads: int | None = None) -> Field:
-    """Read a field that ``save_field`` or ``save_checkpoint`` wrote.
+    """Load a trained radiance field that ``save_field`` or ``save_checkpoint`` wrote.
 
     Args:
         path: Of the file.
@@ -116,7 +117,7 @@ def load_field(path: str | Path, device: str = "cpu", threads: int | None = None
 
 
 def load_checkpoint(path: str | Path) -> TrainingState:
-    """Read a training that ``save_checkpoint`` wrote, into the memory of the CPU.
+    """Load a checkpoint: a training that ``save_checkpoint`` wrote, into the memory of the CPU.
 
     Args:
         path: Of the file.

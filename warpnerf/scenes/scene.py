@@ -119,13 +119,14 @@ class View:
 
     @property
     def channels(self) -> int:
-        """Of its image: 3, or 4 with alpha."""
+        """Image channels: 3, or 4 with alpha."""
         return int(self.__dict__["image"].shape[2])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Scene:
-    """Views, their split, and the extent estimated from their cameras. Lengths are the file's."""
+    """A scene: posed photographs, their train/test split, and the extent estimated from their
+    cameras. Lengths are the file's."""
 
     name: str
     """The folder's name, or a built-in scene's."""
@@ -212,7 +213,7 @@ class Scene:
 
     @property
     def kind(self) -> SceneKind:
-        """What the default schedule of updates goes by."""
+        """The kind of scene, object or not, which the default training schedule goes by."""
         if self.unbounded:
             return "unbounded"
         return "object" if self.has_alpha else "bounded"

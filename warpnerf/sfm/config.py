@@ -1,4 +1,4 @@
-"""How poses are estimated."""
+"""The configuration of camera pose estimation by structure from motion."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Lenses = Literal["auto", "one", "each"]
 
 @dataclass(frozen=True, kw_only=True)
 class PoseConfig:
-    """How poses are estimated."""
+    """The configuration of camera pose estimation by structure from motion."""
 
     camera_model: CameraModel = "auto"
     """Of the lens, as COLMAP names it; auto: RADIAL, but SIMPLE_RADIAL where fewer than ten

@@ -24,7 +24,7 @@ SHOWN = 12
 
 @dataclass(frozen=True, kw_only=True)
 class Posing:
-    """The result of pose estimation."""
+    """The result of camera pose estimation."""
 
     folder: Path
     """The scene's."""

@@ -11,7 +11,8 @@ from warpnerf.model.interface import Model
 
 
 class March(NamedTuple):
-    """Where along rays samples sit: at t = near + (k + 1/2) step for every k >= 0, below far."""
+    """Ray marching with a constant step: samples at t = near + (k + 1/2) step for every k >= 0,
+    below far."""
 
     step: float
     """Length of a step, scene units."""
@@ -22,7 +23,7 @@ class March(NamedTuple):
 
 
 class Head(NamedTuple):
-    """How a node's numbers become a colour."""
+    """A colour head: how a node's numbers become RGB."""
 
     model: str | Model
     """rgb, sh, deferred, per_sample, or a model from ``warpnerf.model.models``."""

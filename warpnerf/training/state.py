@@ -52,7 +52,8 @@ class Progress:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrainingState:
-    """A training between two updates. Batches are functions of seed and step: no random state."""
+    """A checkpoint in memory: a training between two updates. Batches are functions of seed and
+    step: no random state."""
 
     plan: TrainingPlan | OlderPlan
     """What it goes by; on the CPU with the number of threads that it used."""
@@ -73,11 +74,11 @@ class TrainingState:
 
     @property
     def config(self) -> TrainConfig:
-        """How it trains."""
+        """The training configuration."""
         return self.plan.config
 
     def copied_to(self, device: wp.Device) -> TrainingState:
-        """The same with arrays of its own.
+        """A deep copy: the same training with arrays of its own.
 
         Args:
             device: Where they lie.
@@ -92,7 +93,7 @@ class TrainingState:
         return replace(self, field=self.field.copied_to(device), optimiser=optimiser)
 
     def plan_of(self, scene: Scene, config: TrainConfig) -> TrainingPlan:
-        """The plan to continue by: the one that it began with.
+        """The training plan to resume by: the one that it began with.
 
         Args:
             scene: What it trains on.

@@ -16,7 +16,7 @@ from warpnerf.training.state import Progress, TrainingState
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrainResult:
-    """What training leaves."""
+    """The result of training: the radiance field, and the scene with its content distance."""
 
     field: Field
     """The trained scene."""

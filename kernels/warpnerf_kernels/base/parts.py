@@ -1,4 +1,5 @@
-"""What the parts of a model are: the interfaces that ``launch.assembly`` puts together.
+"""Interfaces of a model's kernels, space, sampler, encoding, head and losses, which
+``launch.assembly`` puts together.
 
 Each part has a scalar form, which runs on CUDA, in float64 and wherever a vector form is missing,
 and may have a vector form for the CPU: sixteen samples, or the rows of a batch, at a time. Adjoints
@@ -22,7 +23,7 @@ from typing import Any, NamedTuple
 
 
 class SpaceVectors(NamedTuple):
-    """The vector form of a space: C++ statements on sixteen steps, with the functions of base.simd.
+    """The SIMD form of a space: C++ statements on sixteen steps, with the functions of base.simd.
 
     sampling.traversal puts them into functions of its own, in which ``box`` and ``ray`` are known.
     """
@@ -37,7 +38,8 @@ class SpaceVectors(NamedTuple):
 
 
 class Space(NamedTuple):
-    """In which coordinates rays are straight, and what of space outside the box becomes.
+    """Space contraction: in which coordinates rays are straight, and what of space outside the box
+    becomes.
 
     Steps are placed on q(t) = ray.q_origin + t ray.q_direction, with the box at [-1, 1]^3.
     """
@@ -67,7 +69,7 @@ class Space(NamedTuple):
     """The vector form, if it has one."""
 
     def replace(self, **changes: Any) -> "Space":
-        """The same with other functions; see above."""
+        """A copy with some functions replaced; see above."""
         return self._replace(**{"vectors": None, **changes})
 
 
@@ -76,7 +78,7 @@ INFINITELY_FAR = 1.0e30
 
 
 class Sampler(NamedTuple):
-    """Where the steps of a ray lie."""
+    """Ray sampling: where the steps of a ray lie."""
 
     Params: Any
     """Struct, with near, far and transmittance_min among its fields."""
@@ -101,12 +103,12 @@ class Sampler(NamedTuple):
     """Vector form of keep: (params, ray, packs, slot)."""
 
     def replace(self, **changes: Any) -> "Sampler":
-        """The same with other functions; see above."""
+        """A copy with some functions replaced; see above."""
         return self._replace(**{"place_pack": None, "keep_pack": None, **changes})
 
 
 class EncodingVectors(NamedTuple):
-    """The vector form of an encoding."""
+    """The SIMD form of an encoding."""
 
     read_pack: Any
     """Of read: (params, ray, packs, slot), from x, y, z of a pack to its raw."""
@@ -134,7 +136,7 @@ class EncodingVectors(NamedTuple):
 
 
 class Encoding(NamedTuple):
-    """What is stored over space, and how it is read."""
+    """The encoding of a field: what is stored over space, how it is interpolated, its adjoint."""
 
     n_floats: int
     """Numbers read at a position: raw density, features, and padding that nothing looks at."""
@@ -155,12 +157,12 @@ class Encoding(NamedTuple):
     """The vector form, if it has one."""
 
     def replace(self, **changes: Any) -> "Encoding":
-        """The same with other functions; see above."""
+        """A copy with some functions replaced; see above."""
         return self._replace(**{"vectors": None, **changes})
 
 
 class HeadVectors(NamedTuple):
-    """The vector form of a head."""
+    """The SIMD form of a head."""
 
     begin_rows: Any
     """(params, worker) before the first row of a launch."""
@@ -192,7 +194,8 @@ class HeadVectors(NamedTuple):
 
 
 class Head(NamedTuple):
-    """From features of samples to channels that are composited along the ray, and on to colour.
+    """The colour head: from features of samples to channels that are composited along the ray, and
+    on to RGB.
 
     A head of samples decodes each one's features to red, green and blue, and passes their sum on as
     it is. A head of rays accumulates features, and shades each ray once.
@@ -224,12 +227,12 @@ class Head(NamedTuple):
     """The vector form, if it has one."""
 
     def replace(self, **changes: Any) -> "Head":
-        """The same with other functions; see above."""
+        """A copy with some functions replaced; see above."""
         return self._replace(**{"vectors": None, **changes})
 
 
 class RayLossVectors(NamedTuple):
-    """The vector form of a loss on the ray: sixteen samples at a time. Steps that are no samples
+    """The SIMD form of a loss on the ray: sixteen samples at a time. Steps that are no samples
     have a weight of 0; what a loss adds for them is not looked at."""
 
     add_pack: Any
@@ -271,12 +274,12 @@ class RayLoss(NamedTuple):
     """The vector form. Without one, packs call the scalar functions, one sample after the other."""
 
     def replace(self, **changes: Any) -> "RayLoss":
-        """The same with other functions; see above."""
+        """A copy with some functions replaced; see above."""
         return self._replace(**{"vectors": None, **changes})
 
 
 class SampleLossVectors(NamedTuple):
-    """The vector form of a loss on samples: sixteen at a time."""
+    """The SIMD form of a loss on samples: sixteen at a time."""
 
     add_pack: Any
     """Of add: (params, state, target_rgb, packs, slot) -> state with a pack's samples, whose
@@ -310,7 +313,7 @@ class SampleLoss(NamedTuple):
     """The vector form. Without one, packs call the scalar functions, one sample after the other."""
 
     def replace(self, **changes: Any) -> "SampleLoss":
-        """The same with other functions; see above."""
+        """A copy with some functions replaced; see above."""
         return self._replace(**{"vectors": None, **changes})
 
 
@@ -326,7 +329,7 @@ class Photometric(NamedTuple):
 
 
 class Losses(NamedTuple):
-    """What a training launch minimises: the mean over rays of the sum of these."""
+    """The training loss of a launch: the mean over rays of the sum of these."""
 
     photometric: Photometric
     """Of the ray's colour."""

@@ -68,7 +68,7 @@ class Camera:
         self.check()
 
     def check(self) -> None:
-        """Refuse what makes no rays; kernels would not notice.
+        """Raise InputError where intrinsics or pose make no rays; kernels would not notice.
 
         Raises:
             InputError: A size or focal length is not above zero, a number is not finite, a
@@ -104,7 +104,7 @@ class Camera:
 
     @property
     def radial(self) -> Coefficients:
-        """k1, k2, k3, k4."""
+        """Radial distortion coefficients: k1, k2, k3, k4."""
         return self.k1, self.k2, self.k3, self.k4
 
     @property
@@ -113,7 +113,7 @@ class Camera:
         return not self.fisheye and any((self.k4, self.k5, self.k6))
 
     def distort(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Distort points on the plane Z = 1, as in the equation of the class.
+        """Lens distortion of points on the plane Z = 1, by the equation of the class.
 
         Args:
             points: [n, 2] (x, y) = (X/Z, Y/Z) in OpenCV axes.
