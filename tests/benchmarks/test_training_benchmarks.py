@@ -139,3 +139,19 @@ def test_growth(tmp_path):
     assert len({row["psnr"] for row in record["rows"]}) == 4  # each changes something
     for row in record["rows"]:
         assert row["psnr"] > 5 and row["seconds"] > 0 and f"{row['psnr']:.2f}" in printed
+
+
+@pytest.mark.slow
+def test_scaling_fields_goes_on_where_it_was(tmp_path):
+    output = tmp_path / "record.json"
+    small = ("builtin:room-sparse", "--fields", "dense", "hash", "--steps", "6", "--rays", "64")
+    small += ("--voxels", "4096", "--downscale", "8")
+    first, _ = run("scaling_fields.py", output, *small, "--seeds", "0")
+    record, said = run("scaling_fields.py", output, *small, "--seeds", "0", "1")
+    assert record["rows"][:6] == first["rows"] and len(record["rows"]) == 12
+    assert "[7 of 12]" in said and "[6 of 12]" not in said
+    assert {row["scaling"] for row in record["rows"]} == {"none", "quadratic", "clamped"}
+    for row in record["rows"]:
+        assert row["psnr"] > 5 and row["near_mass"] >= 0 and row["depth_error"] > 0
+    gains = [line for line in said.splitlines() if "clamped" in line and "+-" in line]
+    assert len(gains) == 2

@@ -18,7 +18,8 @@ from warpnerf.cli import train
 from warpnerf.config import LossConfig
 from warpnerf.config_json import config_from_json, config_to_json, decode
 from warpnerf.model.models import PerSample, model_of
-from warpnerf.model.storage_kinds import Vm
+from warpnerf.model.sampler_kinds import Resampled
+from warpnerf.model.storage_kinds import Hash, Vm
 from warpnerf.presets import DEFAULT_PRESETS, PRESETS
 from warpnerf.scenes.scene import Scene
 from warpnerf.training.trainer import Trainer
@@ -62,6 +63,7 @@ def squared_error(field: wn.Field, scene: Scene) -> float:
         ("dvgo-unbounded", tiny_scene(ring(4))),
         ("dvgo-llff", facing()),
         ("tensorf", ball()),
+        ("mip360", tiny_scene(ring(4))),
     ],
 )
 def test_presets_train(name: str, scene: Scene) -> None:
@@ -100,7 +102,7 @@ def test_the_command_knows_all() -> None:
 
 
 def test_there_are_those_of_others_and_the_everyday_ones() -> None:
-    assert set(PRESETS) == {*DEFAULT_PRESETS, *PUBLISHED, "tensorf"}
+    assert set(PRESETS) == {*DEFAULT_PRESETS, *PUBLISHED, "tensorf", "mip360"}
 
 
 PUBLISHED: dict[str, dict[str, Any]] = {
@@ -251,3 +253,16 @@ def test_that_of_tensorf_is_what_is_published() -> None:
     at = [share * config.steps for share in config.grid.grow_at]
     assert at == pytest.approx([2000, 3000, 4000, 7000])
     assert config.loss == LossConfig()
+
+
+def test_that_of_mip360_has_what_is_published_but_for_the_network() -> None:
+    """360.gin of multinerf; presets.py says what is different here."""
+    config = PRESETS["mip360"]
+    assert (config.grid.contraction, config.grid.border, config.march.near) == ("l2", 1.0, 0.0)
+    assert isinstance(config.sampler, Resampled) and isinstance(config.field, Hash)
+    assert (config.sampler.bins, config.sampler.samples) == (64, 32)
+    assert config.sampler.anneal(0.05) == pytest.approx(10 * 0.5 / (9 * 0.5 + 1))
+    assert (config.optim.beta1, config.optim.beta2, config.optim.decay) == (0.9, 0.999, 0.01)
+    assert config.loss.distortion == pytest.approx(3 * 0.01)
+    assert isinstance(config.model, PerSample) and not config.model.residual
+    assert (config.model.learning_rate_mlp, config.model.frequencies) == (2e-3, 4)
