@@ -5,7 +5,7 @@
 Four fields, dense, vm and hash with the preset fast around them and the preset mip360, and hash
 with two other epsilons of Adam; scalings none, quadratic and clamped; several seeds. Trainings are
 small: so many steps of so many rays on so many voxels, one after another. The record is written
-after each, and a run that is stopped goes on where it was when it is started again.
+after each, and a run that was stopped resumes when it is started again.
 
 Prints, by capture and field, mean and half of the range over the seeds without scaling, and what
 the others gain over that with the same seed: PSNR and SSIM of test views, LPIPS with --lpips, near

@@ -311,6 +311,13 @@ class TrainConfig:
             unused.append(("optim", self.optim, ("epsilon",), why))
         if not self.field.smoothed:
             unused.append(("optim", self.optim, OPTIM_VARIATION, "has no total variation;"))
+        elif self.optim.tv_density == self.optim.tv_rgb == 0.0 and not self.field.has_sparsity:
+            for name in ("tv_until", "tv_every"):
+                if getattr(self.optim, name) != getattr(OptimConfig, name):
+                    raise InputError(
+                        f"optim.{name} is {getattr(self.optim, name):g}, but optim.tv_density and "
+                        f"optim.tv_rgb are 0; set one of them, or leave {name} out."
+                    )
         for part, value, names, why in unused:
             for name in names:
                 if getattr(value, name) != getattr(type(value), name):

@@ -82,6 +82,7 @@ def idle_fields(tree: dict[str, Any]) -> set[str]:
     if stored is not None and not stored.smoothed:
         idle |= {f"optim.{name}" for name in OPTIM_VARIATION}
     defaults = {"tv_density": OptimConfig.tv_density, "tv_rgb": OptimConfig.tv_rgb}
-    if not any((defaults | optim)[weight] for weight in defaults):
+    sparse = parts.get("field", {}).get("sparsity", 0.0)
+    if not any([sparse, *((defaults | optim)[weight] for weight in defaults)]):
         idle |= {"optim.tv_until", "optim.tv_every"}
     return idle

@@ -85,12 +85,6 @@ class OptimConfig:
         require_whole("optim.tv_every", self.tv_every, 1)
         if not 0 <= self.tv_until <= 1:
             raise InputError(f"optim.tv_until must lie in [0, 1], not {self.tv_until}.")
-        for name in ("tv_until", "tv_every") if self.tv_density == self.tv_rgb == 0.0 else ():
-            if getattr(self, name) != getattr(OptimConfig, name):
-                raise InputError(
-                    f"optim.{name} is {getattr(self, name):g}, but optim.tv_density and "
-                    f"optim.tv_rgb are 0; set one of them, or leave {name} out."
-                )
         if isinstance(self.accumulate_at, str):
             if self.accumulate_at != "auto":
                 raise InputError(

@@ -61,16 +61,12 @@ def test_a_training_loads_no_other_kernels(
     assert {kernel.module for kernel in trainer.workers._loaded} == modules
 
 
-@pytest.mark.parametrize(
-    "presets",
-    [pytest.param(("fast",), id="fast"), pytest.param(DEFAULT_PRESETS, marks=pytest.mark.slow)],
-)
-def test_warm_up_covers_the_presets_and_is_done_once(presets: tuple[str, ...], device: str) -> None:
+def test_warm_up_covers_the_presets(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Workers, "load", lambda workers, kernel: None)
     shown: list[Any] = []
-    configs = [PRESETS[name] for name in presets]
-    first = warm_up(device, shown.append, configs)
-    assert first == shown
-    names = [kernel.name for kernel in first]
+    found = warm_up("cpu", shown.append, [PRESETS["fast"]])
+    assert found == shown
+    names = [kernel.name for kernel in found]
     assert len(set(names)) == len(names)
     for scaling in ("none", "quadratic", "clamped"):
         assert f"render train, scaling {scaling}, distortion, entropy" in names  # objects
@@ -78,6 +74,21 @@ def test_warm_up_covers_the_presets_and_is_done_once(presets: tuple[str, ...], d
             kinds = "distortion, entropy, opacity"
             assert f"render train{space}, scaling {scaling}, {kinds}" in names
     assert {"render forward", "render forward, contracted space", "adam step"} < set(names)
+
+
+@pytest.mark.parametrize(
+    "configs",
+    [
+        pytest.param(
+            [TrainConfig(model=Rgb(), loss=SQUARED, grid=GridConfig(contraction="none"))], id="rgb"
+        ),
+        pytest.param(
+            [PRESETS[name] for name in DEFAULT_PRESETS], id="presets", marks=pytest.mark.slow
+        ),
+    ],
+)
+def test_it_is_done_once(configs: list[TrainConfig], device: str) -> None:
+    names = [kernel.name for kernel in warm_up(device, configs=configs)]
     again = warm_up(device, configs=configs)
     assert [kernel.name for kernel in again] == names
     assert not any(kernel.compiled for kernel in again)

@@ -28,11 +28,11 @@ WITHOUT_TV = {"tv_density": 0.0, "tv_rgb": 0.0}
     ("make", "says"),
     [
         (
-            lambda: wn.OptimConfig(**WITHOUT_TV, tv_until=0.5),
+            lambda: wn.TrainConfig(optim=wn.OptimConfig(**WITHOUT_TV, tv_until=0.5)),
             "optim.tv_until is 0.5, but optim.tv_density and optim.tv_rgb are 0; .* leave tv_until",
         ),
         (
-            lambda: wn.OptimConfig(**WITHOUT_TV, tv_every=1),
+            lambda: wn.TrainConfig(optim=wn.OptimConfig(**WITHOUT_TV, tv_every=1)),
             "optim.tv_every is 1, but optim.tv_density and optim.tv_rgb are 0; .* leave tv_every",
         ),
         (
@@ -71,8 +71,10 @@ def test_what_would_do_nothing_is_refused(make: Callable[[], object], says: str)
 
 
 def test_what_does_something_is_not() -> None:
-    wn.OptimConfig(tv_density=0.0, tv_until=0.5, tv_every=1)
-    wn.OptimConfig(**WITHOUT_TV)
+    wn.TrainConfig(optim=wn.OptimConfig(tv_density=0.0, tv_until=0.5, tv_every=1))
+    wn.TrainConfig(optim=wn.OptimConfig(**WITHOUT_TV))
+    sparse = wn.Vm(sparsity=1e-4)
+    wn.TrainConfig(field=sparse, optim=wn.OptimConfig(**WITHOUT_TV, tv_until=0.5, tv_every=4))
     wn.GridConfig(contraction="ndc", planes=32)
     wn.TrainConfig(field=wn.Vm(), optim=wn.OptimConfig(tv_rgb=1e-8, tv_every=1))
     # The MLP and the resampler's grid have the optimiser's epsilon.

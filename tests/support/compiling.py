@@ -1,4 +1,5 @@
-"""How kernels are compiled for tests: float64 quickly, and nothing by two processes at once."""
+"""How kernels are compiled for tests: quickly what no user runs, and nothing by two processes at
+once."""
 
 import os
 import tempfile
@@ -16,7 +17,9 @@ try:
 except ImportError:  # Windows: each compiles for itself
     fcntl = None  # type: ignore[assignment]
 
-OPTION, FLOAT64 = "optimization_level", "warpnerf_kernels_float64"
+OPTION = "optimization_level"
+NOT_FOR_USERS = ("warpnerf_kernels_float64", "warpnerf_kernels.launch.scalar")
+"""Modules of kernels that no training runs on the CPU: those in float64, and the plain form."""
 LOCKS = Path(tempfile.gettempdir()) / "warpnerf-tests-locks"
 
 
@@ -35,8 +38,9 @@ def one_at_a_time(name: str) -> Iterator[None]:
 def compile_as_tests_do() -> None:
     """From now on in this process.
 
-    Kernels in float64 are for checking what is computed, and are launched a few times: they are
-    not optimised, which halves the time that they take. Those in float32 are as users have them.
+    Kernels in float64 and plain ones are for checking what is computed, and are launched a few
+    times: they are not optimised, which halves the time that they take. Those that train on the CPU
+    are as users have them.
     """
     load = Workers.load
 
@@ -44,7 +48,7 @@ def compile_as_tests_do() -> None:
     def quickly(workers: Workers, kernel: wp.Kernel) -> None:
         if kernel in workers._loaded:
             return
-        if kernel.func.__module__.startswith(FLOAT64) and not workers.device.is_cuda:
+        if kernel.func.__module__.startswith(NOT_FOR_USERS) and not workers.device.is_cuda:
             kernel.module.options[OPTION] = 0
         with one_at_a_time(kernel.module.name):
             load(workers, kernel)

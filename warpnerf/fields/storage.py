@@ -357,15 +357,26 @@ def density_struct(types: ModuleType, shift: float, scale: float) -> Any:
 
 
 def require_memory(
-    kind: StorageKind, model: Model, size: tuple[int, int, int], device: wp.Device
+    kind: StorageKind, model: Model, size: tuple[int, int, int], device: wp.Device, besides: int = 0
 ) -> None:
-    """Raise InputError if training a field of this size does not fit the memory of the device."""
+    """Raise InputError if training a field of this size does not fit the memory of the device.
+
+    Args:
+        kind: Of its storage.
+        model: What is stored.
+        size: Nodes of the lattice along each axis.
+        device: Where it is to be trained.
+        besides: Bytes that training takes besides the field.
+
+    Raises:
+        InputError: It does not, or kernels cannot count so many nodes.
+    """
     if math.prod(size) >= MAX_VOXELS:
         raise InputError(
             f"grid.voxels must give fewer than {MAX_VOXELS} nodes, not {math.prod(size)}; use "
             "fewer voxels."
         )
-    needed = kind.training_bytes(model, size)
+    needed = kind.training_bytes(model, size) + besides
     total = device.total_memory if device.is_cuda else usable_memory()
     where = device if device.is_cuda else "this machine"
     if total is not None and needed > total:

@@ -55,6 +55,11 @@ class StorageKind(ABC):
     """Whether total variation smooths it, so that what is configured of that does something."""
 
     @property
+    def has_sparsity(self) -> bool:
+        """Whether an L1 loss makes it sparse, added as often as total variation is."""
+        return False
+
+    @property
     @abstractmethod
     def rules(self) -> Mapping[str, str]:
         """The arrays that are learned, by their names in files, and the name of the rule of the
@@ -129,7 +134,7 @@ class Vm(StorageKind):
     """Adam's learning rate of the decoder matrix, at the start."""
     sparsity: float = 0.0
     """Weight of TensoRF's L1 loss: the mean magnitude of density components of planes and lines,
-    where rays have been."""
+    where rays have been. It is added as optim.tv_every and optim.tv_until say."""
 
     def __post_init__(self) -> None:
         """Refuse a configuration for which there are no kernels."""
@@ -145,6 +150,11 @@ class Vm(StorageKind):
         require_positive("field.learning_rate_decoder", self.learning_rate_decoder)
         require_at_least("field.sparsity", self.sparsity, 0.0)
         registry.keep_plain(self, "field")
+
+    @property
+    def has_sparsity(self) -> bool:
+        """Whether TensoRF's L1 loss has a weight."""
+        return self.sparsity > 0.0
 
     @property
     def width(self) -> int:

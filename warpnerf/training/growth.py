@@ -24,7 +24,10 @@ from warpnerf.training.plan import TrainingPlan
 def require_room(plan: TrainingPlan, device: wp.Device) -> None:
     """Raise InputError if training the final field of a plan does not fit the device's memory."""
     config = plan.config
-    require_memory(config.field, _model(config), plan.stages[-1].size, device)
+    of_rays = config.sampler.training_bytes(
+        config.rays_per_step * plan.schedule.most_steps_an_update
+    )
+    require_memory(config.field, _model(config), plan.stages[-1].size, device, of_rays)
 
 
 def first_storage(plan: TrainingPlan, device: wp.Device) -> Storage:
