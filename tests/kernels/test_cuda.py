@@ -104,6 +104,7 @@ def test_factors_compile_for_cuda(name: str, tmp_path: Path) -> None:
         assert ".entry" in compiled(kernel.module, tmp_path / str(number))
 
 
+@pytest.mark.slow
 def test_code_does_not_grow_with_layers(tmp_path: Path) -> None:
     """Layers that the compiler writes out take it minutes."""
     assembly = precision.load("float32", "launch.assembly")

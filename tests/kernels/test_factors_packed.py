@@ -59,7 +59,7 @@ def test_packs_against_the_plain_form(name: str, contraction: str) -> None:
     require_same(packed, plain, contraction)
 
 
-@pytest.mark.parametrize("name", ["deferred", "per_sample"])
+@pytest.mark.parametrize("name", ["deferred", pytest.param("per_sample", marks=pytest.mark.slow)])
 def test_wide_entries(name: str) -> None:
     numbers = {"density": 8, "appearance": 24}
     require_same(*(gradient(MODELS[name], k(**numbers)) for k in (Vm, Plain)))

@@ -44,6 +44,7 @@ each_case = pytest.mark.parametrize(
     ("model", "contraction"), CASES, ids=[f"{name_of(model)}-{where}" for model, where in CASES]
 )
 SEEDS = range(4)
+LARGE = (DEFERRED_LARGE, FEATURES_LARGE)
 
 
 def problem(model: Model, contraction: str, seed: int) -> Problem:
@@ -120,7 +121,13 @@ def test_the_threshold_leaves_samples_out(kernels64: Kernels) -> None:
     assert np.abs(all_lit - kernels64.forward(p).rgb).max() > 1e-3
 
 
-@each_case
+@pytest.mark.parametrize(
+    ("model", "contraction"),
+    [
+        pytest.param(*case, marks=pytest.mark.slow if case[0] in LARGE else (), id=name_of(case[0]))
+        for case in CASES
+    ],
+)
 def test_adjoint_against_central_differences(
     model: Model, contraction: str, kernels64: Kernels
 ) -> None:

@@ -37,7 +37,7 @@ MODELS = (
     DEFERRED_LARGE,
     FEATURES_SMALL,
     FEATURES,
-    FEATURES_LARGE,
+    pytest.param(FEATURES_LARGE, marks=pytest.mark.slow),
 )
 each_model = pytest.mark.parametrize("model", MODELS, ids=name_of)
 """All of them clamped: a scaling is compiled for."""

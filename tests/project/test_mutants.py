@@ -42,6 +42,21 @@ def test_each_mutant_finds_its_text(mutants: tuple, tmp_path: Path) -> None:
             assert f"def {test.partition('[')[0]}(" in (HERE / file).read_text(), mutant.name
 
 
+@pytest.mark.slow  # collects all tests
+def test_each_mutant_names_tests_that_there_are(mutants: tuple) -> None:
+    """Also by the parameters in brackets, and where the host's are not slow."""
+    collect = [sys.executable, "-m", "pytest", "--collect-only", "-q", "-n0"]
+    for marks in ("", "not slow"):
+        done = subprocess.run(
+            [*collect, "-m", marks], capture_output=True, text=True, cwd=HERE.parent, check=True
+        )
+        found = [line.removeprefix("tests/") for line in done.stdout.splitlines() if "::" in line]
+        known = {part for test in found for part in (test, test.partition("[")[0])}
+        known |= {test.partition("::")[0] for test in found}
+        asked = {mutant.tests for mutant in mutants if mutant.marks == marks}
+        assert asked and asked <= known, sorted(asked - known)
+
+
 @pytest.mark.slow  # some eighty runs of pytest
 @pytest.mark.timeout(3600)
 def test_mutants_of_the_host_are_noticed() -> None:
