@@ -18,6 +18,7 @@ from __future__ import annotations
 import gc
 import json
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,7 @@ FIELDS = {
 }
 SCALINGS = ("none", "quadratic", "clamped")
 FIGURES = ("psnr", "ssim", "lpips", "near_mass", "pulled_psnr", "depth_error")
-LOOKED_AT = 8
+LOOKED_AT = 5
 """Views of each split that are looked at, at most."""
 
 
@@ -59,30 +60,24 @@ def main() -> None:
     output = args.output or RESULTS / f"scaling_fields_{args.device.replace(':', '')}.json"
     rows = done_before(output, settings)
     n = len(args.scenes) * len(args.fields) * len(args.seeds) * len(SCALINGS)
-    for name in args.scenes:
-        scene = wn.load_scene(path_of(name), downscale=args.downscale)
-        for seed in args.seeds:
-            for field in args.fields:
-                for scaling in SCALINGS:
-                    key = {"scene": name, "field": field, "scaling": scaling, "seed": seed}
-                    if any(key.items() <= row.items() for row in rows):
-                        continue
-                    rows.append(key | trained(scene, field, scaling, seed, args))
-                    write_record(
-                        {
-                            "benchmark": "scaling_fields",
-                            "machine": machine(args.device, Workers(args.device).count),
-                            "settings": settings,
-                            "fields": {text: FIELDS[text] for text in args.fields},
-                            "rows": rows,
-                        },
-                        output,
-                        "scaling_fields",
-                        args.device,
-                    )
-                    psnr = rows[-1]["psnr"]
-                    said = f"{name}, {field}, {scaling}, seed {seed}"
-                    print(f"[{len(rows)} of {n}] {said}: {psnr:.2f} dB", flush=True)
+    scenes = {name: wn.load_scene(path_of(name), downscale=args.downscale) for name in args.scenes}
+    for seed, (name, scene), field, scaling in product(
+        args.seeds, scenes.items(), args.fields, SCALINGS
+    ):
+        key = {"scene": name, "field": field, "scaling": scaling, "seed": seed}
+        if any(key.items() <= row.items() for row in rows):
+            continue
+        rows.append(key | trained(scene, field, scaling, seed, args))
+        record = {
+            "benchmark": "scaling_fields",
+            "machine": machine(args.device, Workers(args.device).count),
+            "settings": settings,
+            "fields": FIELDS,
+            "rows": rows,
+        }
+        write_record(record, output, "scaling_fields", args.device)
+        said = f"{name}, {field}, {scaling}, seed {seed}: {rows[-1]['psnr']:.2f} dB"
+        print(f"[{len(rows)} of {n}] {said}", flush=True)
     for name in args.scenes:
         print(f"\n{name}")
         for line in table([row for row in rows if row["scene"] == name]):
