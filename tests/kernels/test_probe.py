@@ -15,7 +15,8 @@ from tests.support.small_model import SMALL
 from warpnerf.model.interface import Model
 from warpnerf.model.models import Rgb
 from warpnerf.runtime.parallel import Workers
-from warpnerf.verification.gradient_check import ProblemKernels, make_problem, of_model
+from warpnerf.verification.gradient_check import ProblemKernels
+from warpnerf.verification.problems import make_problem, of_model
 
 
 @pytest.mark.parametrize("model", [Rgb(), SMALL], ids=lambda model: model.name)

@@ -21,7 +21,7 @@ EPSILON = f"{TRAINING}::test_adam_has_an_epsilon_of_its_own"
 MUTANTS = [
     # the plain form
     Mutant("begin_of_row: a prime", "fields/hashed_packs.py", "805459861", "805459863", ORACLE),
-    Mutant("begin_of_row: added, not xored", FILE, ") ^ (wp", ") + (wp", ORACLE),
+    Mutant("begin_of_row: added, not xored", FILE, "of_i ^ (wp", "of_i + (wp", ORACLE),
     Mutant(
         "begin_of_row: levels on top of each other",
         FILE,

@@ -14,24 +14,30 @@ import pytest
 from tests.support.small_model import SMALL
 from warpnerf.checks import InputError
 from warpnerf.model.interface import Model
+from warpnerf.model.storage_kinds import StorageKind
 from warpnerf.runtime.parallel import Workers
 from warpnerf.verification import verify as checks
-from warpnerf.verification.gradient_check import Found, ProblemKernels
+from warpnerf.verification.gradient_check import ProblemKernels
 from warpnerf.verification.gradient_errors import relative_error
+from warpnerf.verification.problems import Found
 from warpnerf.verification.verify import Result, report, verify
 
 
 @pytest.mark.parametrize(
-    "view_dependent",
+    ("view_dependent", "stored"),
     [
-        pytest.param((SMALL,), id="some"),
-        pytest.param(checks.VIEW_DEPENDENT, id="all", marks=pytest.mark.slow),
+        pytest.param((SMALL,), (), id="some"),
+        pytest.param(checks.VIEW_DEPENDENT, checks.STORED, id="all", marks=pytest.mark.slow),
     ],
 )
 def test_all_pass_here(
-    view_dependent: tuple[Model, ...], monkeypatch: pytest.MonkeyPatch, device: str
+    view_dependent: tuple[Model, ...],
+    stored: tuple[StorageKind, ...],
+    monkeypatch: pytest.MonkeyPatch,
+    device: str,
 ) -> None:
     monkeypatch.setattr(checks, "VIEW_DEPENDENT", view_dependent)
+    monkeypatch.setattr(checks, "STORED", stored)
     begun: list[str] = []
     ended: list[Result] = []
     results = verify(device, 2, begun.append, ended.append)
@@ -54,15 +60,15 @@ def failing(device: str, *words: str) -> set[str]:
 Spoil = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
-def multiplied(found: Any, factor: float) -> Any:
-    """A gradient, or an array."""
-    if isinstance(found, Found):
-        return Found(values=factor * found.values, weights=factor * found.weights)
-    return factor * found
+def multiplied(found: Any, factor: float, *arrays: str) -> Any:
+    """A gradient, all of it or some of its arrays, or an array."""
+    return found.times(factor, *arrays) if isinstance(found, Found) else factor * found
 
 
-def times(factor: float) -> Spoil:
-    return lambda method: lambda *given, **named: multiplied(method(*given, **named), factor)
+def times(factor: float, *arrays: str) -> Spoil:
+    return lambda method: (
+        lambda *given, **named: multiplied(method(*given, **named), factor, *arrays)
+    )
 
 
 def trained_times(factor: float) -> Spoil:
@@ -72,17 +78,6 @@ def trained_times(factor: float) -> Spoil:
             return error, multiplied(gradient, factor)
 
         return train
-
-    return spoil
-
-
-def weights_times(factor: float) -> Spoil:
-    def spoil(method: Callable[..., Any]) -> Callable[..., Any]:
-        def gradient(*given: Any, **named: Any) -> Found:
-            found = method(*given, **named)
-            return Found(values=found.values, weights=factor * found.weights)
-
-        return gradient
 
     return spoil
 
@@ -121,18 +116,33 @@ def coarse_when_packed(method: Callable[..., Any]) -> Callable[..., Any]:
     return see
 
 
+def coarse_bound_when_packed(method: Callable[..., Any]) -> Callable[..., Any]:
+    def bound(self: ProblemKernels, problem: Any) -> Any:
+        loss, gradient = method(self, problem)
+        return loss * (1.0 + 1e-3 * self._packed), gradient
+
+    return bound
+
+
 @pytest.mark.parametrize(
     ("method", "spoil", "words"),
     [
         ("gradient", times(1.0 + 1e-6), ["central differences"]),
-        ("gradient", weights_times(1.0 + 1e-5), ["differences, deferred"]),
+        ("gradient", times(1.0 + 1e-5, "weights"), ["differences, deferred"]),
         pytest.param(
-            *("gradient", weights_times(1.0 + 1e-5), ["differences, per_sample"]),
+            *("gradient", times(1.0 + 1e-5, "weights"), ["differences, per_sample"]),
             marks=pytest.mark.slow,
         ),
         ("gradient", times(1.0 + 1e-6), ["differences, frustum"]),
         ("train", trained_times(1.0 + 1e-6), ["differences, losses"]),
         ("scatter", times(1.0 + 1e-5), ["gather"]),
+        ("gradient", times(1.0 + 1e-6, "planes"), ["differences, field vm"]),
+        ("gradient", times(1.0 + 1e-6, "lines"), ["differences, field vm"]),
+        ("gradient", times(1.0 + 1e-6, "decoder"), ["differences, field vm"]),
+        ("gradient", times(1.0 + 1e-6, "values"), ["differences, field hash"]),
+        ("gradient", times(1.0 + 1e-6, "decoder"), ["differences, field hash"]),
+        ("bound", trained_times(1.0 + 1e-6), ["differences, bound"]),
+        ("bound", coarse_bound_when_packed, ["in packs of sixteen to float64, bound"]),
         ("gradient", without_scaling, ["s(t)", "t = 0"]),
         ("gradient", never_above_one, ["beyond", "its own s(t)"]),
         ("train", sum_for_mean, ["training launch"]),
@@ -165,9 +175,9 @@ def test_training_that_differs_fails(
     def drifting(scene: Any, config: Any) -> Any:
         return train(scene, replace(config, steps=config.steps + next(count)))
 
-    assert failing(device, "training twice") == set()
+    assert failing(device, "twice from one seed") == set()
     monkeypatch.setattr(checks, "train", drifting)
-    assert failing(device, "training twice")
+    assert len(failing(device, "twice from one seed")) == len(checks.TRAININGS) == 4
 
 
 def test_a_check_that_cannot_run_fails_and_says_why(
@@ -177,9 +187,10 @@ def test_a_check_that_cannot_run_fails_and_says_why(
         raise RuntimeError("does not compile\nat all")
 
     monkeypatch.setattr(checks, "VIEW_DEPENDENT", (SMALL,))
+    monkeypatch.setattr(checks, "STORED", ())
     monkeypatch.setattr(ProblemKernels, "see", broken)
     monkeypatch.setattr(ProblemKernels, "train", broken)
-    monkeypatch.setattr(checks, "_trained_twice", lambda threads: 0.0)
+    monkeypatch.setattr(checks, "_trained_twice", lambda config: 0.0)
     results = verify(device, 1)
     failed = [result for result in results if not result.passed]
     assert 5 < len(failed) < len(results)

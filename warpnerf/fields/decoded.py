@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -13,6 +14,7 @@ from warpnerf_kernels.fields.decoder import columns_of, padded
 
 from warpnerf.fields.gradients import zero_weights
 from warpnerf.fields.storage import ReadAtNodes
+from warpnerf.model.interface import Load, loader
 from warpnerf.runtime.parallel import Workers
 
 
@@ -34,20 +36,30 @@ class Decoded(ReadAtNodes):
         """Columns of the decoder."""
         return columns_of(self.n_floats)
 
+    @property
+    def n_transposed(self) -> int:
+        """Numbers of the decoder as the vector form lays it out: transposed, inputs padded."""
+        return self.n_decoded * padded(self.decoder.size // self.n_columns)
+
     @cached_property
     def struct(self) -> Any:
         """Its arrays as kernels take them."""
-        return self.struct_with(wp.zeros((0, 0), dtype=real, device=self.decoder.device))
+        return self._struct(wp.zeros((0, 0), dtype=real, device=self.decoder.device))
 
     def struct_for(self, workers: Workers) -> Any:
         """The same, and a transposed decoder of each worker."""
-        n_inputs = self.decoder.size // self.n_columns
-        return self.struct_with(zero_weights(self.n_decoded * padded(n_inputs), workers))
+        return self._struct(zero_weights(self.n_transposed, workers))
+
+    def _struct(self, transposed: wp.array) -> Any:
+        arrays = {name: getattr(self, name) for name in self.kind.rules}
+        return self.struct_with(loader("float32"), arrays, transposed)
 
     @abstractmethod
-    def struct_with(self, transposed: wp.array) -> Any:
-        """Its arrays as kernels take them.
+    def struct_with(self, load: Load, arrays: Mapping[str, wp.array], transposed: wp.array) -> Any:
+        """Arrays like its own as kernels take them.
 
         Args:
-            transposed: [n_workers, n_decoded * padded inputs] scratch of the vector form.
+            load: The kernels' modules, in the precision of the arrays.
+            arrays: As long as its own, by the names of the kind's ``rules``.
+            transposed: [n_workers, n_transposed or more] scratch of the vector form.
         """

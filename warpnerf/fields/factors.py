@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import warp as wp
 from warpnerf_kernels.base.parts import Encoding
-from warpnerf_kernels.base.types import real, vec3, vector
+from warpnerf_kernels.base.types import real, vector
 from warpnerf_kernels.fields import factors
 from warpnerf_kernels.optim import adam
 from warpnerf_kernels.optim.factor_terms import line_terms, plane_terms_kernel
@@ -20,7 +21,7 @@ from warpnerf.fields.gradients import Gradients, zero_entries, zero_head_weights
 from warpnerf.fields.lattice import Lattice
 from warpnerf.fields.parameters import Parameter
 from warpnerf.fields.storage import Regulariser, Storage, TrainedOn, allocate_nodes, require_shapes
-from warpnerf.model.interface import Model
+from warpnerf.model.interface import Load, Model
 from warpnerf.model.storage_kinds import StorageKind, Vm
 from warpnerf.optim_config import OptimConfig
 from warpnerf.runtime.parallel import NODES, Workers
@@ -118,12 +119,13 @@ class Factors(Decoded):
         """Products of planes and lines, decoded."""
         return factors.factors(self.kind.width, self.n_floats, self.n_decoded, self.by_sample)
 
-    def struct_with(self, transposed: wp.array) -> Any:
-        """Its arrays as kernels take them."""
+    def struct_with(self, load: Load, arrays: Mapping[str, wp.array], transposed: wp.array) -> Any:
+        """Planes, lines and decoder as kernels take them."""
         lattice, middle = self.lattice, 0.5 * (np.array(self.lattice.size) - 1)
-        struct = factors.factors_type(self.kind.width)()
-        struct.planes, struct.lines, struct.decoder = self.planes, self.lines, self.decoder
-        struct.transposed = transposed
+        struct = load("fields.factors").factors_type(self.kind.width)()
+        for name, array in arrays.items():
+            setattr(struct, name, array)
+        struct.transposed, vec3 = transposed, load("base.types").vec3
         struct.size = wp.vec3i(*lattice.size)
         struct.to_nodes = vec3(*(middle / (1.0 + lattice.border)))
         struct.middle = vec3(*middle)

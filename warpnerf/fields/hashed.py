@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import warp as wp
 from warpnerf_kernels.base.parts import Encoding
-from warpnerf_kernels.base.types import real, vec3, vector
+from warpnerf_kernels.base.types import real, vector
 from warpnerf_kernels.fields import hashed
 from warpnerf_kernels.fields.decoder import columns_of
 from warpnerf_kernels.optim import adam
@@ -19,7 +20,7 @@ from warpnerf.fields.gradients import Gradients, zero_entries, zero_head_weights
 from warpnerf.fields.lattice import Lattice
 from warpnerf.fields.parameters import Parameter
 from warpnerf.fields.storage import Storage, allocate_nodes, require_shapes
-from warpnerf.model.interface import Model
+from warpnerf.model.interface import Load, Model
 from warpnerf.model.storage_kinds import Hash, StorageKind
 from warpnerf.optim_config import OptimConfig
 from warpnerf.runtime.parallel import NODES, Workers
@@ -152,18 +153,22 @@ class Hashed(Decoded):
         finest = 1.01 * self.kind.finest / max(1.0, wider)
         return max(1, sum(n <= finest for n in self.kind.resolutions))
 
-    def struct_with(self, transposed: wp.array) -> Any:
-        """Its arrays as kernels take them."""
-        struct = hashed.hash_type(self.kind.features)()
-        struct.values, struct.decoder, struct.transposed = self.values, self.decoder, transposed
-        levels = [self._level(shape) for shape in level_shapes(self.kind, self.lattice)]
-        struct.levels = wp.array(levels, dtype=hashed.Level, device=self.decoder.device)
+    def struct_with(self, load: Load, arrays: Mapping[str, wp.array], transposed: wp.array) -> Any:
+        """Entries and decoder as kernels take them, and levels."""
+        module = load("fields.hashed")
+        struct = module.hash_type(self.kind.features)()
+        for name, array in arrays.items():
+            setattr(struct, name, array)
+        struct.transposed = transposed
+        levels = [self._level(load, shape) for shape in level_shapes(self.kind, self.lattice)]
+        struct.levels = wp.array(levels, dtype=module.Level, device=self.decoder.device)
         struct.n_active, struct.width = self.n_active, self.kind.features
         struct.n_decoded = self.n_decoded
         return struct
 
-    def _level(self, shape: LevelShape) -> Any:
-        level, middle = hashed.Level(), 0.5 * shape.edges
+    def _level(self, load: Load, shape: LevelShape) -> Any:
+        level, middle = load("fields.hashed").Level(), 0.5 * shape.edges
+        vec3 = load("base.types").vec3
         level.size, level.middle = wp.vec3i(*shape.size), vec3(*middle)
         level.to_nodes = vec3(*(middle / (1.0 + self.lattice.border)))
         level.begin = shape.begin

@@ -15,7 +15,6 @@ from typing import Any
 import warp as wp
 from warpnerf_kernels.base.types import real, vec2
 from warpnerf_kernels.launch import propose
-from warpnerf_kernels.sampling import resampled
 
 from warpnerf.config import Contraction
 from warpnerf.fields.dense import DenseGrid
@@ -23,7 +22,7 @@ from warpnerf.fields.gradients import Gradients
 from warpnerf.fields.lattice import Lattice
 from warpnerf.fields.occupancy import FreeCells
 from warpnerf.fields.parameters import Parameter
-from warpnerf.model.interface import Load
+from warpnerf.model.interface import Load, loader
 from warpnerf.model.sampler_kinds import Resampled
 from warpnerf.model.spaces import part_of
 from warpnerf.model.storage_kinds import DENSE
@@ -108,6 +107,39 @@ def proposing_kernels(contraction: Contraction, device: wp.Device) -> SimpleName
     """
     space = part_of(contraction, "float32")
     return propose.proposing(space, not device.is_cuda and space.vectors is not None)
+
+
+def bins_struct(load: Load, n: int, unit: float, steps: Steps, ends: wp.array) -> Any:
+    """Histogram bins of rays, as kernels take them.
+
+    Args:
+        load: The kernels' modules, in the precision of the array.
+        n: Of each ray.
+        unit: See ``Proposal.unit``.
+        steps: Near, far, and where rays end.
+        ends: [n_rays] vec2 that is written.
+    """
+    bins = load("sampling.resampled").Bins()
+    bins.ends, bins.n, bins.unit = ends, n, unit
+    bins.near, bins.far = steps.near, steps.far
+    bins.transmittance_min = steps.transmittance_min
+    return bins
+
+
+def scratch_of(made: SimpleNamespace, workers: Workers) -> Any:
+    """Scratch memory of ``launch.propose.proposing``: a pack of bins for each worker, if packed."""
+    scratch = made.Scratch()
+    if "packs" in made.Scratch.vars:
+        dtype = made.Scratch.vars["packs"].type.dtype
+        scratch.packs = wp.empty(workers.count, dtype=dtype, device="cpu")
+    return scratch
+
+
+def shares_of(workers: Workers, n_rays: int) -> tuple[int, int, int]:
+    """Threads that scatter the gradient of so many rays' bins, parts of the grid, and threads of
+    each part. On the CPU each thread adds to a part of its own; on CUDA there is one part, and a
+    thread a ray."""
+    return (n_rays, 1, n_rays) if workers.device.is_cuda else (workers.count, workers.count, 1)
 
 
 def unit_of(near: float, content_distance: float) -> float:
@@ -201,16 +233,10 @@ class Proposer:
         self._guide = guide = propose.Guide()
         guide.box = lattice.box_between(steps.near, steps.far)
         guide.grid, guide.density = proposal.grid.struct, proposal.grid.density
-        bins = resampled.Bins()
-        bins.ends = wp.empty(n_rays, dtype=vec2, device=device)
-        bins.n, bins.unit = kind.bins, proposal.unit
-        bins.near, bins.far = steps.near, steps.far
-        bins.transmittance_min = steps.transmittance_min
+        ends = wp.empty(n_rays, dtype=vec2, device=device)
+        bins = bins_struct(loader("float32"), kind.bins, proposal.unit, steps, ends)
         self._bins = guide.bins = bins
-        self._scratch = self._kernels.Scratch()
-        if not device.is_cuda and "packs" in self._kernels.Scratch.vars:
-            dtype = self._kernels.Scratch.vars["packs"].type.dtype
-            self._scratch.packs = wp.empty(workers.count, dtype=dtype, device="cpu")
+        self._scratch = scratch_of(self._kernels, workers)
         self.gradients = proposal.gradients(workers) if learns else None
         """What ``learn`` has accumulated to since the last update; None: there is no way back."""
 
@@ -256,9 +282,7 @@ class Proposer:
             self.loss,
             cache=self._launches,
         )
-        # Each thread adds to a part of its own: on CUDA there is one part, and a thread a ray.
-        parts = 1 if self._workers.device.is_cuda else self._workers.count
-        items = n if self._workers.device.is_cuda else parts
+        items, parts, stride = shares_of(self._workers, n)
         self._workers.launch(
             self._kernels.add_bins,
             items,
@@ -266,7 +290,7 @@ class Proposer:
             rays,
             self.histograms,
             parts,
-            items // parts,
+            stride,
             self.gradients.struct,
             cache=self._launches,
         )

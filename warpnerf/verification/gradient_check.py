@@ -1,29 +1,29 @@
-"""Gradient checking: small rendering problems in plain numbers, for kernels of either precision."""
+"""Gradient checking: the kernels of either precision and form, launched with small problems."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 import warp as wp
 from warpnerf_kernels.base import precision, tiles
+from warpnerf_kernels.base.simd import LANES
 
-from warpnerf.config import Contraction, LossConfig, Scaling
-from warpnerf.fields.gradients import gradient_struct, n_tiles
+from warpnerf.config import Scaling
+from warpnerf.fields.gradients import n_tiles
 from warpnerf.fields.lattice import box_struct, frustum_struct, grid_struct
 from warpnerf.fields.occupancy import free_struct
 from warpnerf.fields.storage import density_struct
-from warpnerf.model.interface import Model, n_weights
-from warpnerf.model.models import Rgb
-from warpnerf.model.spaces import SPACES
+from warpnerf.model.sampler_kinds import ProposedDensity
+from warpnerf.model.spaces import SPACES, part_of
+from warpnerf.model.storage_kinds import DENSE
 from warpnerf.rendering.adjoint import AdjointLaunch
-from warpnerf.rendering.losses import PHOTOMETRIC_ONLY, Objective
+from warpnerf.rendering.proposal import bins_struct, scratch_of, shares_of
 from warpnerf.rendering.rays import rays_struct
 from warpnerf.rendering.render import KEPT_PACKS
-from warpnerf.rendering.steps import Steps
 from warpnerf.rendering.structs import (
     FieldStructs,
     render_outputs_struct,
@@ -33,195 +33,16 @@ from warpnerf.rendering.structs import (
     variant_of,
 )
 from warpnerf.runtime.parallel import Workers
-from warpnerf.scenes.extent.frustum import Frustum
+from warpnerf.verification.problems import (
+    DENSITY_SHIFT,
+    Found,
+    RayProblem,
+    RenderOutputs,
+    some_intervals,
+)
 
-DENSITY_SHIFT = 0.3
-BOX_MIN, BOX_MAX = np.array([-1.0, -0.8, -1.1]), np.array([1.2, 0.9, 1.0])
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class RayProblem:
-    """Rays through a grid, and a loss: the product of what they see with the slopes below."""
-
-    raw: np.ndarray
-    """[X, Y, Z, n_floats] raw density, raw features, padding."""
-    origins: np.ndarray
-    """[n_rays, 3] scene units."""
-    directions: np.ndarray
-    """[n_rays, 3] unit vectors."""
-    background: np.ndarray
-    """[n_rays, 3] in [0, 1]."""
-    target: np.ndarray
-    """[n_rays, 3] in [0, 1], for the training launch, which has its own loss."""
-    rgb_slope: np.ndarray
-    """[n_rays, 3] dL/drgb."""
-    opacity_slope: np.ndarray
-    """[n_rays] dL/dopacity."""
-    depth_slope: np.ndarray
-    """[n_rays] dL/ddepth."""
-    steps: Steps
-    """How rays are marched."""
-    offsets: np.ndarray
-    """[n_rays] in [0, 1): where in its step a sample sits."""
-    content_distance: np.ndarray
-    """[n_rays] scene units."""
-    free: np.ndarray = field(default_factory=lambda: np.zeros((1, 1, 1), np.uint8))
-    """[MX, MY, MZ] cells to the nearest occupied one."""
-    box_min: np.ndarray = field(default_factory=lambda: BOX_MIN)
-    """[3] scene units, or coordinates in the frustum."""
-    box_max: np.ndarray = field(default_factory=lambda: BOX_MAX)
-    """[3] likewise."""
-    contraction: Contraction = "none"
-    """How space outside the box is contracted, or ndc."""
-    border: float = 0.0
-    """Width of the shell that holds what is contracted, in half edges of the box."""
-    frustum: Frustum | None = None
-    """Of normalised device coordinates."""
-    density_scale: float = 1.0
-    """1 / scene unit."""
-    model: Model = field(default_factory=Rgb)
-    """What raw values mean."""
-    weights: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    """[n_weights] of the model's MLP."""
-    objective: Objective = PHOTOMETRIC_ONLY
-    """What the training launch minimises."""
-
-    @property
-    def n_rays(self) -> int:
-        """How many rays there are."""
-        return len(self.origins)
-
-    def rounded(self) -> RayProblem:
-        """The same in numbers that float32 holds, so that only arithmetic can differ."""
-        exact = {f.name: getattr(self, f.name) for f in fields(self)}
-        exact |= {
-            name: value.astype(np.float32).astype(np.float64)
-            for name, value in exact.items()
-            if isinstance(value, np.ndarray) and value.dtype == np.float64
-        }
-        if self.frustum is not None:
-            exact["frustum"] = replace(
-                self.frustum,
-                origin=self.frustum.origin.astype(np.float32).astype(np.float64),
-                axes=self.frustum.axes.astype(np.float32).astype(np.float64),
-                near=float(np.float32(self.frustum.near)),
-                depth=float(np.float32(self.frustum.depth)),
-            )
-        return RayProblem(**exact)
-
-
-def make_problem(seed: int, n_rays: int = 24, size: tuple[int, int, int] = (7, 8, 6)) -> RayProblem:
-    """Random rays, half of them from inside the box, through a random grid."""
-    rng = np.random.default_rng(seed)
-
-    def unit(vectors: np.ndarray) -> np.ndarray:
-        return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
-
-    origins = 2.0 * unit(rng.normal(size=(n_rays, 3)))
-    origins[::2] *= 0.2
-    return RayProblem(
-        raw=rng.normal(size=(*size, 4)),
-        origins=origins,
-        directions=unit(0.5 * rng.normal(size=(n_rays, 3)) - origins),
-        background=rng.uniform(size=(n_rays, 3)),
-        target=rng.uniform(size=(n_rays, 3)),
-        rgb_slope=rng.normal(size=(n_rays, 3)),
-        opacity_slope=rng.normal(size=n_rays),
-        depth_slope=rng.normal(size=n_rays),
-        steps=Steps(near=0.07, far=2.9, step=0.11),
-        offsets=rng.uniform(size=n_rays),
-        content_distance=rng.uniform(0.5, 3.0, size=n_rays),
-    )
-
-
-def stopping_early(problem: RayProblem) -> RayProblem:
-    """The same through a denser medium, with rays that end where little light is left."""
-    steps = replace(problem.steps, transmittance_min=0.2)
-    return replace(problem, density_scale=2.5, steps=steps)
-
-
-def partly_free(problem: RayProblem) -> RayProblem:
-    """The same where half of 3 x 4 x 5 cells are free."""
-    occupied = np.random.default_rng(7).uniform(size=(3, 4, 5)) < 0.5
-    return replace(problem, free=np.where(occupied, 0, 1).astype(np.uint8))
-
-
-def contracted(problem: RayProblem, contraction: Contraction = "linf") -> RayProblem:
-    """The same in contracted space, with steps that grow outside the box."""
-    steps = replace(problem.steps, far=40.0, n_linear=12, growth=0.09)
-    return replace(problem, contraction=contraction, border=0.2, steps=steps)
-
-
-def in_frustum(problem: RayProblem) -> RayProblem:
-    """The same rays through a frustum, turned against the axes: some go away, some come back."""
-    rng = np.random.default_rng(5)
-    axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    axes *= np.sign(np.linalg.det(axes))
-    return replace(
-        problem,
-        contraction="ndc",
-        frustum=Frustum(origin=-1.4 * axes[2], axes=axes, near=0.6, depth=1.3),
-        box_min=np.array([-1.1, -0.8, 0.06]),
-        box_max=np.array([0.9, 1.0, 1.3 * 0.999]),
-        steps=replace(problem.steps, far=40.0, step=0.043, in_ndc=True),
-    )
-
-
-def with_losses(problem: RayProblem, sample_colour: float = 0.0) -> RayProblem:
-    """The same with losses besides the squared error, in a launch that trains."""
-    losses = LossConfig(
-        photometric="huber",
-        distortion=0.3,
-        entropy=0.2,
-        opacity=0.1,
-        sample_colour=sample_colour,
-        near_clip=0.1,
-        near_clip_distance=0.6,
-    )
-    return replace(problem, objective=Objective(config=losses, content_distance=1.3))
-
-
-def of_model(problem: RayProblem, model: Model) -> RayProblem:
-    """The same rays through a random grid and MLP of another model."""
-    rng = np.random.default_rng(11)
-    return replace(
-        problem,
-        raw=rng.normal(size=(*problem.raw.shape[:3], model.n_floats)),
-        model=model,
-        weights=rng.normal(size=n_weights(model)) * 0.4,
-    )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Found:
-    """A gradient."""
-
-    values: np.ndarray
-    """[X, Y, Z, n_floats] of the raw values."""
-    weights: np.ndarray
-    """[n_weights] of the MLP's."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class RenderOutputs:
-    """What the rays of a problem see."""
-
-    rgb: np.ndarray
-    """[n_rays, 3] in [0, 1], with background."""
-    opacity: np.ndarray
-    """[n_rays] in [0, 1]."""
-    depth: np.ndarray
-    """[n_rays] scene units."""
-    n_samples: np.ndarray
-    """[n_rays] visited steps."""
-
-    def loss(self, problem: RayProblem) -> float:
-        """The problem's loss."""
-        return float(
-            np.vdot(problem.rgb_slope, self.rgb)
-            + np.vdot(problem.opacity_slope, self.opacity)
-            + np.vdot(problem.depth_slope, self.depth)
-        )
+BINS, BIN_UNIT = 32, 0.7
+"""Of a ray, and where they begin to widen, scene units."""
 
 
 class ProblemKernels:
@@ -318,6 +139,38 @@ class ProblemKernels:
         )
         return _found(gradient, problem).values
 
+    def bound(self, problem: RayProblem) -> tuple[np.ndarray, Found]:
+        """Proposal loss of rays [n_rays], by how much ``some_intervals`` outweigh the bins of a
+        proposal; and the gradient of the sum. Proposed are the densities of the problem's grid.
+        """
+        densities = replace(problem, raw=problem.raw[..., :1], model=ProposedDensity())
+        load, workers, n_rays = self._load, self._workers, problem.n_rays
+        propose, rays = load("launch.propose"), self._rays(problem)
+        made = propose.proposing(part_of(problem.contraction, self._name), self._packed)
+        scene, guide = self._scene(densities, workers), propose.Guide()
+        guide.box, guide.free, guide.grid = scene.box, scene.free, scene.field
+        guide.density = scene.density
+        ends = self._zeros(n_rays, self._types.vec2)
+        guide.bins = bins = bins_struct(load, BINS, BIN_UNIT, problem.steps, ends)
+        histograms = propose.Histograms()
+        for name in propose.Histograms.vars:
+            setattr(histograms, name, self._zeros((n_rays, BINS)))
+        scratch = scratch_of(made, workers)
+        edges, weights = (self._array(array) for array in some_intervals(problem))
+        drawn, none = self._zeros(edges.shape), self._zeros((0, 0))
+        workers.launch_owned(
+            *(made.propose_forward, n_rays, guide, rays, 1.0, scratch, histograms, drawn, none)
+        )
+        loss, gradient = self._zeros(n_rays), self._no_gradient(densities, workers)
+        workers.launch(
+            *(made.propose_backward, n_rays, bins, edges, weights, 1.0, histograms, loss)
+        )
+        items, parts, stride = shares_of(workers, n_rays)
+        workers.launch(*(made.add_bins, items, guide, rays, histograms, parts, stride, gradient))
+        found = np.zeros(problem.raw.shape)
+        found[..., :1] = _found(gradient, densities).values
+        return loss.numpy(), Found(arrays={"values": found})
+
     def _encoding(self, n_floats: int) -> Any:
         return self._load("fields.dense").dense(n_floats)
 
@@ -344,6 +197,7 @@ class ProblemKernels:
             "none",
             self._packed,
             problem.objective.config,
+            problem.stored,
         )
 
     def _grid(self, values: np.ndarray, border: float) -> Any:
@@ -365,14 +219,29 @@ class ProblemKernels:
             FieldStructs(
                 box=box,
                 free=free_struct(self._types, distance, (x, y, z), problem.border),
-                values=self._grid(problem.raw, problem.border),
+                values=self._stored(problem, workers),
                 density=density_struct(self._types, DENSITY_SHIFT, problem.density_scale),
                 weights=self._array(problem.weights),
             ),
             problem.steps,
             workers,
             objective=problem.objective,
+            stored=problem.stored,
         )
+
+    def _stored(self, problem: RayProblem, workers: Workers) -> Any:
+        """The encoding's ``Params``."""
+        if problem.stored == DENSE:
+            return self._grid(problem.raw, problem.border)
+        storage = problem.storage(self._workers.device)
+        arrays = {
+            name: self._array(array, self._types.vector(array.shape[1]))
+            if problem.stored.rules[name] == "nodes"
+            else self._array(array.ravel())
+            for name, array in problem.tensors.items()
+        }
+        transposed = self._rows(storage.n_transposed, workers)
+        return storage.struct_with(self._load, arrays, transposed)
 
     def _rays(self, problem: RayProblem) -> Any:
         return rays_struct(
@@ -385,14 +254,21 @@ class ProblemKernels:
         )
 
     def _no_gradient(self, problem: RayProblem, workers: Workers) -> Any:
-        """A kernel's Gradient of a problem's model, zero."""
-        n_nodes = math.prod(problem.raw.shape[:3])
-        return gradient_struct(
-            self._types,
-            self._zeros(n_nodes, self._types.vector(problem.model.n_floats)),
-            self._zeros(n_tiles(n_nodes), wp.uint8),
-            self._zeros((workers.count, len(problem.weights))),
-        )
+        """The encoding's ``Gradient``, zero."""
+        gradient = problem.stored.encoding(self._load, problem.model).Gradient()
+        gradient.weights = self._rows(len(problem.weights), workers)
+        for name, array in problem.learned.items():
+            if problem.stored.rules.get(name) == "nodes":
+                n, width = math.prod(array.shape[:-1]), array.shape[-1]
+                setattr(gradient, name, self._zeros(n, self._types.vector(width)))
+                gradient.touched = self._zeros(n_tiles(n), wp.uint8)
+            else:
+                setattr(gradient, name, self._rows(array.size, workers))
+        return gradient
+
+    def _rows(self, n: int, workers: Workers) -> wp.array:
+        """A row of numbers for each worker, of whole cache lines."""
+        return self._zeros((workers.count, -(-n // LANES) * LANES))
 
     def _adjoint(self, problem: RayProblem, kernel: wp.Kernel, variant: Any) -> AdjointLaunch:
         length = float(np.linalg.norm(problem.box_max - problem.box_min))
@@ -420,10 +296,15 @@ def _found(gradient: Any, problem: RayProblem) -> Found:
 
     NaN in tiles that hold gradient and are not flagged: the optimiser would not see them.
     """
-    found = gradient.values.numpy().astype(np.float64)
-    flags = np.pad(gradient.touched.numpy(), (1, 0)) != 0
-    tile = 1 + np.arange(len(found)) // tiles.TILE
-    seen = flags[tile] | flags[tile - 1]
-    found[found.any(axis=1) & ~seen] = np.nan
-    weights = gradient.weights.numpy().astype(np.float64).sum(axis=0)
-    return Found(values=found.reshape(problem.raw.shape), weights=weights)
+    arrays = {}
+    for name, array in problem.learned.items():
+        found = getattr(gradient, name).numpy().astype(np.float64)
+        if problem.stored.rules.get(name) == "nodes":
+            flags = np.pad(gradient.touched.numpy(), (1, 0)) != 0
+            tile = 1 + np.arange(len(found)) // tiles.TILE
+            seen = flags[tile] | flags[tile - 1]
+            found[found.any(axis=1) & ~seen] = np.nan
+        else:  # a row of each worker
+            found = found.sum(axis=0)[: array.size]
+        arrays[name] = found.reshape(array.shape)
+    return Found(arrays=arrays)

@@ -14,14 +14,8 @@ import numpy as np
 
 from warpnerf.config import Scaling
 from warpnerf.rendering.steps import Steps
-from warpnerf.verification.gradient_check import (
-    BOX_MAX,
-    BOX_MIN,
-    Found,
-    ProblemKernels,
-    RayProblem,
-    make_problem,
-)
+from warpnerf.verification.gradient_check import ProblemKernels
+from warpnerf.verification.problems import BOX_MAX, BOX_MIN, Found, RayProblem, make_problem
 
 SCALINGS: tuple[Scaling, ...] = ("quadratic", "clamped")
 
@@ -38,11 +32,9 @@ def relative_error(value: np.ndarray, expected: np.ndarray) -> float:
 
 
 def gradient_error(value: Found, expected: Found) -> float:
-    """relative_error of what a model's grid gets, or that of its weights if it is larger."""
-    errors = [relative_error(value.values, expected.values)]
-    if expected.weights.size:
-        errors.append(relative_error(value.weights, expected.weights))
-    return float(np.max(errors))
+    """relative_error of each array, the largest."""
+    pairs = ((value.arrays[name], array) for name, array in expected.arrays.items())
+    return float(np.max([relative_error(*pair) for pair in pairs]))
 
 
 def against_differences(kernels: ProblemKernels, problem: RayProblem) -> float:
@@ -55,6 +47,12 @@ def trained_against_differences(kernels: ProblemKernels, problem: RayProblem) ->
     """The gradient of a training launch, against differences of the losses that it reports."""
     _, gradient = kernels.train(problem)
     return _differences(kernels, problem, gradient, lambda p: float(kernels.train(p)[0].mean()))
+
+
+def bound_against_differences(kernels: ProblemKernels, problem: RayProblem) -> float:
+    """The gradient of a proposal's loss, against differences of that loss."""
+    _, gradient = kernels.bound(problem)
+    return _differences(kernels, problem, gradient, lambda p: float(kernels.bound(p)[0].sum()))
 
 
 def _differences(
@@ -74,17 +72,14 @@ def _differences(
     # A ReLU or a threshold crossed within h leaves no derivative; with many, h has to be small.
     h = 2e-6 if problem.weights.size else 2e-5
     errors = []
-    for of_weights in (False, True) if problem.weights.size else (False,):
+    for name, array in problem.learned.items():
         found, expected = [], []
         for _ in range(8):
-            direction = rng.normal(size=problem.weights.shape if of_weights else problem.raw.shape)
+            direction = rng.normal(size=array.shape)
             losses = {}
             smooth = True
             for k in (-2, -1, 1, 2):
-                if of_weights:
-                    moved = replace(problem, weights=problem.weights + k * h * direction)
-                else:
-                    moved = replace(problem, raw=problem.raw + k * h * direction)
+                moved = problem.moved(name, k * h * direction)
                 # Where a ray just reaches the end of its light, the loss jumps.
                 smooth &= np.array_equal(kernels.see(moved).n_samples, visited)
                 losses[k] = loss(moved)
@@ -92,8 +87,7 @@ def _differences(
             smooth &= abs(2.0 * near - far) <= 1e-6 * abs(far)
             if smooth:
                 expected.append((8.0 * near - far) / (12.0 * h))
-                change = gradient.weights if of_weights else gradient.values
-                found.append(np.vdot(direction, change))
+                found.append(np.vdot(direction, gradient.arrays[name]))
         enough = len(found) > 4
         errors.append(relative_error(np.array(found), np.array(expected)) if enough else math.nan)
     return float(np.max(errors))
@@ -203,6 +197,12 @@ def fused(kernels: ProblemKernels, problem: RayProblem) -> float:
 
 def forms(a: ProblemKernels, b: ProblemKernels, problem: RayProblem) -> float:
     """What rays see, and all gradients."""
+    found, expected = (kernels.gradient(problem.rounded()) for kernels in (a, b))
+    return float(np.max([trained_forms(a, b, problem), gradient_error(found, expected)]))
+
+
+def trained_forms(a: ProblemKernels, b: ProblemKernels, problem: RayProblem) -> float:
+    """What rays see, and the gradient of a training launch."""
     problem = problem.rounded()
     ours, theirs = a.see(problem), b.see(problem)
     if not np.array_equal(ours.n_samples, theirs.n_samples):
@@ -211,10 +211,15 @@ def forms(a: ProblemKernels, b: ProblemKernels, problem: RayProblem) -> float:
         relative_error(ours.rgb, theirs.rgb),
         relative_error(ours.opacity, theirs.opacity),
         relative_error(ours.depth, theirs.depth),
-        gradient_error(a.gradient(problem), b.gradient(problem)),
         gradient_error(a.train(problem, "clamped")[1], b.train(problem, "clamped")[1]),
     ]
     return float(np.max(errors))
+
+
+def bound_forms(a: ProblemKernels, b: ProblemKernels, problem: RayProblem) -> float:
+    """A proposal's loss of each ray, and its gradient."""
+    (ours, found), (theirs, expected) = (kernels.bound(problem.rounded()) for kernels in (a, b))
+    return float(np.max([relative_error(ours, theirs), gradient_error(found, expected)]))
 
 
 def same_image(kernels: ProblemKernels, problem: RayProblem) -> float:

@@ -10,21 +10,23 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
 from warpnerf.config import GridConfig, LossConfig, TrainConfig
 from warpnerf.model.interface import Model
-from warpnerf.model.models import Deferred, PerSample, SphericalHarmonics
+from warpnerf.model.models import Deferred, PerSample, Rgb, SphericalHarmonics
+from warpnerf.model.sampler_kinds import Resampled
+from warpnerf.model.storage_kinds import Hash, StorageKind, Vm
 from warpnerf.runtime.parallel import Workers
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.scene import Scene, View
 from warpnerf.training.train import train
 from warpnerf.verification import gradient_errors
-from warpnerf.verification.gradient_check import (
-    ProblemKernels,
+from warpnerf.verification.gradient_check import ProblemKernels
+from warpnerf.verification.problems import (
     RayProblem,
     contracted,
     in_frustum,
@@ -32,6 +34,7 @@ from warpnerf.verification.gradient_check import (
     of_model,
     partly_free,
     stopping_early,
+    stored_in,
     with_losses,
 )
 
@@ -60,6 +63,34 @@ VIEW_DEPENDENT: tuple[Model, ...] = (
     PerSample(residual=False, threshold=0.0),
 )
 """The models besides rgb, which the checks above are made with."""
+
+STORED: tuple[StorageKind, ...] = (
+    Vm(),
+    Hash(levels=4, coarsest=3, finest=40, table=64),
+)
+"""The storages besides dense grids, of which one level of the hash has an entry for each node."""
+
+BOUND = "bound of resampled steps"
+
+TRAINING = TrainConfig(
+    steps=240,
+    rays_per_step=256,
+    occupancy_every=20,
+    background="random",
+    model=Rgb(),
+    loss=LossConfig(),
+    grid=GridConfig(voxels=6000, grow_at=(0.5,)),
+)
+"""Short, growing the grid once."""
+
+TRAININGS: dict[str, TrainConfig] = {
+    "training": replace(TRAINING, model=DEFERRED),
+    **{f"training with field {kind.name}": replace(TRAINING, field=kind) for kind in STORED},
+    "training with resampled steps": replace(
+        TRAINING, sampler=Resampled(samples=16, bins=32, voxels=1000)
+    ),
+}
+"""Each twice; where a pair shares kernels with a check above, these are compiled already."""
 
 Measure = Callable[[], float]
 
@@ -159,6 +190,13 @@ def _checks(workers: Workers) -> Iterator[tuple[str, float, Measure]]:
         yield f"float64 adjoint = central differences, {_words(model)}", 1e-7, measure
     measure = partial(_worst, gradient_errors.trained_against_differences, with_losses, exact)
     yield "float64 adjoint = central differences, losses of rays", 1e-7, measure
+    for kind in STORED:
+        measure = partial(
+            _worst, gradient_errors.against_differences, partial(_with_storage, kind), exact
+        )
+        yield f"float64 adjoint = central differences, field {kind.name}", 1e-7, measure
+    measure = partial(_worst, gradient_errors.bound_against_differences, partly_free, exact)
+    yield f"float64 adjoint = central differences, {BOUND}", 1e-7, measure
     for name, kernels, tolerance in (("float64", exact, 1e-15), ("float32", plain, 1e-6)):
         measure = partial(gradient_errors.transposed, kernels)
         yield f"{name} <gather x, y> = <x, adjoint of gather y>", tolerance, measure
@@ -213,6 +251,13 @@ def _checks(workers: Workers) -> Iterator[tuple[str, float, Measure]]:
                 _worst, gradient_errors.forms, partial(_with_model, model), kernels, other
             )
             yield f"{name}, {_words(model)}", 1e-4, measure
+        for kind in STORED:
+            path = partial(_with_storage, kind)
+            measure = partial(_worst, gradient_errors.trained_forms, path, kernels, other)
+            # Fine levels of a hash amplify the rounding of positions, to 7e-6 as measured.
+            yield f"{name}, field {kind.name}", 5e-5, measure
+        measure = partial(_worst, gradient_errors.bound_forms, partly_free, kernels, other)
+        yield f"{name}, {BOUND}", 1e-5, measure
     yield (
         "image has the same bits for every scaling",
         0.0,
@@ -225,11 +270,14 @@ def _checks(workers: Workers) -> Iterator[tuple[str, float, Measure]]:
         )
         measure = partial(_worst, gradient_errors.threads, every, one, more)
         yield f"float32, 1 thread = {several} threads within rounding", 1e-5, measure
-        yield (
-            "training twice from one seed gives the same bits",
-            0.0,
-            partial(_trained_twice, workers.count),
-        )
+        for kind in STORED:
+            path = partial(_with_storage, kind)
+            measure = partial(_worst, gradient_errors.threads, path, one, more)
+            name = f"float32, 1 thread = {several} threads within rounding, field {kind.name}"
+            yield name, 1e-5, measure
+        for name, config in TRAININGS.items():
+            measure = partial(_trained_twice, replace(config, threads=workers.count))
+            yield f"{name} twice from one seed gives the same bits", 0.0, measure
 
 
 def _with_all_losses(problem: RayProblem) -> RayProblem:
@@ -239,6 +287,10 @@ def _with_all_losses(problem: RayProblem) -> RayProblem:
 def _words(model: Model) -> str:
     direct = isinstance(model, PerSample) and not model.residual
     return f"{model.name}, {'direct, ' if direct else ''}{BESIDES}"
+
+
+def _with_storage(kind: StorageKind, problem: RayProblem) -> RayProblem:
+    return stored_in(stopping_early(partly_free(problem)), kind)
 
 
 def _with_model(model: Model, problem: RayProblem) -> RayProblem:
@@ -254,24 +306,15 @@ def _worst(
     return float(np.max([measure(*kernels, path(make_problem(seed, N_RAYS))) for seed in SEEDS]))
 
 
-def _trained_twice(threads: int) -> float:
-    """Values and weights that differ between two short trainings, which grow the grid once."""
+def _trained_twice(config: TrainConfig) -> float:
+    """How many of the numbers that are learned differ between two trainings."""
     scene = _noise()
 
     def values(seed: int) -> np.ndarray:
-        config = TrainConfig(
-            steps=240,
-            rays_per_step=256,
-            occupancy_every=20,
-            background="random",
-            seed=seed,
-            threads=threads,
-            model=DEFERRED,
-            loss=LossConfig(),
-            grid=GridConfig(voxels=6000, grow_at=(0.5,)),
-        )
-        field = train(scene, config).field
+        field = train(scene, replace(config, seed=seed)).field
         arrays = [*field.storage.tensors().values(), field.weights.numpy()]
+        if field.proposal is not None:
+            arrays.append(field.proposal.grid.values.numpy())
         return np.concatenate([a.ravel() for a in arrays])
 
     first = values(0)

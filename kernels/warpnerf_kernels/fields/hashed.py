@@ -87,7 +87,8 @@ class Corner:
 @wp.func
 def begin_of_row(level: Level, i: int, j: int) -> int:
     """The entry at which the row of nodes (i, j, 0), (i, j, 1), .. begins."""
-    hashed = (wp.uint32(i) * wp.uint32(PRIME_X)) ^ (wp.uint32(j) * wp.uint32(PRIME_Y))
+    of_i = wp.uint32(i) * wp.static(wp.uint32(PRIME_X))
+    hashed = of_i ^ (wp.uint32(j) * wp.static(wp.uint32(PRIME_Y)))
     own = (i * level.size[1] + j) * level.size[2]
     return level.begin + wp.where(level.mask == wp.uint32(0), own, int(hashed & level.mask))
 
