@@ -17,7 +17,9 @@ TWO_D, TWO_F = f"{_TWO}[deferred-1-32-2-4]", f"{_TWO}[per_sample-4-32-2-12-True]
 BATCH = "kernels/test_heads_packed.py::test_batches_of_any_size"
 LONG = "kernels/test_heads_packed.py::test_long_rays_against_float64"
 CAPACITY = "kernels/test_heads_packed.py::test_capacity_changes_nothing[deferred-1-32-2-4]"
-CAPACITY_F = "kernels/test_heads_packed.py::test_capacity_changes_nothing[per_sample-4-32-2-12-True]"
+CAPACITY_F = (
+    "kernels/test_heads_packed.py::test_capacity_changes_nothing[per_sample-4-32-2-12-True]"
+)
 OWN = "kernels/test_heads_packed.py::test_each_worker_has_a_gradient_of_its_own[deferred-1-32-2-4]"
 NAN = "kernels/test_heads_packed.py::test_what_is_not_a_number_shows"
 VIEW = "kernels/test_heads_parts.py::test_harmonics_and_encoded_directions[float64-1e-14]"

@@ -353,13 +353,17 @@ def _split_to_look_at(scene: Scene) -> str:
 
 def _train(run: Run, scene: Scene, trainer: Trainer, session: Session | None) -> int:
     """Train to the end, or until asked to stop; look at the test views."""
+    from warpnerf.reports.limits import what_limits
+
     between = None if session is None else session.after_update
+    reports: list[Progress] = []
     with StopRequest() as stop:
         try:
             with ProgressBar("first step") as bar:
 
                 def on_progress(progress: Progress) -> None:
                     run.log(progress)
+                    reports.append(progress)
                     bar.report(progress.fraction, _text(progress))
 
                 trainer.run(on_progress, run.save_checkpoint, lambda: stop.asked, between)
@@ -387,6 +391,10 @@ def _train(run: Run, scene: Scene, trainer: Trainer, session: Session | None) ->
         with ProgressBar("first view") as bar:
             result = run.evaluate(trainer.field(), scene, split, bar.report)
         print(result)
+        pixels = trainer.plan.voxel_pixels.median
+        limit = what_limits(reports, pixels, result.mean["psnr"] if split == "test" else None)
+        if limit is not None:
+            print(limit)
     except Stopped as stopped:
         print(f"stopped; the field is saved. Continue with: {run.resume_command}", flush=True)
         return stopped.exit_code
@@ -434,8 +442,9 @@ def _absolute(source: str) -> str:
 def _text(progress: Progress) -> str:
     speed = progress.step / max(progress.seconds, 1e-6)
     size = " x ".join(str(n) for n in progress.size)
-    drawn = f" over {progress.seen:.0%} of pixels" if progress.seen < 1.0 else ""
+    drawn = f" ({progress.psnr:.2f} over {progress.seen:.0%} of pixels)"
     return (
-        f"step {progress.step}  loss {progress.loss:.5f}  PSNR {progress.psnr:.2f}{drawn}  "
+        f"step {progress.step}  loss {progress.loss:.5f}  "
+        f"PSNR {progress.picture_psnr:.2f}{drawn if progress.seen < 1.0 else ''}  "
         f"grid {size}  {speed:.1f} steps/s"
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
@@ -48,6 +49,11 @@ class Progress:
     seen: float = 1.0
     """Share of the pixels, as blocks of them tell, that rays are drawn from, (0, 1]; those of all
     others meet nothing, and ``loss``, ``psnr`` and ``samples_per_ray`` do not count them."""
+
+    @property
+    def picture_psnr(self) -> float:
+        """PSNR over whole pictures, dB: pixels that rays are not drawn from count as exact."""
+        return self.psnr - 10.0 * math.log10(self.seen)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

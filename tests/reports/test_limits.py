@@ -1,0 +1,57 @@
+"""What limits a training is named, the largest cost first."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from warpnerf.reports.limits import what_limits
+from warpnerf.training.state import Progress
+
+
+def reports(rise: float, seen: float = 1.0, n: int = 100) -> list[Progress]:
+    """Of a training whose PSNR rises to 30 dB over whole pictures, by so much in the last third."""
+    return [
+        Progress(
+            step=100 * k,
+            fraction=float(k / n),
+            seconds=float(k),
+            loss=0.1,
+            psnr=30.0 - rise * (1.0 - k / n) * 3.0 + 10.0 * np.log10(seen),
+            samples_per_ray=20.0,
+            size=(9, 9, 9),
+            occupied=0.1,
+            seen=seen,
+        )
+        for k in range(1, n + 1)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("rise", "pixels", "test_psnr", "name", "says"),
+    [
+        (0.3, 4.5, 29.0, "voxels", "4.5 pixels wide where cameras look; try more --voxels"),
+        (0.3, 1.3, 26.2, "photographs", "training views reach 30.0 dB, test views 26.2; try photo"),
+        (3.0, 1.3, 29.0, "time", "rose by 2.9 dB in the last third; try more --steps"),
+        (3.0, 1.3, None, "time", "rose by 2.9 dB"),
+        (0.3, 1.5, 29.0, "nothing", "neither voxels nor photographs nor time stands out"),
+    ],
+)
+def test_the_largest_is_named(
+    rise: float, pixels: float, test_psnr: float | None, name: str, says: str
+) -> None:
+    limit = what_limits(reports(rise), pixels, test_psnr)
+    assert limit is not None and limit.name == name
+    assert says in str(limit)
+
+
+def test_pixels_that_meet_nothing_count() -> None:
+    """As they do in test views: or an object that fills a tenth of them has 10 dB less."""
+    assert reports(0.3, seen=0.1)[-1].picture_psnr == pytest.approx(30.0)
+    limit = what_limits(reports(0.3, seen=0.1), 1.3, 26.2)
+    assert limit is not None and limit.name == "photographs"
+
+
+def test_a_training_of_few_reports_says_nothing() -> None:
+    assert what_limits(reports(0.3)[-3:], 4.5, 20.0) is None
+    assert what_limits([], 4.5, None) is None

@@ -1,0 +1,93 @@
+"""What limits a training's quality: voxels, photographs or time, and what to try next."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from warpnerf.training.state import Progress
+
+SHARP = 1.5
+"""Pixels: narrower voxels hardly blur."""
+EXPONENT = 1.25
+"""The squared error that a voxel of w pixels adds is about w^EXPONENT; ``scenes.extent.space_plan``
+goes by the same."""
+USUAL_GAP = 1.5
+"""dB by which test views lie below training views where there are photographs enough."""
+USUAL_RISE = 0.5
+"""dB that the PSNR rises in the last third of a training that has had time enough: learning rates
+fall then."""
+NOTABLE = 0.5
+"""dB that a limit is thought to cost before it is named."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limit:
+    """What a training's quality is limited by most."""
+
+    name: str
+    """voxels, photographs, time; or nothing: none of these stands out."""
+    cost: float
+    """About how many dB it costs, a guess."""
+    sentence: str
+    """What was seen, and what to try next."""
+
+    def __str__(self) -> str:
+        """The sentence."""
+        return self.sentence
+
+
+def what_limits(
+    reports: Sequence[Progress], voxel_pixels: float, test_psnr: float | None
+) -> Limit | None:
+    """What limits the quality of a training.
+
+    Args:
+        reports: Of the training, from its first to its last.
+        voxel_pixels: Width of a voxel of the final grid where cameras look, pixels.
+        test_psnr: Mean PSNR of its test views, dB; None: there are none.
+
+    Returns:
+        What costs most, by thresholds that are rules of thumb; None: there are too few reports.
+    """
+    done = np.array([report.fraction for report in reports])
+    psnr = np.array([report.picture_psnr for report in reports])
+    late, before = done > 0.9, (done > 0.55) & (done <= 0.7)
+    if not (late.any() and before.any()):
+        return None
+    reached = float(psnr[late].mean())
+    rise = reached - float(psnr[before].mean())
+    gap = 0.0 if test_psnr is None else reached - test_psnr
+    limits = [
+        Limit(
+            name="voxels",
+            cost=10.0 * EXPONENT * math.log10(max(voxel_pixels, SHARP) / SHARP),
+            sentence=f"limited by voxels: one is {voxel_pixels:.2g} pixels wide where cameras "
+            "look; try more --voxels, or a smaller --box",
+        ),
+        Limit(
+            name="photographs",
+            cost=gap - USUAL_GAP,
+            sentence=f"limited by photographs: training views reach {reached:.1f} dB, test views "
+            f"{reached - gap:.1f}; try photographs from more places, fewer --voxels or more --loss",
+        ),
+        Limit(
+            name="time",
+            cost=rise - USUAL_RISE,
+            sentence=f"limited by time: PSNR of training views rose by {rise:.1f} dB in the last "
+            "third; try more --steps and a longer --time-limit",
+        ),
+    ]
+    most = max(limits, key=lambda limit: limit.cost)
+    if most.cost < NOTABLE:
+        return Limit(
+            name="nothing",
+            cost=0.0,
+            sentence="neither voxels nor photographs nor time stands out as a limit: voxels are "
+            f"{voxel_pixels:.2g} pixels wide, training views reach {reached:.1f} dB, and rose by "
+            f"{rise:.1f} dB in the last third",
+        )
+    return most
