@@ -1,4 +1,4 @@
-"""One process at a time writes to a run's folder."""
+"""One process at a time writes to a run's folder, and only to what lies in it."""
 
 from __future__ import annotations
 
@@ -16,6 +16,12 @@ except ImportError:  # Windows, where nothing is locked
 
 NAME = ".lock"
 """Of the file that is locked; it holds the process's number."""
+WRITTEN = (
+    *("config.json", "log.jsonl", "metrics.json", "test.png", "field.safetensors", "test", "scene"),
+    *("checkpoint-*.safetensors", "test/*.png"),
+)
+"""What a run writes or removes in its folder and in previous/, as patterns of names; folders before
+what lies in them."""
 
 
 @contextmanager
@@ -26,8 +32,10 @@ def only_writer(folder: Path) -> Iterator[None]:
         folder: Made if it does not exist, and then removed if nothing was written to it.
 
     Raises:
-        InputError: Another process has it, or it cannot be written to.
+        InputError: Another process has it, it cannot be written to, or one of its files is none of
+            its own.
     """
+    require_own_files(folder)
     if fcntl is None:
         yield
         return
@@ -48,6 +56,28 @@ def only_writer(folder: Path) -> Iterator[None]:
         with suppress(OSError):  # not empty, as where something was written
             for place in made:
                 place.rmdir()
+
+
+def require_own_files(folder: Path) -> None:
+    """Raise InputError where a file of a run is a symbolic link, a pipe or a device.
+
+    What a link leads to would be overwritten or removed, and a pipe be waited for without end.
+    """
+    older = folder / "previous"
+    paths = [folder / name for name in (NAME, "next", "next/scene", older.name)]
+    for place in (folder, older):
+        for name in WRITTEN:
+            paths += sorted(place.glob(name)) if "*" in name else [place / name]
+    for path in paths:
+        if path.is_symlink():
+            raise InputError(
+                f"{path} is a link, and a run writes only to files of its own folder; remove the "
+                "link, or name another folder."
+            )
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise InputError(
+                f"{path} is neither a file nor a folder; remove it, or name another folder."
+            )
 
 
 def _locked(path: Path) -> int:

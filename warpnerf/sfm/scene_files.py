@@ -119,9 +119,10 @@ def remove_written(folder: Path, record: Record) -> None:
     for path in _written(folder, record):
         path.unlink()
     folders = {parent for name in record.written for parent in Path(name).parents[:-1]}
-    for inner in sorted(folders, reverse=True):
-        with suppress(OSError):  # not empty, or never made
-            (root / inner).rmdir()
+    for inner in sorted((root / name for name in folders), reverse=True):
+        if inner.resolve().is_relative_to(root):
+            with suppress(OSError):  # not empty, or never made
+                inner.rmdir()
 
 
 def remove_posed(folder: Path) -> None:

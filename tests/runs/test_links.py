@@ -1,0 +1,76 @@
+"""A run writes and removes only what lies in its own folder, by no link."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from warpnerf.checks import InputError
+from warpnerf.runs.lock import only_writer
+from warpnerf.sfm.scene_files import Record, remove_written
+
+FILES = (".lock", "config.json", "log.jsonl", "metrics.json", "test.png", "field.safetensors")
+LATER = ("checkpoint-00000010.safetensors", "test/view.png", "previous/config.json")
+FOLDERS = ("test", "previous", "previous/test", "scene", "next", "next/scene")
+
+
+def begun(folder: Path) -> Path:
+    """The folder of a run, and beside it what a link may lead to."""
+    for inner in ("run/test", "run/previous", "run/next", "elsewhere"):
+        (folder / inner).mkdir(parents=True, exist_ok=True)
+    return folder / "run"
+
+
+@pytest.mark.parametrize("name", [*FILES, *LATER])
+@pytest.mark.parametrize("dangling", [False, True])
+def test_a_link_in_place_of_a_file_is_refused(tmp_path: Path, name: str, dangling: bool) -> None:
+    run, target = begun(tmp_path), tmp_path / "elsewhere" / "file"
+    if not dangling:
+        target.write_text("precious")
+    (run / name).symlink_to(target)
+    with pytest.raises(InputError, match=f"{name} is a link, .* remove the link"), only_writer(run):
+        pass
+    assert target.read_text() == "precious" if not dangling else not target.exists()
+
+
+@pytest.mark.parametrize("name", FOLDERS)
+def test_a_link_in_place_of_a_folder_is_refused(tmp_path: Path, name: str) -> None:
+    run = begun(tmp_path)
+    if (run / name).exists():
+        (run / name).rmdir()
+    (run / name).symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(InputError, match=f"{name} is a link"), only_writer(run):
+        pass
+
+
+@pytest.mark.parametrize("name", [*FILES, *LATER])
+def test_a_pipe_is_not_waited_for(tmp_path: Path, name: str) -> None:
+    run = begun(tmp_path)
+    os.mkfifo(run / name)
+    with pytest.raises(InputError, match=f"{name} is neither a file nor"), only_writer(run):
+        pass
+
+
+def test_what_is_not_the_run_s_may_be_a_link(tmp_path: Path) -> None:
+    run = begun(tmp_path)
+    for name in ("photographs", "test/notes.txt", "weights.safetensors"):
+        (run / name).symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "by_link").symlink_to(run)
+    for folder in (run, tmp_path / "by_link"):
+        with only_writer(folder):
+            pass
+
+
+def test_a_record_removes_no_folder_elsewhere(tmp_path: Path) -> None:
+    scene, other = tmp_path / "scene", tmp_path / "other"
+    for folder in (scene / "images", other / "empty", tmp_path / "next to it"):
+        folder.mkdir(parents=True)
+    (scene / "images" / "a.png").write_bytes(b"a")
+    names = ["images/a.png", f"{other}/empty/b.png", "../next to it/c.png"]
+    record = msgspec.convert({"made_of": {}, "written": names}, Record)
+    remove_written(scene, record)
+    assert (other / "empty").is_dir() and (tmp_path / "next to it").is_dir()
+    assert not (scene / "images").exists() and scene.is_dir()
