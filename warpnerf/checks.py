@@ -56,9 +56,11 @@ def require_at_least(field: str, value: float, least: float) -> None:
 
 
 def require_whole(field: str, value: int, least: int) -> None:
-    """Raise InputError unless value is a whole number of at least `least`."""
+    """Raise InputError unless value is a whole number of at least `least`, below 2^63."""
     if isinstance(value, bool) or not hasattr(value, "__index__") or value < least:
         raise InputError(f"{field} must be a whole number of at least {least}, not {value!r}.")
+    if value >= 2**63:
+        raise InputError(f"{field} must be below 2^63, which is more than any machine counts to.")
 
 
 def require_one_of(field: str, value: str, choices: Iterable[str]) -> None:

@@ -328,6 +328,12 @@ def test_a_model_that_a_program_registers_has_options(monkeypatch: pytest.Monkey
     ("line", "says"),
     [
         ("train --stesp 3", "train has no option --stesp, the nearest is --steps; warpnerf train"),
+        ("train --lr 1", "train has no option --lr, here it is --optim.learning-rate-density; "),
+        ("train --iters=9", "train has no option --iters, here it is --steps; "),
+        ("train --data x", "train has no option --data: what to train on is a word without one, "),
+        ("eval --gpu 0", "eval has no option --gpu, here it is --device; "),
+        ("eval --data x", "eval has no option --data; "),
+        (f"train x --steps {'9' * 400}", "steps must be below 2^63, "),
         ("train --decay 1", "train has no option --decay, the nearest is --optim.decay; "),
         ("train --grid.voxel=1", "--grid.voxel, the nearest is --grid.voxels; "),
         ("train --qqq", "train has no option --qqq; warpnerf train --help-all lists all."),
@@ -354,6 +360,13 @@ def helped(capsys: pytest.CaptureFixture[str], *line: str) -> str:
         main(list(line))
     assert stop.value.code == 0
     return capsys.readouterr().out
+
+
+def test_help_ends_in_a_terminal_of_one_column(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "1")
+    assert "warpnerf train" in helped(capsys, "train", "--help")
 
 
 def test_help_is_read_at_a_glance(

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import logging
+import os
 import re
+import shutil
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -18,6 +20,7 @@ from warpnerf.cli.arguments import flags_of, registry, with_help
 from warpnerf.cli.demo import demo_command
 from warpnerf.cli.evaluate import eval_command
 from warpnerf.cli.export import export_command
+from warpnerf.cli.foreign import SCENE, meant_by
 from warpnerf.cli.given import near_to
 from warpnerf.cli.inspect import inspect_command
 from warpnerf.cli.machine import FAILED, check_command, warmup_command
@@ -47,6 +50,12 @@ COMMANDS: dict[str, Callable[..., int]] = {
 
 PATHS = ("--output", "--resume", "--config", "--scene", "--masks", "--json")
 """Options whose value may be any name."""
+
+TAKES_A_SCENE = ("train", "inspect")
+"""Subcommands whose first word is a scene."""
+
+NARROWEST = 24
+"""Columns of a terminal; in fewer, laying out help would not end."""
 
 HELP_ALL = "--help-all"
 """Lists all options of a subcommand, --help those that are used often."""
@@ -93,9 +102,17 @@ def _require_known(name: str, words: Sequence[str]) -> None:
             return
         flag = word.partition("=")[0].replace("_", "-")
         if flag.startswith("--") and flag not in flags:
+            known = {*flags, SCENE} if name in TAKES_A_SCENE else flags
+            given, ours = word.partition("=")[0], meant_by(flag, known)
+            if ours == SCENE:
+                raise InputError(
+                    f"{name} has no option {given}: what to train on is a word without one, as in "
+                    f"warpnerf {name} FOLDER."
+                )
+            hint = near_to(flag, sorted(flags)) if ours is None else f", here it is {ours}"
             raise InputError(
-                f"{name} has no option {word.partition('=')[0]}{near_to(flag, sorted(flags))}; "
-                f"warpnerf {name} --help{'-all' if '--help-all' in flags else ''} lists all."
+                f"{name} has no option {given}{hint}; warpnerf {name} "
+                f"--help{'-all' if HELP_ALL in flags else ''} lists all."
             )
 
 
@@ -123,6 +140,8 @@ def _parsed(words: list[str]) -> int:
         named.__doc__ = (command.__doc__ or "").partition("\n\n")[0]
         return named
 
+    if shutil.get_terminal_size().columns < NARROWEST:
+        os.environ["COLUMNS"] = str(NARROWEST)
     with registry:
         return tyro.extras.subcommand_cli_from_dict(
             {name: shown(command) for name, command in COMMANDS.items()},
