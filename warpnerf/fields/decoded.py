@@ -39,15 +39,19 @@ class Decoded(ReadAtNodes):
         """Its arrays as kernels take them."""
         return self.struct_with(wp.zeros((0, 0), dtype=real, device=self.decoder.device))
 
+    @property
+    def n_transposed(self) -> int:
+        """Numbers of the decoder's transpose."""
+        return self.n_decoded * padded(self.decoder.size // self.n_columns)
+
     def struct_for(self, workers: Workers) -> Any:
         """The same, and a transposed decoder of each worker."""
-        n_inputs = self.decoder.size // self.n_columns
-        return self.struct_with(zero_weights(self.n_decoded * padded(n_inputs), workers))
+        return self.struct_with(zero_weights(self.n_transposed, workers))
 
     @abstractmethod
     def struct_with(self, transposed: wp.array) -> Any:
         """Its arrays as kernels take them.
 
         Args:
-            transposed: [n_workers, n_decoded * padded inputs] scratch of the vector form.
+            transposed: [n_workers, n_transposed] scratch of the vector form.
         """
