@@ -188,12 +188,17 @@ class Hashed(Decoded):
         level.mask = self.kind.table - ROW_ALIGNED if shape.is_hashed else 0
         return level
 
+    @staticmethod
+    def densities_kernel(kind: Hash) -> wp.Kernel:
+        """That of its densities at nodes."""
+        return hashed.node_densities_kernel(kind.features, kind.levels, kind.hidden)
+
     def densities_of_planes(self, workers: Workers, first: int, n: int) -> wp.array:
         """Those that are read there."""
         lattice, (_, y, z) = self.lattice, self.lattice.size
         values = allocate_nodes(n * y * z, vector(1), workers.device)
         workers.launch(
-            hashed.node_densities_kernel(self.kind.features, self.kind.hidden),
+            self.densities_kernel(self.kind),
             n * y,
             *(self.struct, self.n_columns, wp.vec3i(*lattice.size), 1.0 + lattice.border),
             *(first * y, values),
@@ -207,7 +212,7 @@ class Hashed(Decoded):
         assert isinstance(kind, Hash)
         return [
             *super().kernels(kind, model),
-            hashed.node_densities_kernel(kind.features, kind.hidden),
+            cls.densities_kernel(kind),
             adam.adam_kernel(kind.features),
         ]
 

@@ -288,10 +288,10 @@ def decoded_twice(
 
 
 @cache
-def node_densities_kernel(width: int, hidden: int = 0) -> wp.Kernel:
-    """Raw densities at nodes of the lattice of the field, with so many units of a hidden layer."""
+def node_densities_kernel(width: int, n_levels: int, hidden: int) -> wp.Kernel:
+    """Raw densities at nodes of the lattice of the field."""
     if hidden:
-        return hidden_densities_kernel(width, hidden)
+        return hidden_densities_kernel(width, n_levels, hidden)
     Hash, Density, column = hash_type(width), vector(1), density_column(width)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -334,10 +334,36 @@ def node_densities_kernel(width: int, hidden: int = 0) -> wp.Kernel:
     return node_densities
 
 
+DENSITY_OF = r"""
+float units[HIDDEN] = {};
+for (int i = 0; i < n_inputs; ++i) {
+    const float* row = hidden.data + i * HIDDEN;
+    for (int u = 0; u < HIDDEN; ++u) units[u] += x.c[i] * row[u];
+}
+float raw = 0.0f;
+for (int u = 0; u < HIDDEN; ++u) {
+    raw += (units[u] < 0.0f ? 0.0f : units[u]) * decoder.data[u * columns];
+}
+return raw;
+"""
+
+
 @cache
-def hidden_densities_kernel(width: int, hidden: int) -> wp.Kernel:
+def hidden_densities_kernel(width: int, n_levels: int, hidden: int) -> wp.Kernel:
     """The same where there is a hidden layer, through which each node goes by itself."""
-    Hash, Density, Units = hash_type(width), vector(1), vector(hidden)
+    Hash, Density = hash_type(width), vector(1)
+    Numbers = vector(n_levels * width)
+
+    @wp.func_native(f"constexpr int HIDDEN = {hidden};\n" + DENSITY_OF)
+    def density_of(
+        x: Numbers,
+        n_inputs: int,  # how many of these there are
+        hidden: wp.array(dtype=real),
+        decoder: wp.array(dtype=real),
+        columns: int,  # of the decoder
+    ) -> wp.float32:
+        """The raw density, in C++: compilers know the number of units, and compute some at once."""
+        ...
 
     @wp.kernel(module="unique", enable_backward=False)
     def node_densities(
@@ -354,16 +380,19 @@ def hidden_densities_kernel(width: int, hidden: int) -> wp.Kernel:
         out: wp.array(dtype=Density),  # [n_rows * Z]
     ):
         """Raw densities at the nodes of a row along z: fields.hashed.read there."""
-        row, n_units = first + wp.tid(), params.n_units
+        row, n_numbers = first + wp.tid(), params.width
         x = real((begin + row) // size[1]) / real(size[0] - 1)
         y = real((begin + row) % size[1]) / real(size[1] - 1)
+        numbers = Numbers()
         for k in range(size[2]):
             share = vec3(x, y, real(k) / real(size[2] - 1))
             position = reach * (real(2.0) * share - vec3(real(1.0)))
-            before = times(params, params.hidden, hidden, n_units, position, Units())
-            raw = real(0.0)
-            for u in range(n_units):
-                raw += relu(before[u]) * params.decoder[u * columns]
+            for m in range(params.n_active):
+                around = in_level(params, corner_of(params.levels[m], position))
+                for i in range(n_numbers):
+                    numbers[m * n_numbers + i] = around[i]
+            n = params.n_active * n_numbers
+            raw = density_of(numbers, n, params.hidden, params.decoder, columns)
             out[row * size[2] + k] = Density(raw)
 
     return node_densities
