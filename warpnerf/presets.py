@@ -2,7 +2,8 @@
 
 ``fast`` and ``quality`` are what warpnerf reaches in a minute or three and in a quarter of an hour
 on two cores; docs/decisions/presets.md says how they were chosen. The others are the published
-hyperparameters of DirectVoxGO, to compare with; they take hours on two cores.
+hyperparameters of DirectVoxGO, TensoRF and Instant-NGP, to compare with; they take hours on two
+cores. First DirectVoxGO.
 
 Source of these: Sun et al. 2022 (CVPR), Sun et al. 2022 (arXiv 2206.05085), and the configurations
 in their repository: default.py, nerf_unbounded_default.py, llff_default.py. Different here:
@@ -40,6 +41,26 @@ repository. Different here:
   each eighth update, which counts eight times. The weight is three times theirs, as the squared
   error is.
 - Free space is looked for each 1000 steps, not twice, and the box becomes tight at each growth.
+
+``ngp`` is Instant-NGP for objects: Mueller et al. 2022 (SIGGRAPH), configs/nerf/base.json as first
+published in their repository, and scripts/run.py. Different here:
+
+- The near plane is 0 and gradients are scaled by distance, as above; they push densities near
+  cameras down instead.
+- Where a level has more nodes than entries, rows of nodes along z are hashed as wholes; theirs
+  hashes single nodes. Level l has 16 * 128^(l / 15) cells, rounded, along the longest edge of the
+  scene's box; theirs over a cube, one fewer, with nodes half a cell off the faces.
+- Density is softplus over a voxel of the lattice, 128 along an edge as their occupancy grid; theirs
+  is an exponential.
+- A step draws 4096 rays, as theirs does at first; theirs then draws as many as have 2^18 samples.
+- The colour network sees the other 15 outputs and four octaves of the direction, and has biases;
+  theirs sees all 16 outputs and spherical harmonics of degree 4, and has none. Here samples of no
+  more weight than 1e-4 get no colour.
+- Learning rates fall from the start on, to what theirs are at the end; theirs fall at 20 000 and
+  30 000 steps. The networks' weights do not decay, and those that render are the last ones, not
+  their running mean.
+- Free space is looked for each 100 steps at all nodes, by the densities there; theirs by samples
+  in cells with a decaying maximum, each 16 steps or oftener.
 
 ``mip360`` has of Mip-NeRF 360 what does not need its network: Barron et al. 2022 (CVPR), and
 360.gin in google-research/multinerf. Space is contracted by the Euclidean norm, to twice the box;
@@ -176,6 +197,30 @@ PRESETS: dict[str, TrainConfig] = {
             decay=0.1, restart_at_growth=True, tv_density=0.0, tv_rgb=0.0, accumulate_at=()
         ),
         loss=LossConfig(),
+    ),
+    "ngp": TrainConfig(
+        steps=35_000,
+        background="random",
+        coarse_steps=0,
+        alpha_min=0.01,
+        model=PerSample(
+            features=15, frequencies=4, width=64, residual=False, learning_rate_mlp=0.01
+        ),
+        field=Hash(
+            levels=16,
+            features=2,
+            coarsest=16,
+            finest=2048,
+            table=1 << 19,
+            hidden=64,
+            learning_rate=0.01,
+            learning_rate_decoder=0.01,
+            epsilon=1e-15,
+        ),
+        grid=GridConfig(voxels=128**3, grow_at=(), alpha_init=1 / 128),
+        march=MarchConfig(step_voxels=127 * 3**0.5 / 1024, transmittance_min=1e-4),
+        optim=OptimConfig(decay=0.33**2, epsilon=1e-15, accumulate_at=()),
+        loss=LossConfig(photometric="huber"),
     ),
     "mip360": TrainConfig(
         steps=25_000,

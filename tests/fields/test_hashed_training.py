@@ -20,7 +20,8 @@ from warpnerf.fields.dense import DenseGrid
 from warpnerf.fields.hashed import Hashed, level_shapes
 from warpnerf.fields.occupancy import FreeCells
 from warpnerf.model.models import Deferred
-from warpnerf.model.storage_kinds import DENSE, STORAGE_KINDS, Hash
+from warpnerf.model.registry import to_json
+from warpnerf.model.storage_kinds import DENSE, STORAGE_KINDS, Hash, from_json
 from warpnerf.training.optim import Update, adam_struct
 from warpnerf.training.plan import resolve
 from warpnerf.training.state import TrainingState
@@ -59,6 +60,29 @@ def test_it_resumes_with_equal_bits(states: list[TrainingState], tmp_path: Path)
 
 def test_files_hold_it(states: list[TrainingState], tmp_path: Path) -> None:
     require_files_hold(states[1], CONFIG, tmp_path / "field.safetensors")
+
+
+def test_a_hidden_layer_learns_and_is_kept(tmp_path: Path) -> None:
+    config = replace(CONFIG, field=replace(CONFIG.field, hidden=16, learning_rate=0.02))
+    states = states_of(config, early=100)
+    assert states[1].progress.loss < 0.2
+    fresh, trained = Trainer(ball(), config).storage.tensors(), storage_of(states[1]).tensors()
+    assert list(trained) == ["values", "hidden", "decoder"]
+    for name, shape in {"hidden": (20, 16), "decoder": (16, 16)}.items():
+        assert trained[name].shape == shape
+        assert np.abs(trained[name] - fresh[name])[:, :4].max() > 1e-2
+    assert (trained["decoder"][:, 4:] == 0.0).all()  # padding
+    assert np.abs(fresh["hidden"]).max() == pytest.approx((6 / 20) ** 0.5, rel=0.05)
+    assert np.abs(fresh["decoder"]).max() == pytest.approx((3 / 16) ** 0.5, rel=0.1)
+    require_resumes(states, config, tmp_path / "state")
+    require_files_hold(states[1], config, tmp_path / "field.safetensors")
+
+
+def test_files_from_before_there_were_hidden_layers() -> None:
+    tree = to_json(CONFIG.field)
+    del tree["hidden"]
+    assert from_json(tree) == CONFIG.field
+    assert list(CONFIG.field.rules) == ["values", "decoder"]
 
 
 @pytest.mark.parametrize("name", EXPORTS)
@@ -114,6 +138,13 @@ def test_memory_does_not_grow_with_the_lattice() -> None:
     assert kind.training_bytes(model, (100,) * 3) < 0.05 * DENSE.training_bytes(model, (200,) * 3)
 
 
+def test_a_hidden_layer_counts() -> None:
+    alone, kind, model = Hash(), Hash(hidden=64), Deferred()
+    bytes_of = [k.training_bytes(model, (100,) * 3) for k in (alone, kind)]
+    assert bytes_of[1] - bytes_of[0] == 12 * 24 * 64
+    assert kind.relative_time - alone.relative_time == pytest.approx(4e-4 * 64 * (24 + 16))
+
+
 @pytest.mark.parametrize(
     ("numbers", "sentence"),
     [
@@ -123,6 +154,9 @@ def test_memory_does_not_grow_with_the_lattice() -> None:
         ({"coarsest": 64, "finest": 32}, "field.finest must be a whole number of at least 64"),
         ({"finest": 1 << 16}, "field.finest must be at most 32768, not 65536."),
         ({"table": 1000}, "field.table must be a power of two, up to 16777216, not 1000."),
+        ({"hidden": -16}, "field.hidden must be a whole number of at least 0, not -16."),
+        ({"hidden": 24}, "field.hidden must be a multiple of 16 up to 128, or 0 for no hidden"),
+        ({"hidden": 144}, "field.hidden must be a multiple of 16 up to 128, or 0 for no hidden"),
         ({"epsilon": 0.0}, "field.epsilon must be"),
     ],
 )

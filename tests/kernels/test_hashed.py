@@ -1,5 +1,6 @@
 """A hash in float64: what is read, and its transpose, compared with the oracle and differences."""
 
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -19,8 +20,9 @@ from warpnerf.model.storage_kinds import Hash
 from warpnerf.runtime.parallel import Workers
 from warpnerf.scenes.extent.space import Space
 
-KINDS = [(4, 16, 16), (2, 4, 4), (8, 32, 28)]
-"""Numbers of an entry, of a sample, and how many of these are decoded."""
+KINDS = [(4, 16, 16, 0), (2, 4, 4, 0), (8, 32, 28, 0), (2, 32, 17, 48)]
+"""Numbers of an entry, of a sample, how many of these are decoded, and units of a hidden layer."""
+KIND = Hash(levels=4, coarsest=3, finest=40, table=64)
 EDGES = np.array([1.0, 1.5, 2.0])
 
 
@@ -36,17 +38,26 @@ class Numbers(EncodingProblem):
     entries = "values"
 
     def __init__(
-        self, width: int, n_floats: int, n_decoded: int, border: float = 0.0, active: int = 4
+        self,
+        width: int,
+        n_floats: int,
+        n_decoded: int,
+        hidden: int,
+        border: float = 0.0,
+        active: int = 4,
     ) -> None:
         rng = np.random.default_rng(width + n_decoded)
-        self.kind = Hash(levels=4, features=width, coarsest=3, finest=40, table=64)
+        self.kind = replace(KIND, features=width, hidden=hidden)
         self.active, self.shapes = active, level_shapes(self.kind, lattice_of(border))
         assert [shape.is_hashed for shape in self.shapes] == [False, True, True, True]
         arrays = {
             "values": rng.normal(size=(self.shapes[-1].end, width)),
-            "decoder": rng.normal(size=(4 * width, max(16, n_floats))),
+            "decoder": rng.normal(size=(hidden or 4 * width, max(16, n_floats))),
         }
-        part = loader("float64")("fields.hashed").hashed(width, 4, n_floats, n_decoded)
+        if hidden:
+            arrays["hidden"] = rng.normal(size=(4 * width, hidden))
+        hashed = loader("float64")("fields.hashed").hashed
+        part = hashed(width, 4, n_floats, n_decoded, hidden=hidden)
         super().__init__(part, arrays, n_floats, n_decoded, border)
 
     def level(self, shape: LevelShape) -> Any:
@@ -61,6 +72,9 @@ class Numbers(EncodingProblem):
         params, width = self.part.Params(), self.kind.features
         params.values = wp.array(arrays["values"], dtype=wp.types.vector(width, wp.float64))
         params.decoder = wp.array(arrays["decoder"].ravel(), dtype=wp.float64)
+        if self.kind.hidden:
+            params.hidden = wp.array(arrays["hidden"].ravel(), dtype=wp.float64)
+        params.n_units = self.kind.hidden
         levels = [self.level(shape) for shape in self.shapes]
         params.levels = wp.array(levels, dtype=loader("float64")("fields.hashed").Level)
         params.n_active, params.width, params.n_decoded = self.active, width, self.n_decoded
@@ -69,26 +83,28 @@ class Numbers(EncodingProblem):
     def oracle(self, given: dict[str, torch.Tensor]) -> torch.Tensor:
         read = self.shapes[: self.active]
         tables = [given["values"][shape.begin : shape.end] for shape in read]
-        decoder = given["decoder"][: len(read) * self.kind.features]
+        matrices = [given[name] for name in ("hidden", "decoder") if name in given]
+        matrices[0] = matrices[0][: len(read) * self.kind.features]
         cells = [tuple(n * EDGES / EDGES.max()) for n in self.kind.resolutions][: len(read)]
         shares = 0.5 * (torch.tensor(self.points) / (1.0 + self.border) + 1.0)
-        return raw_values(tables, cells, self.kind.table, decoder, shares)
+        return raw_values(tables, cells, self.kind.table, matrices, shares)
 
 
 @pytest.mark.parametrize("border", [0.0, 0.3])
 @pytest.mark.parametrize("kind", KINDS)
-def test_against_the_oracle(kind: tuple[int, int, int], border: float) -> None:
+def test_against_the_oracle(kind: tuple[int, int, int, int], border: float) -> None:
     Numbers(*kind, border=border).require_oracle()
 
 
-def test_levels_that_are_not_active_count_as_0() -> None:
-    numbers = Numbers(*KINDS[0], active=2)
+@pytest.mark.parametrize("kind", [KINDS[0], KINDS[3]])
+def test_levels_that_are_not_active_count_as_0(kind: tuple[int, int, int, int]) -> None:
+    numbers = Numbers(*kind, active=2)
     numbers.require_oracle()
     assert not numbers.touched[numbers.shapes[2].begin // 4 :].any()
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_against_central_differences(kind: tuple[int, int, int]) -> None:
+def test_against_central_differences(kind: tuple[int, int, int, int]) -> None:
     Numbers(*kind).require_differences()
 
 
@@ -129,9 +145,9 @@ def test_levels_are_read_as_the_lattice_grows() -> None:
         first.resized(workers, moved)
 
 
-@pytest.mark.parametrize("border", [0.0, 0.3])
-def test_densities_at_nodes_are_what_is_read_there(border: float) -> None:
-    kind, workers = Hash(levels=4, coarsest=3, finest=40, table=64), Workers("cpu", 2)
+@pytest.mark.parametrize(("border", "hidden"), [(0.0, 0), (0.3, 0), (0.3, 32)])
+def test_densities_at_nodes_are_what_is_read_there(border: float, hidden: int) -> None:
+    kind, workers = replace(KIND, hidden=hidden), Workers("cpu", 2)
     stored = Hashed.first(kind, Deferred(), lattice_of(border), 0, workers.device)
     rng = np.random.default_rng(3)
     values = rng.normal(size=stored.values.numpy().shape).astype(np.float32)
@@ -140,8 +156,9 @@ def test_densities_at_nodes_are_what_is_read_there(border: float) -> None:
     shapes = level_shapes(kind, stored.lattice)
     tables = [torch.tensor(values[s.begin : s.end].astype(np.float64)) for s in shapes]
     cells = [tuple(n * EDGES / EDGES.max()) for n in kind.resolutions]
-    decoder = torch.tensor(stored.tensors()["decoder"].astype(np.float64))
+    stored_matrices = [x for name, x in stored.tensors().items() if name != "values"]
+    matrices = [torch.tensor(x.astype(np.float64)) for x in stored_matrices]
     axes = [np.linspace(0.0, 1.0, n) for n in stored.lattice.size]
     shares = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    expected = raw_values(tables, cells, kind.table, decoder, torch.tensor(shares))[:, 0].numpy()
+    expected = raw_values(tables, cells, kind.table, matrices, torch.tensor(shares))[:, 0].numpy()
     assert_close(stored.raw_densities(workers).ravel(), expected, 2e-5)

@@ -1,6 +1,6 @@
 """A hash in packs of sixteen samples: against the plain form, and with several workers."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import pytest
@@ -56,8 +56,7 @@ def gradient(
         wider = kind.finest / kind.resolutions[active - 1] / storage.lattice.voxel_size.min()
         storage = replace(storage, density_scale=float(wider))
         assert storage.n_active == active
-    names = ("levels", "features", "coarsest", "finest", "table")
-    read_as = Plain(**{name: getattr(kind, name) for name in names}) if is_plain else kind
+    read_as = Plain(**{f.name: getattr(kind, f.name) for f in fields(kind)}) if is_plain else kind
     return gradient_of(trainer, replace(storage, kind=read_as))
 
 
@@ -76,9 +75,23 @@ def test_other_entries(name: str, features: int) -> None:
     require_same(*(gradient(MODELS[name], kind, is_plain=p) for p in (False, True)))
 
 
-def test_levels_that_are_not_active() -> None:
-    packed, plain = (gradient(MODELS["deferred"], active=3, is_plain=p) for p in (False, True))
-    assert (packed["decoder"].reshape(24, -1)[12:] == 0.0).all()
+@pytest.mark.parametrize(("hidden", "features"), [(16, 4), (48, 2)])
+@pytest.mark.parametrize("name", ["deferred", "many"])
+def test_a_hidden_layer(name: str, hidden: int, features: int) -> None:
+    kind = replace(SMALL, features=features, hidden=hidden)
+    packed, plain = (gradient(MODELS[name], kind, is_plain=p) for p in (False, True))
+    assert packed["hidden"].any() and packed["decoder"].any()
+    require_same(packed, plain)
+
+
+@pytest.mark.parametrize("hidden", [0, 16])
+def test_levels_that_are_not_active(hidden: int) -> None:
+    kind = replace(SMALL, hidden=hidden)
+    packed, plain = (
+        gradient(MODELS["deferred"], kind, active=3, is_plain=p) for p in (False, True)
+    )
+    first = packed["hidden" if hidden else "decoder"].reshape(24, -1)
+    assert (first[12:] == 0.0).all() and first[:12].any()
     require_same(packed, plain)
 
 
@@ -86,6 +99,12 @@ def test_levels_that_are_not_active() -> None:
 def test_one_worker_against_more(threads: int) -> None:
     """Also where there are more workers than levels."""
     require_workers_agree(lambda n: gradient(MODELS["deferred"], threads=n), threads)
+
+
+@pytest.mark.parametrize("threads", [2, 8])
+def test_one_worker_against_more_with_a_hidden_layer(threads: int) -> None:
+    kind = replace(SMALL, hidden=16)
+    require_workers_agree(lambda n: gradient(MODELS["deferred"], kind, threads=n), threads)
 
 
 @pytest.mark.parametrize("threads", [1, 2, 8])

@@ -63,6 +63,7 @@ def squared_error(field: wn.Field, scene: Scene) -> float:
         ("dvgo-unbounded", tiny_scene(ring(4))),
         ("dvgo-llff", facing()),
         ("tensorf", ball()),
+        ("ngp", ball()),
         ("mip360", tiny_scene(ring(4))),
     ],
 )
@@ -102,7 +103,7 @@ def test_the_command_knows_all() -> None:
 
 
 def test_there_are_those_of_others_and_the_everyday_ones() -> None:
-    assert set(PRESETS) == {*DEFAULT_PRESETS, *PUBLISHED, "tensorf", "mip360"}
+    assert set(PRESETS) == {*DEFAULT_PRESETS, *PUBLISHED, "tensorf", "ngp", "mip360"}
 
 
 PUBLISHED: dict[str, dict[str, Any]] = {
@@ -253,6 +254,32 @@ def test_that_of_tensorf_is_what_is_published() -> None:
     at = [share * config.steps for share in config.grid.grow_at]
     assert at == pytest.approx([2000, 3000, 4000, 7000])
     assert config.loss == LossConfig()
+
+
+def test_that_of_instant_ngp_is_what_is_published() -> None:
+    """base.json, run.py and testbed_nerf.cu of theirs; presets.py says what is different here."""
+    config, theirs = PRESETS["ngp"], {"steps": 35_000, "rays": 4096, "occupancy": 128}
+    field, optim, model, march = config.field, config.optim, config.model, config.march
+    assert isinstance(field, Hash) and isinstance(model, PerSample)
+    assert (config.steps, config.rays_per_step) == (theirs["steps"], theirs["rays"])
+    assert (field.levels, field.features, field.table, field.hidden) == (16, 2, 1 << 19, 64)
+    assert field.resolutions[0] == 16 and field.resolutions[-1] == 2048
+    assert field.resolutions[1] == round(16 * 1.3819)
+    assert (1 + model.features, model.width, model.hidden_layers) == (16, 64, 2)
+    assert not model.residual
+    rates = field.learning_rate, field.learning_rate_decoder, model.learning_rate_mlp
+    assert rates == (0.01, 0.01, 0.01)
+    assert (optim.beta1, optim.beta2, optim.epsilon, field.epsilon) == (0.9, 0.99, 1e-15, 1e-15)
+    at = [20_000, 30_000]  # two falls to a third each, within the steps
+    assert optim.decay == pytest.approx(0.33 ** sum(n < theirs["steps"] for n in at))
+    assert optim.accumulate_at == config.grid.grow_at == ()
+    assert config.grid.voxels == theirs["occupancy"] ** 3
+    cells = theirs["occupancy"] - 1
+    assert march.step_voxels / cells == pytest.approx(3**0.5 / 1024)  # of an edge
+    assert (march.jitter, march.near, march.transmittance_min) == (True, 0.0, 1e-4)
+    assert config.alpha_min == 0.01 and config.background == "random"
+    assert (config.loss.photometric, config.loss.huber_delta) == ("huber", 0.1)
+    assert config.loss == LossConfig(photometric="huber")
 
 
 def test_that_of_mip360_has_what_is_published_but_for_the_network() -> None:

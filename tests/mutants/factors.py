@@ -225,7 +225,7 @@ MUTANTS = [
     Mutant(
         "begin: not transposed",
         "fields/decoder.py",
-        "to[o * PADDED + n]",
+        "to[o * padded + n]",
         "to[n * COLUMNS + o]",
         PLAIN,
     ),

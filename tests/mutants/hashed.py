@@ -4,19 +4,27 @@ from mutant import Mutant, of_host
 
 FILE, PACKS, DECODER = "fields/hashed.py", "fields/hashed_packs.py", "fields/decoder.py"
 HOST = "fields/hashed.py"
+KINDS = "model/storage_kinds.py"
 ORACLE = "kernels/test_hashed.py::test_against_the_oracle[kind0-0.3]"
 FLAGS = "kernels/test_hashed.py::test_flags_are_those_of_pairs"
-NODES = "kernels/test_hashed.py::test_densities_at_nodes_are_what_is_read_there[0.3]"
+NODES = "kernels/test_hashed.py::test_densities_at_nodes_are_what_is_read_there[0.3-0]"
+LAYER = "kernels/test_hashed.py::test_against_the_oracle[kind3-0.3]"
+LAYER_NODES = "kernels/test_hashed.py::test_densities_at_nodes_are_what_is_read_there[0.3-32]"
 SHAPES = "kernels/test_hashed.py::test_levels_lie_one_behind_the_other"
 ACTIVE = "kernels/test_hashed.py::test_levels_are_read_as_the_lattice_grows"
 PLAIN = "kernels/test_hashed_packed.py::test_packs_against_the_plain_form[rgb-none]"
 OTHER = "kernels/test_hashed_packed.py::test_other_entries[deferred-2]"
-INACTIVE = "kernels/test_hashed_packed.py::test_levels_that_are_not_active"
+INACTIVE = "kernels/test_hashed_packed.py::test_levels_that_are_not_active[0]"
+LAYER_PACKS = "kernels/test_hashed_packed.py::test_a_hidden_layer[deferred-16-4]"
+WIDE_LAYER = "kernels/test_hashed_packed.py::test_a_hidden_layer[deferred-48-2]"
 SEVERAL = "kernels/test_hashed_packed.py::test_one_worker_against_more"
 TILES = "kernels/test_hashed_packed.py::test_flags_cover_all_that_is_not_0"
 TRAINING = "fields/test_hashed_training.py"
 FREE = f"{TRAINING}::test_free_cells_are_those_of_less_opaque_nodes"
 EPSILON = f"{TRAINING}::test_adam_has_an_epsilon_of_its_own"
+LEARNS = f"{TRAINING}::test_a_hidden_layer_learns_and_is_kept"
+COUNTS = f"{TRAINING}::test_a_hidden_layer_counts"
+REFUSED = f"{TRAINING}::test_what_is_refused"
 
 MUTANTS = [
     # the plain form
@@ -67,15 +75,53 @@ MUTANTS = [
         "params.levels[m], position))",
         "params.levels[0], position))",
         ORACLE,
+        1,
+        2,
     ),
     Mutant(
         "adj_read: one level's rows of the decoder for all",
         FILE,
-        "row = (m * n_numbers + n) * columns",
-        "row = n * columns",
+        "row = (m * n_numbers + i) * stride",
+        "row = i * stride",
         ORACLE,
         2,
         2,
+    ),
+    Mutant("read: units below 0, too", FILE, "unit = relu(before[u])", "unit = before[u]", LAYER),
+    Mutant(
+        "adj_read: of units below 0, too",
+        FILE,
+        "wp.where(unit > real(0.0), total, real(0.0))",
+        "total",
+        LAYER,
+    ),
+    Mutant(
+        "adj_read: the decoder sees units before the ReLU",
+        FILE,
+        "unit * adj_raw[o])",
+        "before[u] * adj_raw[o])",
+        LAYER,
+    ),
+    Mutant(
+        "density_of: units below 0, too",
+        FILE,
+        "(units[u] < 0.0f ? 0.0f : units[u])",
+        "units[u]",
+        LAYER_NODES,
+    ),
+    Mutant(
+        "density_of: not the first column",
+        FILE,
+        "decoder.data[u * columns]",
+        "decoder.data[u]",
+        LAYER_NODES,
+    ),
+    Mutant(
+        "hidden node_densities: one level",
+        FILE,
+        "numbers[m * n_numbers + i]",
+        "numbers[i]",
+        LAYER_NODES,
     ),
     Mutant(
         "node_densities: slabs begin at the first row",
@@ -83,6 +129,8 @@ MUTANTS = [
         "(begin + row) // size[1]",
         "row // size[1]",
         f"{TRAINING}::test_densities_in_slabs",
+        1,
+        2,
     ),
     Mutant("node_densities: one level", FILE, "+= Density(raw)", "= Density(raw)", NODES),
     Mutant("node_densities: steps of the level", FILE, "u = real(k) * step", "u = real(k)", NODES),
@@ -217,11 +265,54 @@ MUTANTS = [
         "n < LANES; n += LANES",
         SEVERAL + "[2]",
     ),
-    Mutant("begin: not transposed", DECODER, "to[o * PADDED + n]", "to[n * DECODED + o]", PLAIN),
+    Mutant("begin: not transposed", DECODER, "to[o * padded + n]", "to[n * n_numbers + o]", PLAIN),
+    Mutant(
+        "begin: one matrix on top of the other",
+        DECODER,
+        "to += n_numbers * padded;",
+        ";",
+        LAYER_PACKS,
+    ),
+    Mutant(
+        "hidden layer: units below 0, too",
+        PACKS,
+        "before < 0.0f ? splat(0.0f) : before",
+        "before",
+        LAYER_PACKS,
+    ),
+    Mutant(
+        "hidden layer, back: of units below 0, too",
+        PACKS,
+        "at(units_of(r) + block) > 0.0f ? at(adj) : splat(0.0f)",
+        "at(adj)",
+        LAYER_PACKS,
+    ),
+    Mutant(
+        "hidden layer, back: the other matrix",
+        PACKS,
+        "transposed + HIDDEN * PADDED + block",
+        "transposed + block",
+        LAYER_PACKS,
+    ),
+    Mutant(
+        "hidden layer, back: some of the units",
+        PACKS,
+        "add_products(n_rows, HIDDEN, units_of",
+        "add_products(n_rows, LANES, units_of",
+        WIDE_LAYER,
+    ),
     Mutant(
         "add_products: more inputs than there are", DECODER, "if (n < n_here) put", "put", OTHER
     ),
     # the host
+    of_host(
+        "limits of a hidden layer", HOST, "sqrt(6.0 / n_inputs)", "sqrt(3.0 / n_inputs)", LEARNS
+    ),
+    of_host("limits of its decoder", HOST, "sqrt(3.0 / n_rows)", "sqrt(3.0 / n_inputs)", LEARNS),
+    of_host("a layer takes no time", KINDS, " + LAYER_TIME * of_layer", "", COUNTS),
+    of_host("a layer takes no memory", KINDS, " + self.levels * self.hidden", "", COUNTS),
+    of_host("any number of units", KINDS, "self.hidden % 16 or self", "self", REFUSED),
+    of_host("as many units as one likes", KINDS, " or self.hidden > MAX_WIDTH", "", REFUSED),
     of_host(
         "rows at the table's end",
         HOST,

@@ -10,7 +10,7 @@ def raw_values(
     tables: list[torch.Tensor],
     cells: list[tuple[float, float, float]],
     most: int,
-    decoder: torch.Tensor,
+    matrices: list[torch.Tensor],
     shares: torch.Tensor,
 ) -> torch.Tensor:
     """Raw values at points.
@@ -19,7 +19,8 @@ def raw_values(
         tables: [n_entries, width] of each level.
         cells: Of each level along the field's edges.
         most: Nodes of a level that has an entry for each of them; others hash (i, j).
-        decoder: [n_levels * width, n].
+        matrices: [n_levels * width, n]; with a hidden layer [n_levels * width, n_units] and
+            [n_units, n].
         shares: [n_points, 3] where points lie in the field, [0, 1].
 
     Returns:
@@ -39,7 +40,10 @@ def raw_values(
                 total = total + weight * table[entry_of(node, nodes, most)]
             points.append(total)
         levels.append(torch.stack(points))
-    return torch.cat(levels, dim=1) @ decoder
+    numbers = torch.cat(levels, dim=1)
+    for hidden in matrices[:-1]:
+        numbers = (numbers @ hidden).clamp(min=0.0)
+    return numbers @ matrices[-1]
 
 
 def entry_of(node: list[int], nodes: list[int], most: int) -> int:

@@ -46,13 +46,15 @@ class TrainOptions:
     output: Path | None = None
     """Folder for the configuration, the field, the log, the figures and the pictures."""
     preset: (
-        Literal["fast", "quality", "dvgo", "dvgo-unbounded", "dvgo-llff", "tensorf", "mip360"]
+        Literal[
+            "fast", "quality", "dvgo", "dvgo-unbounded", "dvgo-llff", "tensorf", "ngp", "mip360"
+        ]
         | None
     ) = None
     """Starting point, by default fast, which takes a minute or three on two cores; quality takes a
     quarter of an hour; dvgo, dvgo-unbounded and dvgo-llff are the published hyperparameters of
-    DirectVoxGO, tensorf those of TensoRF, and take hours; mip360 samples and contracts as Mip-NeRF
-    360 does. Other options replace its values."""
+    DirectVoxGO, tensorf those of TensoRF, ngp those of Instant-NGP, and take hours; mip360 samples
+    and contracts as Mip-NeRF 360 does. Other options replace its values."""
     config: Path | None = None
     """Starting point instead of a preset: the config.json of a run, which is repeated, with its
     scene, downscale and masks, but for what other options replace."""

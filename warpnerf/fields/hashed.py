@@ -1,4 +1,4 @@
-"""A hash: tables of entries by level of resolution, and their decoder."""
+"""A hash: tables of entries by level of resolution, and what decodes them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import warp as wp
 from warpnerf_kernels.base.parts import Encoding
 from warpnerf_kernels.base.types import real, vector
 from warpnerf_kernels.fields import hashed
-from warpnerf_kernels.fields.decoder import columns_of
+from warpnerf_kernels.fields.decoder import columns_of, padded
 from warpnerf_kernels.optim import adam
 
 from warpnerf.fields.decoded import Decoded
@@ -72,27 +72,32 @@ def level_shapes(kind: Hash, lattice: Lattice) -> list[LevelShape]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Hashed(Decoded):
-    """Tables of entries, and the matrix that decodes them; see fields.hashed of the kernels."""
+    """Tables of entries, and what decodes them; see fields.hashed of the kernels."""
 
     kind: Hash
     values: wp.array
     """[n_entries] vectors, level by level."""
+    hidden: wp.array
+    """[n_inputs * units] the hidden layer's matrix row by row; none without one."""
 
     @classmethod
     def first(
         cls, kind: StorageKind, model: Model, lattice: Lattice, seed: int, device: wp.Device
     ) -> Hashed:
-        """Entries of next to nothing, and a random matrix."""
+        """Entries of next to nothing, and random matrices that keep the size of what they see."""
         assert isinstance(kind, Hash)
         rng, n_inputs = np.random.default_rng(seed), kind.levels * kind.features
         n_entries = level_shapes(kind, lattice)[-1].end
-        limit = math.sqrt(3.0 / n_inputs)
-        decoder = np.zeros((n_inputs, columns_of(model.n_floats)), np.float32)
-        decoder[:, : 1 + model.n_features] = rng.uniform(
-            -limit, limit, (n_inputs, 1 + model.n_features)
-        )
+        n_rows, n_decoded = kind.hidden or n_inputs, 1 + model.n_features
+        limit = math.sqrt(3.0 / n_rows)
+        decoder = np.zeros((n_rows, columns_of(model.n_floats)), np.float32)
+        decoder[:, :n_decoded] = rng.uniform(-limit, limit, (n_rows, n_decoded))
         values = rng.uniform(-LIMIT, LIMIT, (n_entries, kind.features)).astype(np.float32)
         tensors = {"values": values, "decoder": decoder}
+        if kind.hidden:
+            limit = math.sqrt(6.0 / n_inputs)  # half of the units are 0
+            hidden = rng.uniform(-limit, limit, (n_inputs, kind.hidden))
+            tensors["hidden"] = hidden.astype(np.float32)
         return cls.from_tensors(kind, model, lattice, tensors, device)
 
     @classmethod
@@ -104,15 +109,19 @@ class Hashed(Decoded):
         tensors: dict[str, np.ndarray],
         device: wp.Device,
     ) -> Hashed:
-        """From [n_entries, features] values and the decoder."""
+        """From [n_entries, features] values, the hidden layer if there is one, and the decoder."""
         assert isinstance(kind, Hash)
+        n_inputs = kind.levels * kind.features
         shapes = {
             "values": (level_shapes(kind, lattice)[-1].end, kind.features),
-            "decoder": (kind.levels * kind.features, columns_of(model.n_floats)),
+            "decoder": (kind.hidden or n_inputs, columns_of(model.n_floats)),
         }
+        if kind.hidden:
+            shapes["hidden"] = (n_inputs, kind.hidden)
         require_shapes(tensors, shapes)
         values = allocate_nodes(shapes["values"][0], vector(kind.features), device)
         values.assign(tensors["values"])
+        hidden = tensors.get("hidden", np.zeros(0, np.float32))
         return cls(
             kind=kind,
             lattice=lattice,
@@ -120,30 +129,38 @@ class Hashed(Decoded):
             n_decoded=1 + model.n_features,
             by_sample=model.by_sample,
             values=values,
+            hidden=wp.array(hidden.ravel(), dtype=real, device=device),
             decoder=wp.array(tensors["decoder"].ravel(), dtype=real, device=device),
         )
 
     def tensors(self) -> dict[str, np.ndarray]:
-        """Entries, and the decoder row by row."""
-        n_inputs = self.kind.levels * self.kind.features
-        return {
-            "values": self.values.numpy(),
-            "decoder": self.decoder.numpy().reshape(n_inputs, -1),
-        }
+        """Entries, and matrices row by row."""
+        units = self.kind.hidden
+        hidden = {"hidden": self.hidden.numpy().reshape(-1, units)} if units else {}
+        decoder = self.decoder.numpy().reshape(-1, self.n_columns)
+        return {"values": self.values.numpy(), **hidden, "decoder": decoder}
 
     def copied_to(self, device: wp.Device) -> Hashed:
         """The same with arrays of its own."""
         values = allocate_nodes(self.values.shape[0], self.values.dtype, device)
         wp.copy(values, self.values)
-        return replace(self, values=values, decoder=wp.clone(self.decoder, device=device))
+        hidden, decoder = (wp.clone(m, device=device) for m in (self.hidden, self.decoder))
+        return replace(self, values=values, hidden=hidden, decoder=decoder)
 
     @property
     def encoding(self) -> Encoding:
         """Entries of all levels, decoded."""
         kind = self.kind
         return hashed.hashed(
-            *(kind.features, kind.levels, self.n_floats, self.n_decoded, self.by_sample)
+            *(kind.features, kind.levels, self.n_floats, self.n_decoded, self.by_sample),
+            kind.hidden,
         )
+
+    @property
+    def n_transposed(self) -> int:
+        """Numbers of the transposes of all matrices."""
+        kind = self.kind
+        return super().n_transposed + kind.hidden * padded(kind.levels * kind.features)
 
     @property
     def n_active(self) -> int:
@@ -163,7 +180,7 @@ class Hashed(Decoded):
         levels = [self._level(load, shape) for shape in level_shapes(self.kind, self.lattice)]
         struct.levels = wp.array(levels, dtype=module.Level, device=self.decoder.device)
         struct.n_active, struct.width = self.n_active, self.kind.features
-        struct.n_decoded = self.n_decoded
+        struct.n_units, struct.n_decoded = self.kind.hidden, self.n_decoded
         return struct
 
     def _level(self, load: Load, shape: LevelShape) -> Any:
@@ -175,12 +192,17 @@ class Hashed(Decoded):
         level.mask = self.kind.table - ROW_ALIGNED if shape.is_hashed else 0
         return level
 
+    @staticmethod
+    def densities_kernel(kind: Hash) -> wp.Kernel:
+        """That of its densities at nodes."""
+        return hashed.node_densities_kernel(kind.features, kind.levels, kind.hidden)
+
     def densities_of_planes(self, workers: Workers, first: int, n: int) -> wp.array:
         """Those that are read there."""
         lattice, (_, y, z) = self.lattice, self.lattice.size
         values = allocate_nodes(n * y * z, vector(1), workers.device)
         workers.launch(
-            hashed.node_densities_kernel(self.kind.features),
+            self.densities_kernel(self.kind),
             n * y,
             *(self.struct, self.n_columns, wp.vec3i(*lattice.size), 1.0 + lattice.border),
             *(first * y, values),
@@ -194,13 +216,14 @@ class Hashed(Decoded):
         assert isinstance(kind, Hash)
         return [
             *super().kernels(kind, model),
-            hashed.node_densities_kernel(kind.features),
+            cls.densities_kernel(kind),
             adam.adam_kernel(kind.features),
         ]
 
     def parameters(self, model: Model, optim: OptimConfig) -> tuple[Parameter, ...]:
-        """Entries: Adam where rays have been; the decoder, which all rays share."""
+        """Entries: Adam where rays have been; matrices, which all rays share."""
         kind = self.kind
+        matrices = {"hidden": self.hidden} if kind.hidden else {}
         return (
             Parameter(
                 name="values",
@@ -210,21 +233,25 @@ class Hashed(Decoded):
                 gradient=("values", "touched"),
                 epsilon=kind.epsilon,
             ),
-            Parameter(
-                name="decoder",
-                values=self.decoder,
-                rule=kind.rules["decoder"],
-                learning_rates=np.array([kind.learning_rate_decoder]),
-                gradient=("decoder",),
-                epsilon=kind.epsilon,
+            *(
+                Parameter(
+                    name=name,
+                    values=matrix,
+                    rule=kind.rules[name],
+                    learning_rates=np.array([kind.learning_rate_decoder]),
+                    gradient=(name,),
+                    epsilon=kind.epsilon,
+                )
+                for name, matrix in (matrices | {"decoder": self.decoder}).items()
             ),
         )
 
     def gradients(self, model: Model, workers: Workers) -> Gradients:
-        """As large as its entries, with flags of tiles that hold any; of the decoder, copies."""
+        """As large as its entries, with flags of tiles that hold any; of matrices, copies."""
         return Gradients.of(
             self.encoding.Gradient,
             zero_entries(self.values.shape[0], self.values.dtype, workers, large_pages=True)
+            | {"hidden": zero_weights(self.hidden.size, workers)}
             | {"decoder": zero_weights(self.decoder.size, workers)}
             | zero_head_weights(model, workers),
         )

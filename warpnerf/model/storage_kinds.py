@@ -29,6 +29,11 @@ LOOK_BYTES = 3
 """Memory of a look for free space, for each node, where nodes are not stored."""
 MAX_WIDTH = 128
 """Numbers of an entry of planes, or of all levels of a hash together, at most."""
+LAYER_TIME = 4e-4
+"""Training time of a multiplication of a hidden layer, which each sample goes through, over that of
+a sample of dense."""
+COLUMNS = 16
+"""Of a decoder, at least."""
 MAX_CELLS = 1 << 15
 """Of a level of a hash along an edge: positions in it are float32."""
 MAX_TABLE = 1 << 24
@@ -211,10 +216,13 @@ class Hash(StorageKind):
     table: int = 1 << 17
     """Entries of a level, at most, a power of two; where a level has more nodes, nodes share
     them."""
+    hidden: int = 0
+    """Units of a hidden layer with ReLU before the decoder, as Instant-NGP's density network has: a
+    multiple of 16 up to 128. 0: the decoder sees entries themselves."""
     learning_rate: float = 0.1
     """Adam's learning rate of entries, at the start."""
     learning_rate_decoder: float = 0.01
-    """Adam's learning rate of the decoder matrix, at the start."""
+    """Adam's learning rate of the matrices behind entries, at the start."""
     epsilon: float = 1e-12
     """Adam's, in place of ``OptimConfig.epsilon``: entries of fine levels get small gradients."""
 
@@ -238,6 +246,12 @@ class Hash(StorageKind):
             raise InputError(
                 f"field.table must be a power of two, up to {MAX_TABLE}, not {self.table}."
             )
+        require_whole("field.hidden", self.hidden, 0)
+        if self.hidden % 16 or self.hidden > MAX_WIDTH:
+            raise InputError(
+                f"field.hidden must be a multiple of 16 up to {MAX_WIDTH}, or 0 for no hidden "
+                f"layer, not {self.hidden}: units are worked on sixteen at a time."
+            )
         require_positive("field.learning_rate", self.learning_rate)
         require_positive("field.learning_rate_decoder", self.learning_rate_decoder)
         require_positive("field.epsilon", self.epsilon)
@@ -252,26 +266,31 @@ class Hash(StorageKind):
 
     @property
     def relative_time(self) -> float:
-        """Training time relative to a dense grid, by benchmarks/factors.py."""
-        return 0.6 + 0.4 * self.levels
+        """Training time relative to a dense grid, by benchmarks/factors.py; and that of a hidden
+        layer, for each sample."""
+        of_layer = self.hidden * (self.levels * self.features + COLUMNS)
+        return 0.6 + 0.4 * self.levels + LAYER_TIME * of_layer
 
     @property
     def rules(self) -> Mapping[str, str]:
-        """The tensors that are stored: hash table entries, decoder."""
-        return {"values": "nodes", "decoder": "weights"}
+        """The tensors that are stored: hash table entries, hidden layer, decoder."""
+        hidden = {"hidden": "weights"} if self.hidden else {}
+        return {"values": "nodes", **hidden, "decoder": "weights"}
 
     def encoding(self, load: Load, model: Model) -> Any:
         """The kernels' encoding: hash table entries of all levels, decoded to the model's
         numbers."""
         return load("fields.hashed").hashed(
-            *(self.features, self.levels, model.n_floats, 1 + model.n_features, model.by_sample)
+            *(self.features, self.levels, model.n_floats, 1 + model.n_features, model.by_sample),
+            self.hidden,
         )
 
     def training_bytes(self, model: Model, size: tuple[int, int, int]) -> int:
-        """Training memory in bytes: of each entry, as in a cube; and of a look for free space,
-        which is for all nodes."""
+        """Training memory in bytes: of each entry, as in a cube; of a hidden layer; and of a look
+        for free space, which is for all nodes."""
         entries = sum(min(self.table, (n + 1) ** 3) + n for n in self.resolutions)
-        return entries * self.features * NUMBER_BYTES + math.prod(size) * LOOK_BYTES
+        numbers = self.features * (entries + self.levels * self.hidden)
+        return numbers * NUMBER_BYTES + math.prod(size) * LOOK_BYTES
 
     def in_words(self, model: Model, size: tuple[int, int, int]) -> str:
         """A description in words: hash grid levels, and what an entry has."""

@@ -4,7 +4,7 @@
 
 Numbers of a row fill the vectors, and rows, which are samples, go through side by side. Encodings
 say before these words what FLOATS, the numbers of a sample, DECODED, those that are not padding,
-COLUMNS, INPUTS and PADDED, these in whole vectors, are.
+COLUMNS and INPUTS are.
 """
 
 from functools import cache
@@ -64,16 +64,19 @@ auto multiply = [&](int n_rows, int n_inputs, auto&& x_of, const float* matrix, 
     for (; r + 4 < n_rows; r += Many::value) some(Many(), r);
     if (r < n_rows) some(Few(), r);
 };
-// to += x^T adj, the gradient of a decoder of so many inputs. Of x whole eights are read.
-auto add_products = [&](int n_rows, int n_inputs, auto&& x_of, auto&& adj_of, float* to) {
-    for (int block = 0; block < COLUMNS; block += LANES) {
+struct Columns { enum { value = COLUMNS }; };
+// to += x^T adj, the gradient of a matrix of so many rows. Of x whole eights are read.
+auto add_products = [&](int n_rows, int n_inputs, auto&& x_of, auto&& adj_of, float* to,
+                        auto columns_of) {
+    constexpr int columns = decltype(columns_of)::value;
+    for (int block = 0; block < columns; block += LANES) {
         for (int begin = 0; begin < n_inputs; begin += 8) {
-            float* sums_at = to + (size_t)begin * COLUMNS + block;
+            float* sums_at = to + (size_t)begin * columns + block;
             const int n_here = min(8, n_inputs - begin);
             vec sums[8];
             #pragma clang loop unroll(full)
             for (int n = 0; n < 8; ++n) {
-                sums[n] = n < n_here ? at(sums_at + n * COLUMNS) : splat(0.0f);
+                sums[n] = n < n_here ? at(sums_at + n * columns) : splat(0.0f);
             }
             for (int r = 0; r < n_rows; ++r) {
                 const float* x = x_of(r) + begin;
@@ -83,7 +86,7 @@ auto add_products = [&](int n_rows, int n_inputs, auto&& x_of, auto&& adj_of, fl
             }
             #pragma clang loop unroll(full)
             for (int n = 0; n < 8; ++n) {
-                if (n < n_here) put(sums_at + n * COLUMNS, sums[n]);
+                if (n < n_here) put(sums_at + n * columns, sums[n]);
             }
         }
     }
@@ -137,13 +140,21 @@ BEGIN = (
     VECTORS
     + r"""
 float* to = params.transposed.data + (size_t)worker * params.transposed.shape[1];
-for (int n = 0; n < PADDED; ++n) {
-    for (int o = 0; o < DECODED; ++o) {
-        to[o * PADDED + n] = n < INPUTS ? params.decoder.data[n * COLUMNS + o] : 0.0f;
+// The next transpose: of a matrix of so many rows, the first numbers of each, in whole vectors.
+auto transpose = [&](const float* matrix, int n_rows, int columns, int n_numbers) {
+    const int padded = (n_rows + LANES - 1) / LANES * LANES;
+    for (int n = 0; n < padded; ++n) {
+        for (int o = 0; o < n_numbers; ++o) {
+            to[o * padded + n] = n < n_rows ? matrix[n * columns + o] : 0.0f;
+        }
     }
-}
+    to += n_numbers * padded;
+};
 """
 )
+"""What laying out matrices again begins with."""
+
+TRANSPOSE_DECODER = "transpose(params.decoder.data, INPUTS, COLUMNS, DECODED);"
 
 
 class VectorCode(NamedTuple):
@@ -152,6 +163,7 @@ class VectorCode(NamedTuple):
     read_pack: str
     adj_read_pack: str
     add_records: str
+    begin: str = TRANSPOSE_DECODER
 
 
 @cache
@@ -220,9 +232,9 @@ def decoded_vectors(
         """Add what a sender has left for a worker."""
         ...
 
-    @wp.func_native(words + BEGIN)
+    @wp.func_native(words + BEGIN + code.begin)
     def begin(params: Any, worker: int):
-        """Transpose the decoder, for adj_read_pack."""
+        """Transpose what adj_read_pack needs so."""
         ...
 
     @wp.func

@@ -143,7 +143,7 @@ auto add_plane = [&](const Places& places, int plane, unsigned lower, unsigned u
     }
     add_products(n_rows, WIDTH, [&](int r) { return products[r]; },
                  [&](int r) { return adj_of[r]; },
-                 decoder_gradient + (size_t)plane * WIDTH * COLUMNS);
+                 decoder_gradient + (size_t)plane * WIDTH * COLUMNS, Columns());
 };
 """
 )
@@ -244,7 +244,7 @@ def vectors_of(
     """The vector form of ``factors.factors``, which says what the arguments are."""
     words = (
         f"constexpr int WIDTH = {width}, FLOATS = {n_floats}, DECODED = {n_decoded}, "
-        f"COLUMNS = {columns}, INPUTS = {3 * width}, PADDED = INPUTS;\n"
+        f"COLUMNS = {columns}, INPUTS = {3 * width};\n"
     )
     code = VectorCode(READ_PACK, ADJ_READ_PACK, ADD_RECORDS)
     return decoded_vectors(words, code, record_type("adj_raw", columns), n_floats, by_sample)

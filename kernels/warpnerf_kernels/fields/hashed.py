@@ -1,16 +1,17 @@
 """A hash: tables of entries by level of resolution, whose numbers a matrix decodes together.
 
-    raw(c) = M^T [E_1(c), E_2(c), ..]
+    raw(c) = M^T [E_1(c), E_2(c), ..]                      or, with a hidden layer,
+    raw(c) = M^T relu(H^T [E_1(c), E_2(c), ..])
 
 Level l is a lattice of cubes over the field, finer from level to level, and E_l(c) the trilinear
 mean of the eight entries around c. Where a level has more nodes than its table may have entries,
 rows of nodes along z are hashed as wholes: a row begins where its i and j say, and its k runs on
 from there. So the two nodes of a row around a sample lie side by side, as they do in a dense grid,
 and in place of eight reads of an entry there are four of a pair. Rows share entries, shifted
-against each other, and training finds out who needs them. The decoder M, [levels width, columns],
-is learned.
+against each other, and training finds out who needs them. The decoder M, [levels width, columns] or
+[units, columns], and H, [levels width, units], are learned; neither layer has biases.
 
-Source: Mueller et al. 2022 (SIGGRAPH), Instant-NGP, which hashes i, j and k, and decodes by an MLP.
+Source: Mueller et al. 2022 (SIGGRAPH), Instant-NGP, which hashes i, j and k, and has 64 units.
 """
 
 from functools import cache
@@ -21,7 +22,7 @@ import warp as wp
 from ..base.parts import Encoding
 from ..base.tiles import tile_of
 from ..base.types import real, vec3, vector
-from ..networks.mlp import add_weight
+from ..networks.mlp import add_weight, relu
 from .decoder import columns_of, density_column
 from .hashed_packs import PRIME_X, PRIME_Y, vectors_of
 from .interp import lowest_node
@@ -48,11 +49,13 @@ def hash_type(width: int) -> type:
     @wp.struct
     class Hash:
         values: wp.array(dtype=Entry)  # [n_entries] level by level, rows along z
-        decoder: wp.array(dtype=real)  # [n_levels width columns] row by row
+        hidden: wp.array(dtype=real)  # [n_levels width n_units] row by row; none without a layer
+        decoder: wp.array(dtype=real)  # [n columns] row by row; n units, or numbers of all levels
         transposed: wp.array2d(dtype=real)  # [n_workers, n] scratch of the vector form
         levels: wp.array(dtype=Level)  # [n_levels] coarsest first
         n_active: int  # levels that are read; finer ones are not, and count as 0
         width: int  # of an entry
+        n_units: int  # of the hidden layer
         n_decoded: int  # numbers of raw that are decoded; the others are padding
 
     return Hash
@@ -68,9 +71,8 @@ def gradient_type(width: int) -> type:
         touched: wp.array(
             dtype=wp.uint8
         )  # [n_tiles] 1 where a pair of entries begins that got some
-        decoder: wp.array2d(
-            dtype=real
-        )  # [n_workers, n_levels width columns] a copy for each worker
+        hidden: wp.array2d(dtype=real)  # [n_workers, n_levels width n_units] each worker's own
+        decoder: wp.array2d(dtype=real)  # [n_workers, n columns] likewise
         weights: wp.array2d(dtype=real)  # [n_workers, n_weights] likewise
 
     return Gradient
@@ -148,6 +150,49 @@ def adj_in_level(at: Corner, adj: Any, gradient: Any):
         wp.atomic_add(gradient.values, n + 1, up * share)
 
 
+# Loops run to a number that compilers do not know, as in networks.mlp.
+
+
+@wp.func
+def times(params: Any, matrix: wp.array(dtype=real), stride: int, n: int, position: vec3, out: Any):
+    """out + matrix^T [E_1, E_2, ..], the first n numbers, with the E_l around a position."""
+    n_numbers = params.width
+    for m in range(params.n_active):
+        around = in_level(params, corner_of(params.levels[m], position))
+        for i in range(n_numbers):
+            row = (m * n_numbers + i) * stride
+            for o in range(n):
+                out[o] += around[i] * matrix[row + o]
+    return out
+
+
+@wp.func
+def adj_times(
+    params: Any,
+    matrix: wp.array(dtype=real),
+    stride: int,
+    n: int,
+    position: vec3,
+    adj_out: Any,
+    gradient: Any,
+    adj_matrix: wp.array2d(dtype=real),  # of gradient; added to
+):
+    """Transpose of times."""
+    n_numbers = params.width
+    for m in range(params.n_active):
+        at = corner_of(params.levels[m], position)
+        around = in_level(params, at)
+        adj = around * real(0.0)
+        for i in range(n_numbers):
+            row = (m * n_numbers + i) * stride
+            total = real(0.0)
+            for o in range(n):
+                total += adj_out[o] * matrix[row + o]
+                add_weight(adj_matrix, row + o, around[i] * adj_out[o])
+            adj[i] = total
+        adj_in_level(at, adj, gradient)
+
+
 @wp.func
 def place(params: Any, position: vec3) -> vec3:
     """Where a position lies in the field, [0, 1]^3."""
@@ -158,7 +203,12 @@ def place(params: Any, position: vec3) -> vec3:
 
 @cache
 def hashed(
-    width: int, n_levels: int, n_floats: int, n_decoded: int, by_sample: bool = False
+    width: int,
+    n_levels: int,
+    n_floats: int,
+    n_decoded: int,
+    by_sample: bool = False,
+    hidden: int = 0,
 ) -> Encoding:
     """The encoding whose entries hold so many numbers.
 
@@ -168,47 +218,13 @@ def hashed(
         n_floats: Of a sample: 4, 8, 16, 32 or 64.
         n_decoded: How many of these are not padding.
         by_sample: Whether packs hold values after the first four sample by sample.
+        hidden: Units of the hidden layer, a multiple of 16; 0: there is none.
     """
-    Hash, Gradient, Raw, Entry = (
-        hash_type(width),
-        gradient_type(width),
-        vector(n_floats),
-        vector(width),
-    )
+    Hash, Gradient, Raw = hash_type(width), gradient_type(width), vector(n_floats)
     columns = columns_of(n_floats)
-
-    # Loops run to a number that compilers do not know, as in networks.mlp.
-
-    @wp.func
-    def read(params: Hash, position: vec3) -> Raw:
-        """Raw values at a position."""
-        n_numbers, n_decoded = params.width, params.n_decoded
-        raw = Raw()
-        for m in range(params.n_active):
-            around = in_level(params, corner_of(params.levels[m], position))
-            for n in range(n_numbers):
-                row = (m * n_numbers + n) * columns
-                for o in range(n_decoded):
-                    raw[o] += around[n] * params.decoder[row + o]
-        return raw
-
-    @wp.func
-    def adj_read(params: Hash, position: vec3, adj_raw: Raw, gradient: Gradient):
-        """Transpose of read."""
-        n_numbers, n_decoded = params.width, params.n_decoded
-        for m in range(params.n_active):
-            at = corner_of(params.levels[m], position)
-            around = in_level(params, at)
-            adj = Entry()
-            for n in range(n_numbers):
-                row = (m * n_numbers + n) * columns
-                total = real(0.0)
-                for o in range(n_decoded):
-                    total += adj_raw[o] * params.decoder[row + o]
-                    add_weight(gradient.decoder, row + o, around[n] * adj_raw[o])
-                adj[n] = total
-            adj_in_level(at, adj, gradient)
-
+    read, adj_read = decoded(Hash, Gradient, Raw, columns)
+    if hidden:
+        read, adj_read = decoded_twice(Hash, Gradient, Raw, columns, hidden)
     return Encoding(
         n_floats=n_floats,
         Params=Hash,
@@ -216,13 +232,67 @@ def hashed(
         read=read,
         adj_read=adj_read,
         place=place,
-        vectors=vectors_of(width, n_levels, n_floats, n_decoded, columns, by_sample),
+        vectors=vectors_of(width, n_levels, n_floats, n_decoded, columns, by_sample, hidden),
     )
 
 
+def decoded(Hash: type, Gradient: type, Raw: type, columns: int) -> tuple[wp.Function, wp.Function]:
+    """read, by the decoder alone, and adj_read."""
+
+    @wp.func
+    def read(params: Hash, position: vec3) -> Raw:
+        """Raw values at a position."""
+        return times(params, params.decoder, columns, params.n_decoded, position, Raw())
+
+    @wp.func
+    def adj_read(params: Hash, position: vec3, adj_raw: Raw, gradient: Gradient):
+        """Transpose of read."""
+        n = params.n_decoded
+        adj_times(params, params.decoder, columns, n, position, adj_raw, gradient, gradient.decoder)
+
+    return read, adj_read
+
+
+def decoded_twice(
+    Hash: type, Gradient: type, Raw: type, columns: int, hidden: int
+) -> tuple[wp.Function, wp.Function]:
+    """The same with a hidden layer."""
+    Units = vector(hidden)
+
+    @wp.func
+    def read(params: Hash, position: vec3) -> Raw:
+        """Raw values at a position."""
+        n_units, n_decoded = params.n_units, params.n_decoded
+        before = times(params, params.hidden, hidden, n_units, position, Units())
+        raw = Raw()
+        for u in range(n_units):
+            unit = relu(before[u])
+            for o in range(n_decoded):
+                raw[o] += unit * params.decoder[u * columns + o]
+        return raw
+
+    @wp.func
+    def adj_read(params: Hash, position: vec3, adj_raw: Raw, gradient: Gradient):
+        """Transpose of read's slope."""
+        n_units, n_decoded = params.n_units, params.n_decoded
+        before = times(params, params.hidden, hidden, n_units, position, Units())
+        adj = Units()
+        for u in range(n_units):
+            unit, total = relu(before[u]), real(0.0)
+            for o in range(n_decoded):
+                total += adj_raw[o] * params.decoder[u * columns + o]
+                add_weight(gradient.decoder, u * columns + o, unit * adj_raw[o])
+            adj[u] = wp.where(unit > real(0.0), total, real(0.0))
+        adj_times(params, params.hidden, hidden, n_units, position, adj, gradient, gradient.hidden)
+
+    return read, adj_read
+
+
 @cache
-def node_densities_kernel(width: int) -> wp.Kernel:
+def node_densities_kernel(width: int, n_levels: int, hidden: int) -> wp.Kernel:
     """Raw densities at nodes of the lattice of the field."""
+    if hidden:
+        return hidden_densities_kernel(width, n_levels, hidden)
     Hash, Density, column = hash_type(width), vector(1), density_column(width)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -261,5 +331,69 @@ def node_densities_kernel(width: int) -> wp.Kernel:
                     pair = (real(1.0) - up) * params.values[n] + up * params.values[n + 1]
                     raw += share_of(at.fraction, side) * wp.dot(pair, decoder)
                 out[row * size[2] + k] += Density(raw)
+
+    return node_densities
+
+
+DENSITY_OF = r"""
+float units[HIDDEN] = {};
+for (int i = 0; i < n_inputs; ++i) {
+    const float* row = hidden.data + i * HIDDEN;
+    for (int u = 0; u < HIDDEN; ++u) units[u] += x.c[i] * row[u];
+}
+float raw = 0.0f;
+for (int u = 0; u < HIDDEN; ++u) {
+    raw += (units[u] < 0.0f ? 0.0f : units[u]) * decoder.data[u * columns];
+}
+return raw;
+"""
+
+
+@cache
+def hidden_densities_kernel(width: int, n_levels: int, hidden: int) -> wp.Kernel:
+    """The same where there is a hidden layer, through which each node goes by itself."""
+    Hash, Density = hash_type(width), vector(1)
+    Numbers = vector(n_levels * width)
+
+    @wp.func_native(f"constexpr int HIDDEN = {hidden};\n" + DENSITY_OF)
+    def density_of(
+        x: Numbers,
+        n_inputs: int,  # how many of these there are
+        hidden: wp.array(dtype=real),
+        decoder: wp.array(dtype=real),
+        columns: int,  # of the decoder
+    ) -> wp.float32:
+        """The raw density, in C++: compilers know the number of units, and compute some at once."""
+        ...
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def node_densities(
+        # launch
+        first: int,
+        # scene
+        params: Hash,
+        # choices
+        columns: int,  # of the decoder
+        size: wp.vec3i,  # X, Y, Z of the field's lattice
+        reach: real,  # contracted coordinates lie in [-reach, reach]
+        begin: int,  # row of nodes along z that is the first of out
+        # out
+        out: wp.array(dtype=Density),  # [n_rows * Z]
+    ):
+        """Raw densities at the nodes of a row along z: fields.hashed.read there."""
+        row, n_numbers = first + wp.tid(), params.width
+        x = real((begin + row) // size[1]) / real(size[0] - 1)
+        y = real((begin + row) % size[1]) / real(size[1] - 1)
+        numbers = Numbers()
+        for k in range(size[2]):
+            share = vec3(x, y, real(k) / real(size[2] - 1))
+            position = reach * (real(2.0) * share - vec3(real(1.0)))
+            for m in range(params.n_active):
+                around = in_level(params, corner_of(params.levels[m], position))
+                for i in range(n_numbers):
+                    numbers[m * n_numbers + i] = around[i]
+            n = params.n_active * n_numbers
+            raw = density_of(numbers, n, params.hidden, params.decoder, columns)
+            out[row * size[2] + k] = Density(raw)
 
     return node_densities

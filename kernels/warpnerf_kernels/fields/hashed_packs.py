@@ -1,20 +1,29 @@
 """The vector form of a hash: what sixteen samples read, and how their gradients are scattered.
 
 Places in a level are computed for sixteen samples at once, entries are read sample by sample,
-level by level, and samples go through the decoder side by side.
+level by level, and samples go through the matrices side by side. Units of a hidden layer stay in
+the pack between the passes.
 
 Workers own levels, in turns there and back, as fine ones take longer; where there are more workers
 than levels, equal parts of one. What a pack has for levels of others goes into a record of places
-and of what flows back to each entry's numbers. Gradients of the decoder go to a worker's own copy.
+and of what flows back to each entry's numbers. Gradients of matrices go to a worker's own copies.
 """
 
 from functools import cache
+from typing import NamedTuple
 
 import warp as wp
 
 from ..base.parts import EncodingVectors
 from ..base.simd import LANES
-from .decoder import DECODER, VectorCode, decoded_vectors, padded, record_type
+from .decoder import (
+    DECODER,
+    TRANSPOSE_DECODER,
+    VectorCode,
+    decoded_vectors,
+    padded,
+    record_type,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -196,9 +205,10 @@ const int n_inputs = n_active * WIDTH;
 for (int r = 0; r < n_rows; ++r) {
     for (int n = n_inputs; n < PADDED; ++n) features_of(r)[n] = 0.0f;
 }
+OF_LAYER
 float raw[LANES][COLUMNS];
 for (int block = 0; block < COLUMNS; block += LANES) {
-    multiply(n_rows, n_inputs, features_of, params.decoder.data + block, COLUMNS,
+    multiply(n_rows, n_decoder_inputs, decoder_inputs_of, params.decoder.data + block, COLUMNS,
              [&](int r) { return raw[r] + block; });
 }
 put_raw(pack, n_rows, lane_of, raw);
@@ -216,11 +226,13 @@ float adj_raw[LANES][COLUMNS], adj_features[LANES][PADDED];
 take_adj_raw(pack, adj_raw);
 auto adj_raw_of = [&](int r) { return adj_raw[lane_of[r]]; };
 auto features_of = [&](int r) { return (const float*)&pack.features.data[lane_of[r]]; };
-add_products(n_rows, n_inputs, features_of, adj_raw_of,
-             sink.gradient.decoder.data + (size_t)worker * sink.gradient.decoder.shape[1]);
+float* decoder_gradient =
+    sink.gradient.decoder.data + (size_t)worker * sink.gradient.decoder.shape[1];
 const float* transposed = params.transposed.data + (size_t)worker * params.transposed.shape[1];
+OF_LAYER
+add_products(n_rows, n_inputs, features_of, adj_of, matrix_gradient, MatrixColumns());
 for (int block = 0; block < n_inputs; block += LANES) {
-    multiply(n_rows, DECODED, adj_raw_of, transposed + block, PADDED,
+    multiply(n_rows, N_NUMBERS, adj_of, transposed + block, PADDED,
              [&](int r) { return adj_features[r] + block; });
 }
 Corners corners[2];
@@ -277,18 +289,95 @@ for (int level = own_after(-1); n && level < n_active; level = own_after(level))
 )
 
 
+class Layer(NamedTuple):
+    """What stands between features and decoder, in C++."""
+
+    forward: str
+    adjoint: str
+    begin: str
+
+
+NO_LAYER = Layer(
+    r"""
+const auto& decoder_inputs_of = features_of;
+const int n_decoder_inputs = n_inputs;
+""",
+    r"""
+const auto& adj_of = adj_raw_of;
+float* matrix_gradient = decoder_gradient;
+constexpr int N_NUMBERS = DECODED;
+using MatrixColumns = Columns;
+""",
+    TRANSPOSE_DECODER,
+)
+"""The decoder sees features."""
+
+HIDDEN_LAYER = Layer(
+    r"""
+float units[LANES][HIDDEN];
+for (int block = 0; block < HIDDEN; block += LANES) {
+    multiply(n_rows, n_inputs, features_of, params.hidden.data + block, HIDDEN,
+             [&](int r) { return units[r] + block; });
+}
+auto decoder_inputs_of = [&](int r) -> float* { return (float*)&pack.units.data[lane_of[r]]; };
+constexpr int n_decoder_inputs = HIDDEN;
+for (int r = 0; r < n_rows; ++r) {
+    for (int n = 0; n < HIDDEN; n += LANES) {
+        const vec before = at(units[r] + n);
+        put(decoder_inputs_of(r) + n, before < 0.0f ? splat(0.0f) : before);
+    }
+}
+""",
+    r"""
+auto units_of = [&](int r) { return (const float*)&pack.units.data[lane_of[r]]; };
+add_products(n_rows, HIDDEN, units_of, adj_raw_of, decoder_gradient, Columns());
+float adj_units[LANES][HIDDEN];
+for (int block = 0; block < HIDDEN; block += LANES) {
+    multiply(n_rows, DECODED, adj_raw_of, transposed + HIDDEN * PADDED + block, HIDDEN,
+             [&](int r) { return adj_units[r] + block; });
+    for (int r = 0; r < n_rows; ++r) {
+        float* adj = adj_units[r] + block;
+        put(adj, at(units_of(r) + block) > 0.0f ? at(adj) : splat(0.0f));
+    }
+}
+auto adj_of = [&](int r) { return adj_units[r]; };
+float* matrix_gradient =
+    sink.gradient.hidden.data + (size_t)worker * sink.gradient.hidden.shape[1];
+constexpr int N_NUMBERS = HIDDEN;
+struct MatrixColumns { enum { value = HIDDEN }; };
+""",
+    "transpose(params.hidden.data, INPUTS, HIDDEN, HIDDEN);\n"
+    "transpose(params.decoder.data, HIDDEN, COLUMNS, DECODED);",
+)
+"""The decoder sees the units of a hidden layer with ReLU, which sees features."""
+
+
 @cache
 def vectors_of(
-    width: int, n_levels: int, n_floats: int, n_decoded: int, columns: int, by_sample: bool
+    width: int,
+    n_levels: int,
+    n_floats: int,
+    n_decoded: int,
+    columns: int,
+    by_sample: bool,
+    hidden: int,
 ) -> EncodingVectors:
     """The vector form of ``hashed.hashed``, which says what the arguments are."""
     n_inputs = width * n_levels
     n_padded = padded(n_inputs)
     words = (
         f"constexpr int WIDTH = {width}, N_LEVELS = {n_levels}, FLOATS = {n_floats}, "
-        f"DECODED = {n_decoded}, COLUMNS = {columns}, INPUTS = {n_inputs}, PADDED = {n_padded};\n"
+        f"DECODED = {n_decoded}, COLUMNS = {columns}, INPUTS = {n_inputs}, PADDED = {n_padded}, "
+        f"HIDDEN = {hidden};\n"
     )
-    code = VectorCode(READ_PACK, ADJ_READ_PACK, ADD_RECORDS)
+    layer = HIDDEN_LAYER if hidden else NO_LAYER
+    code = VectorCode(
+        READ_PACK.replace("OF_LAYER", layer.forward),
+        ADJ_READ_PACK.replace("OF_LAYER", layer.adjoint),
+        ADD_RECORDS,
+        layer.begin,
+    )
     Record = record_type("adj_features", n_padded)  # rows in the order of lanes, samples only
-    features = (("features", wp.types.matrix((LANES, n_padded), wp.float32)),)
-    return decoded_vectors(words, code, Record, n_floats, by_sample, features)
+    kept = {"features": n_padded} | ({"units": hidden} if hidden else {})
+    rows = tuple((name, wp.types.matrix((LANES, n), wp.float32)) for name, n in kept.items())
+    return decoded_vectors(words, code, Record, n_floats, by_sample, rows)
