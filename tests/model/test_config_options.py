@@ -112,6 +112,7 @@ GIVEN: dict[str, tuple[str, Any]] = {
     "field.coarsest": ("16", 16),
     "field.finest": ("512", 512),
     "field.table": ("32768", 32768),
+    "field.hidden": ("32", 32),
     "field.learning_rate": ("0.02", 0.02),
     "field.learning_rate_decoder": ("0.02", 0.02),
     "field.epsilon": ("1e-8", 1e-8),
