@@ -36,29 +36,52 @@ def way_out(error: OSError) -> str:
     return "check that it exists and may be used"
 
 
+LONGEST = 60
+"""Characters of a value that a sentence quotes."""
+
+
+def said(value: object) -> str:
+    """A value as sentences quote it: by its type where it is long."""
+    try:
+        text = repr(value.item() if isinstance(value, np.generic) else value)
+    except ValueError:  # a whole number of more digits than Python writes
+        text = ""
+    if text and len(text) <= LONGEST and "\n" not in text:
+        return text
+    return f"one of type {type(value).__name__}"
+
+
 def _is_finite(value: object) -> bool:
     try:
         return math.isfinite(value)  # type: ignore[arg-type]
-    except TypeError:  # no number
+    except (TypeError, OverflowError):  # no number, or a larger one than there are
         return False
+
+
+def require_finite(field: str, value: float) -> None:
+    """Raise InputError unless value is a finite number."""
+    if not _is_finite(value):
+        raise InputError(f"{field} must be a finite number, not {said(value)}.")
 
 
 def require_positive(field: str, value: float) -> None:
     """Raise InputError unless value is a finite number above zero; NaN is refused as well."""
     if not (_is_finite(value) and value > 0):
-        raise InputError(f"{field} must be a finite number above 0, not {value}.")
+        raise InputError(f"{field} must be a finite number above 0, not {said(value)}.")
 
 
 def require_at_least(field: str, value: float, least: float) -> None:
     """Raise InputError unless value is a finite number of at least `least`."""
     if not (_is_finite(value) and value >= least):
-        raise InputError(f"{field} must be a finite number of at least {least:g}, not {value}.")
+        raise InputError(
+            f"{field} must be a finite number of at least {least:g}, not {said(value)}."
+        )
 
 
 def require_whole(field: str, value: int, least: int) -> None:
     """Raise InputError unless value is a whole number of at least `least`, below 2^63."""
     if isinstance(value, bool) or not hasattr(value, "__index__") or value < least:
-        raise InputError(f"{field} must be a whole number of at least {least}, not {value!r}.")
+        raise InputError(f"{field} must be a whole number of at least {least}, not {said(value)}.")
     if value >= 2**63:
         raise InputError(f"{field} must be below 2^63, which is more than any machine counts to.")
 
@@ -66,7 +89,7 @@ def require_whole(field: str, value: int, least: int) -> None:
 def require_one_of(field: str, value: str, choices: Iterable[str]) -> None:
     """Raise InputError unless value is one of the choices."""
     if value not in choices:
-        raise InputError(f"{field} must be one of {', '.join(choices)}, not {value!r}.")
+        raise InputError(f"{field} must be one of {', '.join(choices)}, not {said(value)}.")
 
 
 def require_kind(value: object, kind: type, what: str, way_out: str) -> None:
@@ -79,7 +102,7 @@ def require_kind(value: object, kind: type, what: str, way_out: str) -> None:
         way_out: The last ones.
     """
     if not isinstance(value, kind):
-        raise InputError(f"{what}, not {value!r}; {way_out}.")
+        raise InputError(f"{what}, not {said(value)}; {way_out}.")
 
 
 def require_shares(field: str, shares: tuple[float, ...]) -> None:

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
+from warpnerf.checked import checked
 from warpnerf.checks import (
     InputError,
     require_at_least,
@@ -14,6 +15,7 @@ from warpnerf.checks import (
     require_positive,
     require_shares,
     require_whole,
+    said,
 )
 from warpnerf.loss_config import OPACITY, USUAL_LOSSES, LossConfig
 from warpnerf.model.interface import Model
@@ -67,11 +69,12 @@ def _checked_box(box: object) -> tuple[float, ...]:
         raise InputError(
             "grid.box must be auto, scene, or six numbers, x y z of a lower corner and x y z of an "
             f"upper one, each above its lower one, no edge below {MIN_EDGE:g} of the longest, not "
-            f"{box!r}."
+            f"{said(box)}."
         )
     return ends
 
 
+@checked("grid")
 @dataclass(frozen=True, kw_only=True)
 class GridConfig:
     """The voxel grid: resolution, bounding box, contraction of unbounded space, growth."""
@@ -112,10 +115,12 @@ class GridConfig:
         require_one_of("grid.contraction", self.contraction, ("auto", *SPACES))
         require_whole("grid.planes", self.planes, 2)
         if not 0 < self.alpha_init < 1:
-            raise InputError(f"grid.alpha_init must lie between 0 and 1, not {self.alpha_init}.")
+            raise InputError(
+                f"grid.alpha_init must lie between 0 and 1, not {said(self.alpha_init)}."
+            )
         if self.border != "auto" and not (_is_number(self.border) and 0 < self.border <= 1):
             raise InputError(
-                f"grid.border must be auto, or above 0 and at most 1, not {self.border!r}."
+                f"grid.border must be auto, or above 0 and at most 1, not {said(self.border)}."
             )
         if not (isinstance(self.box, str) and self.box in ("auto", "scene")):
             object.__setattr__(self, "box", _checked_box(self.box))
@@ -123,7 +128,7 @@ class GridConfig:
             require_shares("grid.grow_at", self.grow_at)
         elif self.grow_at != "auto":
             raise InputError(
-                f"grid.grow_at must be auto or shares between 0 and 1, not {self.grow_at!r}."
+                f"grid.grow_at must be auto or shares between 0 and 1, not {said(self.grow_at)}."
             )
         require_at_least("grid.shift_at_growth", self.shift_at_growth, 0.0)
         if self.shift_at_growth > 0.0 and not self.grow_at:
@@ -171,6 +176,7 @@ class GridConfig:
         return max(8, self.voxels >> len(self.grows_at(kind)) - grown)
 
 
+@checked("march")
 @dataclass(frozen=True, kw_only=True)
 class MarchConfig:
     """Ray marching: step length, its growth with the distance, near and far."""
@@ -198,25 +204,28 @@ class MarchConfig:
             self._require_growth(self.growth)
         if self.far is not None and not self.near < self.far < math.inf:
             raise InputError(
-                f"march.far must be finite and beyond march.near, not {self.far}; leave it out for "
-                "no limit."
+                f"march.far must be finite and beyond march.near, not {said(self.far)}; leave it "
+                "out for no limit."
             )
         if not 0 <= self.transmittance_min < 1:
             raise InputError(
-                f"march.transmittance_min must lie in [0, 1), not {self.transmittance_min}."
+                f"march.transmittance_min must lie in [0, 1), not {said(self.transmittance_min)}."
             )
 
     def _require_growth(self, growth: object) -> None:
         """Refuse what steps cannot grow by."""
         if not (_is_number(growth) and 0.0 <= growth < math.inf):  # type: ignore[operator]
-            raise InputError(f"march.growth must be auto, or a number from 0 on, not {growth!r}.")
+            raise InputError(
+                f"march.growth must be auto, or a number from 0 on, not {said(growth)}."
+            )
         if 0 < growth < 1e-4:  # type: ignore[operator]
             raise InputError(
-                f"march.growth must be 0 or at least 0.0001, not {growth}: a smaller one is "
+                f"march.growth must be 0 or at least 0.0001, not {said(growth)}: a smaller one is "
                 "lost in float32."
             )
 
 
+@checked("")
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig:
     """The configuration of a training run: by default the preset fast."""
@@ -331,11 +340,11 @@ class TrainConfig:
         if isinstance(self.model, str):
             object.__setattr__(self, "model", model_of(self.model))
         if not isinstance(self.model, Model):
-            raise InputError(f"model must be a name or a model, not {self.model!r}.")
+            raise InputError(f"model must be a name or a model, not {said(self.model)}.")
         if isinstance(self.field, str):
             object.__setattr__(self, "field", storage_of(self.field))
         if not isinstance(self.field, StorageKind):
-            raise InputError(f"field must be a name or a storage, not {self.field!r}.")
+            raise InputError(f"field must be a name or a storage, not {said(self.field)}.")
         object.__setattr__(self, "sampler", checked_sampler(self.sampler))
         parts = {"grid": GridConfig, "march": MarchConfig, "optim": OptimConfig, "loss": LossConfig}
         for name, kind in parts.items():
@@ -350,6 +359,8 @@ class TrainConfig:
                 f"{self.coarse_steps}: fewer find nothing."
             )
         require_whole("rays_per_step", self.rays_per_step, 1)
+        if self.rays_per_step >= 2**31:
+            raise InputError("rays_per_step must be below 2^31, which kernels can count.")
         require_whole("occupancy_every", self.occupancy_every, 1)
         require_at_least("alpha_min", self.alpha_min, 0.0)
         if self.alpha_min >= 1.0:
@@ -385,4 +396,4 @@ class TrainConfig:
         elif len(self.background) != 3 or not all(
             math.isfinite(c) and 0 <= c <= 1 for c in self.background
         ):
-            raise InputError(f"background must be rgb in [0, 1], not {self.background}.")
+            raise InputError(f"background must be rgb in [0, 1], not {said(self.background)}.")

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from warpnerf.checks import InputError, require_at_least, require_one_of, require_positive
+from warpnerf.checked import checked
+from warpnerf.checks import InputError, require_at_least, require_one_of, require_positive, said
 
 HUBER_DELTA = 0.1
 
@@ -17,6 +18,7 @@ OPACITY = 1e-3
 """What ``LossConfig.opacity`` is by auto."""
 
 
+@checked("loss")
 @dataclass(frozen=True, kw_only=True)
 class LossConfig:
     """What training minimises: the mean over rays of the photometric loss, which is a sum over the
@@ -55,7 +57,7 @@ class LossConfig:
         require_one_of("loss.photometric", self.photometric, ("squared", "huber"))
         require_positive("loss.huber_delta", self.huber_delta)
         if isinstance(self.opacity, str) and self.opacity != "auto":
-            raise InputError(f"loss.opacity must be auto or a number, not {self.opacity!r}.")
+            raise InputError(f"loss.opacity must be auto or a number, not {said(self.opacity)}.")
         for name in (*WEIGHTS_OF_LOSSES, "near_clip_distance"):
             if name != "opacity" or self.opacity != "auto":
                 require_at_least(f"loss.{name}", getattr(self, name), 0.0)

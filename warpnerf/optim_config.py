@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Literal
 
+from warpnerf.checked import checked
 from warpnerf.checks import (
     InputError,
     require_at_least,
     require_positive,
     require_shares,
     require_whole,
+    said,
 )
 from warpnerf.model.interface import Model
 
@@ -38,6 +40,7 @@ def model_rates(model: Model) -> tuple[str, ...]:
     return tuple(n for n in names if n.startswith("learning_rate") and n != "learning_rate_mlp")
 
 
+@checked("optim")
 @dataclass(frozen=True, kw_only=True)
 class OptimConfig:
     """The optimiser, Adam: learning rates and their decay, and total variation regularisation."""
@@ -84,7 +87,7 @@ class OptimConfig:
         require_at_least("optim.tv_rgb", self.tv_rgb, 0.0)
         require_whole("optim.tv_every", self.tv_every, 1)
         if not 0 <= self.tv_until <= 1:
-            raise InputError(f"optim.tv_until must lie in [0, 1], not {self.tv_until}.")
+            raise InputError(f"optim.tv_until must lie in [0, 1], not {said(self.tv_until)}.")
         if isinstance(self.accumulate_at, str):
             if self.accumulate_at != "auto":
                 raise InputError(
@@ -100,7 +103,9 @@ class OptimConfig:
                 )
         for name in ("beta1", "beta2"):
             if not 0 <= getattr(self, name) < 1:
-                raise InputError(f"optim.{name} must lie in [0, 1), not {getattr(self, name)}.")
+                raise InputError(
+                    f"optim.{name} must lie in [0, 1), not {said(getattr(self, name))}."
+                )
 
     def accumulates_at(self, kind: SceneKind) -> tuple[float, ...]:
         """When gradient accumulation doubles: ``accumulate_at``, decided for a kind of scene.

@@ -54,7 +54,7 @@ REFUSED = [
     ("per_sample", ["features=32"], "model.features must be at most 31, not 32."),
     ("per_sample", ["residual=maybe"], "residual must be true or false, not 'maybe'."),
     ("per_sample", ["threshold=1"], "model.threshold must be below 1, not 1.0."),
-    ("per_sample", ["threshold=nan"], "model.threshold must be a finite number of at least 0"),
+    ("per_sample", ["threshold=nan"], "model.threshold must be a finite number"),
 ]
 
 

@@ -155,7 +155,6 @@ MUTANTS = [
         "= corners[(level + 1) % 2]",
         PLAIN,
     ),
-    Mutant("read_pack: inactive levels are left", PACKS, "features_of(r)[n] = 0.0f", ";", INACTIVE),
     Mutant(
         "read_pack: the lower node alone",
         PACKS,

@@ -31,8 +31,8 @@ def with_nan(pose: np.ndarray) -> np.ndarray:
         ({"height": -2}, "height must be a finite number of at least 1, not -2"),
         ({"fx": 0.0}, "fx must be a finite number above 0, not 0"),
         ({"fy": np.nan}, "fy must be a finite number above 0, not nan"),
-        ({"cx": np.inf}, "cx must be finite, not inf"),
-        ({"k2": np.nan}, "k2 must be finite, not nan"),
+        ({"cx": np.inf}, "cx must be a finite number, not inf"),
+        ({"k2": np.nan}, "k2 must be a finite number, not nan"),
     ],
 )
 def test_what_makes_no_rays_is_refused(changes: dict[str, Any], message: str) -> None:

@@ -11,12 +11,14 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
+from warpnerf.checked import checked
 from warpnerf.checks import (
     InputError,
     require_at_least,
     require_one_of,
     require_positive,
     require_whole,
+    said,
 )
 from warpnerf.model import registry
 from warpnerf.model.interface import Load, Model, Rates, loader, uniform_weights
@@ -39,6 +41,7 @@ class Rgb(Model):
         return load("launch.assembly").Parts(head=load("heads.rgb").rgb())
 
 
+@checked("model")
 @dataclass(frozen=True, kw_only=True)
 class SphericalHarmonics(Model):
     """View-dependent colour by spherical harmonics, without an MLP."""
@@ -54,7 +57,7 @@ class SphericalHarmonics(Model):
         """Refuse a configuration for which there are no kernels."""
         require_whole("model.degree", self.degree, 0)
         if self.degree > 3:
-            raise InputError(f"model.degree must be 0, 1, 2 or 3, not {self.degree}.")
+            raise InputError(f"model.degree must be 0, 1, 2 or 3, not {said(self.degree)}.")
         require_positive("model.learning_rate_sh", self.learning_rate_sh)
         self.keep_plain()
 
@@ -98,7 +101,7 @@ class _WithMlp(Model):
         """Refuse a configuration for which there are no kernels."""
         require_whole("model.frequencies", self.frequencies, 0)
         if self.frequencies > 8:
-            raise InputError(f"model.frequencies must be at most 8, not {self.frequencies}.")
+            raise InputError(f"model.frequencies must be at most 8, not {said(self.frequencies)}.")
         require_whole("model.width", self.width, 1)
         if self.width % 16 or self.width > 128:
             raise InputError(
@@ -119,6 +122,7 @@ class _WithMlp(Model):
         return int(layout.n_own * self.width + hidden + 4 * self.width)
 
 
+@checked("model")
 @dataclass(frozen=True, kw_only=True)
 class Deferred(_WithMlp):
     """Deferred shading: features composited along the ray, then a view-dependent MLP per ray."""
@@ -134,7 +138,7 @@ class Deferred(_WithMlp):
         super().__post_init__()
         require_whole("model.specular", self.specular, 1)
         if self.specular > 28:
-            raise InputError(f"model.specular must be at most 28, not {self.specular}.")
+            raise InputError(f"model.specular must be at most 28, not {said(self.specular)}.")
 
     @property
     def relative_time(self) -> float:
@@ -172,6 +176,7 @@ class Deferred(_WithMlp):
         return rates
 
 
+@checked("model")
 @dataclass(frozen=True, kw_only=True)
 class PerSample(_WithMlp):
     """A view-dependent MLP per sample, on its features and the direction of view, as in DVGO."""
@@ -200,7 +205,7 @@ class PerSample(_WithMlp):
             raise InputError(f"model.features must be at most 31, not {self.features}.")
         require_at_least("model.threshold", self.threshold, 0.0)
         if self.threshold >= 1.0:
-            raise InputError(f"model.threshold must be below 1, not {self.threshold}.")
+            raise InputError(f"model.threshold must be below 1, not {said(self.threshold)}.")
 
     @property
     def relative_time(self) -> float:

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from warpnerf.checks import InputError
+from warpnerf.checks import InputError, require_finite, said
 
 Kind = TypeVar("Kind", bound=type[Any])
 
@@ -59,12 +59,15 @@ def keep_plain(value: Any, what: str) -> None:
         what: It is, in configurations.
 
     Raises:
-        InputError: A field whose default is a bool is given something else.
+        InputError: A field whose default is a bool is given something else, or one whose default
+            is a number no finite one.
     """
     for f in fields(value):
         given, kind = getattr(value, f.name), type(f.default)
         if kind is bool and not isinstance(given, bool | np.bool_):
-            raise InputError(f"{what}.{f.name} must be True or False, not {given!r}.")
+            raise InputError(f"{what}.{f.name} must be True or False, not {said(given)}.")
+        if kind is float:
+            require_finite(f"{what}.{f.name}", given)
         if kind in (bool, int, float):
             object.__setattr__(value, f.name, kind(given))
 

@@ -12,7 +12,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from warpnerf.checks import InputError, require_one_of, require_positive, require_whole
+from warpnerf.checked import checked
+from warpnerf.checks import InputError, require_one_of, require_positive, require_whole, said
 from warpnerf.model import registry
 from warpnerf.model.interface import Load, Model, Rates
 from warpnerf.model.storage_kinds import NUMBER_BYTES
@@ -69,6 +70,7 @@ class Marched(SamplerKind):
         return None
 
 
+@checked("sampler")
 @dataclass(frozen=True, kw_only=True)
 class Resampled(SamplerKind):
     """Proposal sampling, as in Mip-NeRF 360: intervals drawn for each ray from the histogram of a
@@ -95,12 +97,14 @@ class Resampled(SamplerKind):
         if self.bins % PACK or max(self.bins, self.samples) > MOST:
             raise InputError(
                 f"sampler.bins must be a multiple of {PACK}, and neither bins nor samples above "
-                f"{MOST}, not {self.bins} and {self.samples}."
+                f"{MOST}, not {said(self.bins)} and {self.samples}."
             )
         require_whole("sampler.voxels", self.voxels, 8)
         require_positive("sampler.learning_rate_proposal", self.learning_rate_proposal)
         if not 0.0 <= self.anneal_until < 1.0:
-            raise InputError(f"sampler.anneal_until must lie in [0, 1), not {self.anneal_until}.")
+            raise InputError(
+                f"sampler.anneal_until must lie in [0, 1), not {said(self.anneal_until)}."
+            )
         require_whole("sampler.update_every", self.update_every, 1)
         registry.keep_plain(self, "sampler")
 
@@ -212,7 +216,7 @@ def checked_sampler(sampler: object) -> SamplerKind:
     if isinstance(sampler, str):
         return sampler_of(sampler)
     if not isinstance(sampler, SamplerKind):
-        raise InputError(f"sampler must be a name or a sampler, not {sampler!r}.")
+        raise InputError(f"sampler must be a name or a sampler, not {said(sampler)}.")
     return sampler
 
 

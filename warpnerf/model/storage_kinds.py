@@ -13,12 +13,14 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, ClassVar, TypeVar
 
+from warpnerf.checked import checked
 from warpnerf.checks import (
     InputError,
     require_at_least,
     require_one_of,
     require_positive,
     require_whole,
+    said,
 )
 from warpnerf.model import registry
 from warpnerf.model.interface import Load, Model, loader
@@ -121,6 +123,7 @@ class Dense(StorageKind):
         return f"{grid} of {model.n_floats} numbers"
 
 
+@checked("field")
 @dataclass(frozen=True, kw_only=True)
 class Vm(StorageKind):
     """TensoRF's vector-matrix (VM) decomposition: three planes and three lines of vectors, and a
@@ -193,6 +196,7 @@ class Vm(StorageKind):
         return f"a field of planes over {x} x {y} x {z} nodes with entries of {self.width} numbers"
 
 
+@checked("field")
 @dataclass(frozen=True, kw_only=True)
 class Hash(StorageKind):
     """Multiresolution hash encoding, by rows: Instant-NGP's tables of entries, and a matrix that
@@ -231,7 +235,7 @@ class Hash(StorageKind):
         require_whole("field.levels", self.levels, 2)
         require_whole("field.features", self.features, 1)
         if self.features not in (2, 4, 8):
-            raise InputError(f"field.features must be 2, 4 or 8, not {self.features}.")
+            raise InputError(f"field.features must be 2, 4 or 8, not {said(self.features)}.")
         if self.levels * self.features > MAX_WIDTH:
             raise InputError(
                 f"field.levels times field.features must be at most {MAX_WIDTH}, not "
@@ -240,17 +244,17 @@ class Hash(StorageKind):
         require_whole("field.coarsest", self.coarsest, 1)
         require_whole("field.finest", self.finest, self.coarsest)
         if self.finest > MAX_CELLS:
-            raise InputError(f"field.finest must be at most {MAX_CELLS}, not {self.finest}.")
+            raise InputError(f"field.finest must be at most {MAX_CELLS}, not {said(self.finest)}.")
         require_whole("field.table", self.table, 16)
         if self.table & (self.table - 1) or self.table > MAX_TABLE:
             raise InputError(
-                f"field.table must be a power of two, up to {MAX_TABLE}, not {self.table}."
+                f"field.table must be a power of two, up to {MAX_TABLE}, not {said(self.table)}."
             )
         require_whole("field.hidden", self.hidden, 0)
         if self.hidden % 16 or self.hidden > MAX_WIDTH:
             raise InputError(
                 f"field.hidden must be a multiple of 16 up to {MAX_WIDTH}, or 0 for no hidden "
-                f"layer, not {self.hidden}: units are worked on sixteen at a time."
+                f"layer, not {said(self.hidden)}: units are worked on sixteen at a time."
             )
         require_positive("field.learning_rate", self.learning_rate)
         require_positive("field.learning_rate_decoder", self.learning_rate_decoder)

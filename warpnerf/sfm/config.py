@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
+from warpnerf.checked import checked
 from warpnerf.checks import InputError, require_one_of, require_whole
 
 CameraModel = Literal[
@@ -16,6 +17,7 @@ Mapper = Literal["incremental", "global"]
 Lenses = Literal["auto", "one", "each"]
 
 
+@checked("")
 @dataclass(frozen=True, kw_only=True)
 class PoseConfig:
     """The configuration of camera pose estimation by structure from motion."""

@@ -202,9 +202,6 @@ for (int level = 0; level < n_active; ++level) {
     }
 }
 const int n_inputs = n_active * WIDTH;
-for (int r = 0; r < n_rows; ++r) {
-    for (int n = n_inputs; n < PADDED; ++n) features_of(r)[n] = 0.0f;
-}
 OF_LAYER
 float raw[LANES][COLUMNS];
 for (int block = 0; block < COLUMNS; block += LANES) {

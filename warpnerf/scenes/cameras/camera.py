@@ -11,10 +11,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from warpnerf.checks import InputError, require_at_least, require_positive
+from warpnerf.checked import checked
+from warpnerf.checks import InputError, require_at_least, require_finite, require_positive
 from warpnerf.scenes.cameras.fisheye import Coefficients, distorted_angle
 
 
+@checked("Camera")
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Camera:
     """Pinhole camera with OpenCV's radial and tangential distortion, or a fisheye lens.
@@ -79,8 +81,7 @@ class Camera:
         require_positive("Camera.fx", self.fx)
         require_positive("Camera.fy", self.fy)
         for name in ("cx", "cy", "k1", "k2", "k3", "p1", "p2", "k4", "k5", "k6"):
-            if not math.isfinite(getattr(self, name)):
-                raise InputError(f"Camera.{name} must be finite, not {getattr(self, name)}.")
+            require_finite(f"Camera.{name}", getattr(self, name))
         for name in ("p1", "p2", "k5", "k6"):
             if self.fisheye and getattr(self, name) != 0.0:
                 raise InputError(f"Camera.{name} must be 0 for a fisheye lens.")
