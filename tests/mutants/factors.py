@@ -97,13 +97,6 @@ MUTANTS = [
         FLAGS,
     ),
     # packs
-    Mutant(
-        "places: fractions of what is no sample",
-        PACKS,
-        "active ? fraction : splat(0.0f)",
-        "fraction",
-        SEVERAL + "[3]",
-    ),
     Mutant("corners_of: the wrong line", PACKS, "c = 2 - plane;", "c = plane;", PLAIN),
     Mutant(
         "in_plane: the lower row twice", PACKS, "low + (size_t)corners.row * WIDTH", "low", PLAIN

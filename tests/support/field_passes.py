@@ -38,14 +38,20 @@ def trainer_of(
     contraction: str = "none",
     n_rays: int = N_RAYS,
 ) -> Trainer:
-    """At its first step, on a lattice of 700 nodes."""
+    """At its first step, on a lattice of 700 nodes, as many along no axis as along another."""
     config = TrainConfig(
         model=model,
         field=kind,
         loss=LossConfig(),
         rays_per_step=n_rays,
         coarse_steps=0,
-        grid=GridConfig(voxels=700, grow_at=(), contraction=contraction, alpha_init=0.1),
+        grid=GridConfig(
+            voxels=700,
+            grow_at=(),
+            contraction=contraction,
+            alpha_init=0.1,
+            box=(-0.55, -1.0, -0.75, 0.55, 1.0, 0.75),
+        ),
         threads=threads,
     )
     return Trainer(ball(), config)
@@ -59,7 +65,10 @@ def fill(*arrays: Any) -> None:
 
 
 def gradient_of(trainer: Trainer, storage: Storage) -> Gradient:
-    """Of a batch of rays, and the loss of each; copies of workers are summed."""
+    """Of a batch of rays, and the loss of each; copies of workers are summed.
+
+    A third of the cells are free, so that packs have samples in some of their lanes, not the first.
+    """
     steps, workers, n_rays = (
         trainer.march_steps(),
         trainer.workers,
@@ -68,7 +77,9 @@ def gradient_of(trainer: Trainer, storage: Storage) -> Gradient:
     launch = TrainingPass(
         *(n_rays, trainer.model, storage, trainer.weights, steps, "clamped", "none", workers)
     )
-    launch.run(FreeCells.none(workers), trainer._sampler.draw(0))
+    occupied = np.random.default_rng(2).random(storage.lattice.cells) < 0.67
+    free = FreeCells.none(workers).cropped(storage.lattice, occupied, workers)
+    launch.run(free, trainer._sampler.draw(0))
     found = {
         name: array.numpy().sum(axis=0) if array.ndim == 2 else array.numpy()
         for name, array in launch.gradients.arrays.items()

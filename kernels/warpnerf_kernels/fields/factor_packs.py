@@ -28,16 +28,15 @@ const int plane_begin[3] = {0, size.c[0] * size.c[1], size.c[0] * (size.c[1] + s
 const int line_begin[3] = {0, size.c[2], size.c[2] + size.c[1]};
 
 struct Places { ivec node[3]; vec fraction[3]; };
-// Where samples lie in the lattice; what is no sample counts as lying on a node.
-auto places_of = [&](const auto& samples, ivec active) -> Places {
+// Where samples lie in the lattice; what is no sample lies anywhere in it.
+auto places_of = [&](const auto& samples) -> Places {
     Places places;
     const vec c[3] = {load(samples.x), load(samples.y), load(samples.z)};
     #pragma clang loop unroll(full)
     for (int axis = 0; axis < 3; ++axis) {
         const vec u = c[axis] * params.to_nodes.c[axis] + params.middle.c[axis];
         places.node[axis] = clamp(truncate(u), size.c[axis] - 1);
-        const vec fraction = u - to_float(places.node[axis]);
-        places.fraction[axis] = active ? fraction : splat(0.0f);
+        places.fraction[axis] = u - to_float(places.node[axis]);
     }
     return places;
 };
@@ -153,10 +152,10 @@ READ_PACK = (
     WORDS
     + r"""
 auto& pack = packs.data[slot];
-const ivec active = load_int(pack.active);
-const Places places = places_of(pack, active);
+const unsigned active = bits(load_int(pack.active));
+const Places places = places_of(pack);
 int lane_of[2 * LANES];
-const int n_rows = list_lanes(bits(active), 0, lane_of);
+const int n_rows = list_lanes(active, 0, lane_of);
 float products[LANES][PRODUCTS], raw[LANES][COLUMNS];
 Corners corners;
 #pragma clang loop unroll(full)
@@ -182,11 +181,10 @@ ADJ_READ_PACK = (
     ADD_OWN
     + r"""
 const auto& pack = packs.data[slot];
-const ivec is_sample = load_int(pack.active);
-const unsigned active = bits(is_sample);
+const unsigned active = bits(load_int(pack.active));
 float adj_raw[LANES][COLUMNS];
 take_adj_raw(pack, adj_raw);
-const Places places = places_of(pack, is_sample);
+const Places places = places_of(pack);
 bool all_mine = true;
 #pragma clang loop unroll(full)
 for (int plane = 0; plane < 3; ++plane) {
@@ -226,7 +224,7 @@ const int* which = sink.recipients.data + ((size_t)sender * n_workers + worker) 
 const int n = sink.n_recipients.data[sender * row + worker];
 for (int k = 0; k < n; ++k) {
     const auto& record = records[which[k] / 8];
-    const Places places = places_of(record, ivec(-1));
+    const Places places = places_of(record);
     each(which[k] & 7, [&](int plane) {
         const unsigned lower = record.active & lower_of(worker, plane, places);
         const unsigned upper = record.active & upper_of(worker, plane, places);
