@@ -12,6 +12,7 @@ from tests.support.small_model import SMALL
 from warpnerf.model.models import PerSample
 from warpnerf.runtime.parallel import Workers
 from warpnerf.verification.gradient_check import ProblemKernels
+from warpnerf.verification.gradient_errors import bound_forms
 from warpnerf.verification.problems import (
     DENSITY_SHIFT,
     RayProblem,
@@ -113,3 +114,10 @@ def test_rounded_numbers_are_those_of_float32() -> None:
         (frustum.origin, before.frustum.origin),
     ):
         assert np.array_equal(ours.astype(np.float32), ours) and np.abs(ours - exact).max() > 0.0
+
+
+def test_the_proposal_s_gradient_in_packs(on_cpu: None) -> None:
+    workers = Workers("cpu", 2)
+    exact, packs = ProblemKernels("float64", workers), ProblemKernels("float32", workers, True)
+    for seed in range(3):
+        assert bound_forms(packs, exact, partly_free(make_problem(seed))) < 1e-5

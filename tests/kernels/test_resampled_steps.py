@@ -140,7 +140,7 @@ def test_what_samples_weigh_is_kept(contraction: str, device: str) -> None:
 def test_what_is_free_depends_on_no_interval() -> None:
     """Cells are judged by the steps that a march would take."""
     load = precision.load
-    steps = Steps(near=0.1, far=30.0, step=0.2, n_linear=10, growth=0.05)
+    steps = Steps(near=0.1, far=30.0, step=0.2, n_linear=10, growth=0.3)
     kernels = Kernels("float32", "cpu")
     intervals = Intervals(
         kind=Resampled(), steps=steps, edges=kernels.zeros((2, 33)), weights=kernels.zeros((0, 0))
@@ -152,4 +152,7 @@ def test_what_is_free_depends_on_no_interval() -> None:
         for params, sampler in zip(march, (STEPS, resampled.INTERVALS), strict=True)
     ]
     np.testing.assert_array_equal(cells[0].distance.numpy(), cells[1].distance.numpy())
-    assert 0.0 < cells[0].share() < 1.0
+    short = FreeCells.of(
+        field.storage, field.workers, replace(steps, growth=1e-4).struct(), 1e-3, STEPS
+    )
+    assert 0.0 < short.share() < cells[0].share() < 1.0  # long steps see more

@@ -11,6 +11,7 @@ ALIKE = "kernels/test_resampled_steps.py::test_intervals_that_are_alike_are_step
 WALKED = "kernels/test_resampled_steps.py::test_the_vector_form_equals_the_plain_one[1-linf]"
 KEPT = "kernels/test_resampled_steps.py::test_what_samples_weigh_is_kept[none]"
 FREE = "kernels/test_resampled_steps.py::test_what_is_free_depends_on_no_interval"
+IN_PACKS = "kernels/test_gradient_check.py::test_the_proposal_s_gradient_in_packs"
 LEARNS = "training/test_resampling.py::test_the_proposal_learns_to_bound"
 DUE = (
     "training/test_resampling.py::test_a_proposal_learns_every_few_updates_once_it_is_not_flattened"
@@ -161,7 +162,7 @@ MUTANTS = [
         "launch/propose.py",
         "load(pack.sigma_slope) * load(pack.dt)",
         "load(pack.sigma_slope)",
-        LEARNS,
+        IN_PACKS,
     ),
     Mutant(
         "bins: light of none",
