@@ -2,6 +2,7 @@
 
     python benchmarks/against_torch.py lego_200
     python benchmarks/against_torch.py dense sphere --models dvgo
+    python benchmarks/against_torch.py lego_200 fox_q --field vm
 
 A step marches, composites, takes the squared error, goes back through all of it with gradients
 scaled by distance, and updates nodes and network by Adam, which leaves nodes alone that no ray has
@@ -16,6 +17,9 @@ touched. Beside it the pass alone, without Adam. What is marched through:
 Models are as they are by default, and `dvgo`: a density and 12 features in each node and for each
 sample of a weight above 1e-4 an MLP of two hidden layers of 128 units that sees the features and
 the encoded direction; trained by its preset, in steps of half a voxel.
+
+With `--field` the trained field is one of factors, or a hash, in bounded scenes and in unbounded
+ones. Torch is told where the samples lie that warpnerf visits, so it need not march.
 
 Colours and gradients are compared first; where rays end early, a sample more or less at their ends
 may show in colours by the light that is left there. Then the two take turns. Each counts with its
@@ -35,7 +39,9 @@ import numpy as np
 import torch
 from candidates import warpnerf_step
 from candidates.torch_adam import MaskedAdam, Way
-from candidates.torch_models import Choices, Scattering, TorchModels
+from candidates.torch_fields import FieldChoices, TorchFields
+from candidates.torch_models import Choices, TorchModels
+from field_workload import FieldWorkload, late_field
 from measuring import (
     Stopwatch,
     default_threads,
@@ -64,6 +70,10 @@ RATE = 1e-8
 AT_ENDS = 1e-4
 """The share of the gradient's values that may differ by more where rays end early: which sample is
 the last may hang on rounding."""
+FIELDS = ("vm", "hash")
+"""What fields are stored in besides dense grids."""
+OF_FIELDS: tuple[ModelName, ...] = ("deferred", "sh", "rgb")
+"""Models whose samples are all read alike, which torch has with these."""
 MADE = ("dense", "sphere")
 """Scenes of throughput.py."""
 
@@ -105,10 +115,10 @@ class TorchStep:
 
     def __init__(self, work: Workload, threads: int) -> None:
         """Load a workload."""
-        self._pass = TorchModels(work, Choices(threads=threads))
+        self._pass = torch_of(work, threads)
         self._grid = MaskedAdam(self._pass.tables, RATE)
-        network = self._pass.network
-        self._network = torch.optim.Adam(network, lr=RATE, betas=(0.9, 0.99)) if network else None
+        weights = self._pass.weights
+        self._weights = torch.optim.Adam(weights, lr=RATE, betas=(0.9, 0.99)) if weights else None
         self._of_pass = self._of_step = self._pass.choices
 
     def run_pass(self) -> None:
@@ -119,8 +129,8 @@ class TorchStep:
         """A whole step."""
         self._run(self._of_step)
         self._grid.step()
-        if self._network is not None:
-            self._network.step()
+        if self._weights is not None:
+            self._weights.step()
 
     def _run(self, choices: Choices) -> None:
         self._pass.choices = choices
@@ -129,32 +139,33 @@ class TorchStep:
     def choose(self, rounds: int) -> str:
         """Take what is fastest here, for the pass and for the step; describe it."""
         seconds = Stopwatch("cpu").seconds
-        scatterings: tuple[Scattering, ...] = ("rows", "pairs")
         ways: tuple[Way, ...] = ("all", "rows")
-        first = self._pass.choices
-        passes = [
-            replace(first, parts=parts, scattering=scattering, sparse=sparse)
-            for parts, scattering, sparse in itertools.product(
-                (1, 4, 16, 64), scatterings, (False, True)
-            )
-        ]
+        passes = self._pass.ways()
         spent = dict.fromkeys(passes, math.inf)
         for choices in passes * rounds:
             self._run(choices)  # leaves what the next one zeroes
             spent[choices] = min(spent[choices], seconds(lambda c=choices: self._run(c)))
         self._of_pass = min(spent, key=lambda choices: spent[choices])
         updates: dict[tuple[bool, Way], float] = {}
-        for sparse, way in list(itertools.product((False, True), ways)) * rounds:
+        noting = sorted({choices.sparse for choices in passes})
+        for sparse, way in list(itertools.product(noting, ways)) * rounds:
             self._of_step, self._grid.way = replace(self._of_pass, sparse=sparse), way
             self.step()
             updates[sparse, way] = min(updates.get((sparse, way), math.inf), seconds(self.step))
         sparse, self._grid.way = min(updates, key=lambda key: updates[key])
         self._of_step = replace(self._of_pass, sparse=sparse)
-        noted = {True: ", touched nodes noted", False: ""}
+        noted = ", touched nodes noted" if sparse else ""
         return (
-            f"{self._of_pass.parts} parts, gradients by {self._of_pass.scattering}"
-            f"{noted[self._of_pass.sparse]}; with Adam over {self._grid.way}{noted[sparse]}"
+            f"{self._of_pass.parts} parts, {self._of_pass.words}; "
+            f"with Adam over {self._grid.way}{noted}"
         )
+
+
+def torch_of(work: Workload, threads: int, parts: int = 1) -> TorchModels:
+    """The torch of a workload."""
+    if isinstance(work, FieldWorkload):
+        return TorchFields(work, FieldChoices(threads=threads, parts=parts))
+    return TorchModels(work, Choices(threads=threads, parts=parts))
 
 
 def made_workload(scene: Any, model: ModelName, grid: int, n_rays: int) -> Workload:
@@ -165,7 +176,7 @@ def made_workload(scene: Any, model: ModelName, grid: int, n_rays: int) -> Workl
 
 
 def late_workload(scene: wn.Scene, model: ModelName, steps: int, voxels: int) -> Workload:
-    """Where a training stands at nine tenths of its schedule, and a batch of its rays."""
+    """Where a training stands at nine tenths of its schedule, and a batch of its rays: dense."""
     if scene.kind == "unbounded":
         raise SystemExit(f"against_torch: {scene.name} is unbounded, which torch is not here.")
     config = wn.PRESETS["dvgo" if model == "dvgo" else "fast"]
@@ -203,15 +214,16 @@ def compare(work: Workload, thread_counts: list[int], rounds: int) -> dict[str, 
     """Check one case, and time it."""
     sides = {
         ("warpnerf", 1): warpnerf_step.load(work, 1, "cpu"),
-        ("torch", 1): TorchModels(work, Choices(parts=16)),
+        ("torch", 1): torch_of(work, 1, parts=16),
     }
+    of_field = isinstance(work, FieldWorkload)
     kinks = AT_KINKS.get(work.model, AT_ENDS if work.transmittance_min > 0.0 else 0.0)
-    differences = check(sides, kinks, max(TOLERANCE, work.transmittance_min))
+    differences = check(sides, kinks, max(TOLERANCE, work.transmittance_min), of_field)
     n_samples = sides["warpnerf", 1].n_samples()
     del sides
     gc.collect()
     theirs = {threads: TorchStep(work, threads) for threads in thread_counts}
-    choices = {threads: step.choose(2) for threads, step in theirs.items()}
+    choices = {threads: step.choose(1 if of_field else 2) for threads, step in theirs.items()}
     ours = {threads: WarpStep(work, threads) for threads in thread_counts}
     passes = {threads: warpnerf_step.load(work, threads, "cpu") for threads in thread_counts}
     calls = {("warpnerf", t): ours[t].step for t in ours}
@@ -261,7 +273,8 @@ def main() -> None:
     parser = options(__doc__)
     known = "dense, sphere, builtin:room, folders"
     parser.add_argument("scenes", nargs="*", default=["builtin:room"], help=known)
-    parser.add_argument("--models", nargs="+", default=list(MODELS), choices=list(MODELS))
+    parser.add_argument("--models", nargs="+", choices=list(MODELS), help="default: all; deferred")
+    parser.add_argument("--field", choices=FIELDS, help="in place of a dense grid; of captures")
     parser.add_argument("--grid", type=int, default=160, help="nodes along an axis, or their mean")
     parser.add_argument("--rays", type=int, default=8192, help="of dense and sphere")
     parser.add_argument("--steps", type=int, default=4000, help="of a capture's training")
@@ -271,6 +284,11 @@ def main() -> None:
     args = parser.parse_args()
     if args.device != "cpu":
         parser.error("this one measures CPUs")
+    if args.field is not None and not set(args.scenes).isdisjoint(MADE):
+        parser.error(f"{' and '.join(MADE)} are dense grids")
+    if args.field is not None and not set(args.models or ()) <= set(OF_FIELDS):
+        parser.error(f"--field goes with {', '.join(OF_FIELDS)}")
+    models = args.models or (list(MODELS) if args.field is None else ["deferred"])
     print(
         f"{args.rounds} rounds; median [95 % interval]\n\n{'scene':14s}{'model':10s}samples/ray  "
         "a step, ms: ours, torch's; torch's over ours     the pass likewise"
@@ -279,12 +297,14 @@ def main() -> None:
     for name in args.scenes:
         is_made = name in MADE
         scene = None if is_made else wn.load_scene(path_of(name), downscale=args.downscale)
-        for model in args.models:
+        for model in models:
             if scene is None and model == "rgb":
                 print(f"{name}: rgb is left out, for which throughput.py has a faster torch")
                 continue
             if scene is None:
                 work = made_workload(name, model, args.grid, args.rays)
+            elif args.field is not None:
+                work = late_field(scene, model, args.field, args.steps, args.grid**3)
             else:
                 work = late_workload(scene, model, args.steps, args.grid**3)
             row = {"scene": name, **compare(work, args.threads, args.rounds)}
@@ -296,11 +316,13 @@ def main() -> None:
         "benchmark": "against_torch",
         "machine": machine("cpu", max(args.threads)),
         "grid": args.grid,
+        "field": args.field or "dense",
         "steps": args.steps,
         "rounds": args.rounds,
         "rows": rows,
     }
-    print(f"\nrecord: {write_record(record, args.output, 'against_torch', 'cpu')}")
+    name = "against_torch" + ("" if args.field is None else f"_{args.field}")
+    print(f"\nrecord: {write_record(record, args.output, name, 'cpu')}")
 
 
 if __name__ == "__main__":

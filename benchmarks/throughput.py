@@ -106,7 +106,10 @@ def make_cases(grids: Sequence[int]) -> list[Case]:
 
 
 def check(
-    runs: dict[tuple[str, int], Candidate], at_kinks: float = 0.0, of_rgb: float = TOLERANCE
+    runs: dict[tuple[str, int], Candidate],
+    at_kinks: float = 0.0,
+    of_rgb: float = TOLERANCE,
+    of_field: bool = False,
 ) -> dict[str, dict[str, float]]:
     """Run all, and compare them with the first.
 
@@ -115,6 +118,7 @@ def check(
         at_kinks: The share of a gradient's values that is left out, those of greatest difference.
             Where it is not 0, the network's gradient may differ by ten times as much.
         of_rgb: Of the largest colour, by how much colours may differ.
+        of_field: Whether gradients are those of each array that a field is stored in.
 
     Returns:
         For each, the greatest differences in colours, gradient and the network's, if there is one,
@@ -128,7 +132,8 @@ def check(
     for (name, threads), run in runs.items():
         run.step()
         run.step()  # a gradient that is not zeroed would show
-        found = {"rgb": run.rgb(), "gradient": run.gradient()}
+        found = {"rgb": run.rgb()}
+        found |= run.gradients() if of_field else {"gradient": run.gradient()}
         network = run.network_gradient() if hasattr(run, "network_gradient") else np.zeros(0)
         if network.size:
             found["network"] = network
@@ -137,7 +142,7 @@ def check(
         for what, values in found.items():
             largest = np.abs(expected[what]).max()
             apart = np.abs(values - expected[what]).ravel()
-            if what == "gradient" and at_kinks:
+            if at_kinks and what not in ("rgb", "network"):
                 apart = np.sort(apart)[: int(len(apart) * (1.0 - at_kinks))]
             difference = by_value[what] = float(apart.max() / largest)
             allowed = of_rgb if what == "rgb" else TOLERANCE

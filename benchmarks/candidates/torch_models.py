@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -142,6 +142,12 @@ class Choices:
     threads: int = 1
     """torch.set_num_threads."""
 
+    @property
+    def words(self) -> str:
+        """What of it is no number."""
+        noted = ", touched nodes noted" if self.sparse else ""
+        return f"gradients by {self.scattering}{noted}"
+
 
 class Part(NamedTuple):
     """Samples of some rays, packed; and where they lie."""
@@ -150,8 +156,8 @@ class Part(NamedTuple):
     width: int  # samples of the ray that has most
     ray: torch.Tensor  # [n_samples], ascending
     first: torch.Tensor  # [n_rays] each one's first sample
-    node: torch.Tensor  # [n_samples, 8] int32
-    share: torch.Tensor  # [n_samples, 8]
+    place: tuple[torch.Tensor, ...]  # where samples lie: nodes int32 and shares, [n_samples, 8]
+    length: torch.Tensor | float  # of steps, times the density scale; [n_samples] or all alike
     factor: torch.Tensor  # [n_samples] on gradients
     directions: torch.Tensor  # [n_rays, 3]
     density: torch.Tensor | None  # [n_samples] raw, where it was needed to find the samples
@@ -164,17 +170,48 @@ class TorchModels:
         """Load a workload."""
         self._work = work
         self.choices = choices
-        self._space = TorchSpace(work.free, device)
-        self._steps = (torch.arange(work.n_steps, device=device) + 0.5) * work.step
         self._rays = [
             torch.from_numpy(array).to(device)
             for array in (work.origins, work.directions, work.target_rgb)
         ]
+        self._background = torch.tensor(work.background, device=device)
+        self.network = [torch.tensor(array, device=device) for array in work.network]
+        for parameter in self.network:
+            parameter.requires_grad_()
+        self._on = torch.zeros((), device=device, requires_grad=True)
+        self._colors: Callable[[Part], torch.Tensor] = {
+            "rgb": self._rgb,
+            "sh": self._sh,
+            "deferred": self._deferred,
+            "per_sample": self._features,
+            "dvgo": self._features,
+        }[work.model]
+        self.tables: list[Table] = []
+        """What nodes hold: all of it, or features and densities."""
+        self._load_field(work, device)
+
+    @property
+    def weights(self) -> list[torch.Tensor]:
+        """What all rays share, which an optimiser updates as a whole."""
+        return self.network
+
+    def ways(self) -> list[Choices]:
+        """What may be fastest, on as many threads."""
+        scatterings: tuple[Scattering, ...] = ("rows", "pairs")
+        return [
+            replace(self.choices, parts=parts, scattering=scattering, sparse=sparse)
+            for parts, scattering, sparse in itertools.product(
+                (1, 4, 16, 64), scatterings, (False, True)
+            )
+        ]
+
+    def _load_field(self, work: Workload, device: str) -> None:
+        self._space = TorchSpace(work.free, device)
+        self._steps = (torch.arange(work.n_steps, device=device) + 0.5) * work.step
         self._centre, self._half = (
             torch.from_numpy(0.5 * (work.box[1] + sign * work.box[0])).float().to(device)
             for sign in (1.0, -1.0)
         )
-        self._background = torch.tensor(work.background, device=device)
         nodes = torch.tensor(work.values.shape[:3], device=device)
         self._to_nodes = 0.5 * (nodes[:, None] - 1)
         self._last = (nodes[:, None] - 2).int()
@@ -186,31 +223,19 @@ class TorchModels:
         self._corners = (corners @ strides).int().to(device)  # [8]
         values = torch.tensor(work.values.reshape(-1, work.values.shape[3]), device=device)
         self._nodes = Table(values, self._corners)
-        self.tables = [self._nodes]
-        """What nodes hold: all of it, or features and densities."""
+        self.tables.append(self._nodes)
         self._densities: Table | None = None
         if MODELS[work.model].threshold is not None:  # most samples need nothing but their density
             self._densities = Table(values[:, :1].contiguous(), self._corners)
             self.tables.append(self._densities)
-        self.network = [torch.tensor(array, device=device) for array in work.network]
-        for parameter in self.network:
-            parameter.requires_grad_()
         self._optical_step = work.density_scale * work.step
-        self._on = torch.zeros((), device=device, requires_grad=True)
-        self._colors: Callable[[Part], torch.Tensor] = {
-            "rgb": self._rgb,
-            "sh": self._sh,
-            "deferred": self._deferred,
-            "per_sample": self._features,
-            "dvgo": self._features,
-        }[work.model]
 
     def step(self) -> None:
         """Forward, loss and adjoint, part after part."""
         torch.set_num_threads(self.choices.threads)
         for table in self.tables:
             table.clear()
-        for parameter in self.network:
+        for parameter in self.weights:
             parameter.grad = None
         n_rays = len(self._work.origins)
         for part in self._parts():
@@ -263,8 +288,8 @@ class TorchModels:
             width=width,
             ray=ray,
             first=first,
-            node=node,
-            share=share,
+            place=(node, share),
+            length=self._optical_step,
             factor=factor if work.scaled else torch.ones_like(factor),
             directions=directions,
             density=density,
@@ -300,7 +325,7 @@ class TorchModels:
         """Of samples [n_samples], and light that passes [n_rays]."""
         sigma = Scale.apply(F.softplus(raw_density + self._work.density_shift), part.factor)
         n_rays, width = len(part.directions), part.width
-        tau = sigma.new_zeros(n_rays * width).index_copy(0, part.index, sigma * self._optical_step)
+        tau = sigma.new_zeros(n_rays * width).index_copy(0, part.index, sigma * part.length)
         tau = tau.view(n_rays, width)
         depth = tau.cumsum(1)
         weight = torch.exp(tau - depth) * -torch.expm1(-tau)
@@ -313,7 +338,7 @@ class TorchModels:
 
     def _read(self, part: Part) -> tuple[torch.Tensor, torch.Tensor]:
         """Raw densities [n_samples] and all raw values [n_samples, n_values]."""
-        return Unpack.apply(self._interpolate(part.node, part.share))
+        return Unpack.apply(self._interpolate(*part.place))
 
     def _rgb(self, part: Part) -> torch.Tensor:
         density, raw = self._read(part)
@@ -347,17 +372,17 @@ class TorchModels:
     def _features(self, part: Part) -> torch.Tensor:
         """Of the first layer, what comes of the direction is done once for a ray."""
         known = None if part.density is None else part.density[:, None]
-        density = Interpolate.apply(self._on, self._densities, part.node, part.share, "rows", known)
+        density = Interpolate.apply(self._on, self._densities, *part.place, "rows", known)
         weight, passed = self._weights(density[:, 0], part)
         model = MODELS[self._work.model]
         seen = (weight.detach() > model.threshold).nonzero()[:, 0]
         ray = part.ray[seen]
         counts = torch.bincount(ray, minlength=len(passed))
         first = counts.cumsum(0) - counts
-        node = part.node[seen]
+        node, share = (array[seen] for array in part.place)
         if self.choices.sparse:
             self._nodes.note(node[:, 0])
-        raw = self._interpolate(node, part.share[seen])
+        raw = self._interpolate(node, share)
         encoded = view_encoding(part.directions, model.n_frequencies)
         weights, bias = self.network[:2]
         n_colours = model.n_own_colours

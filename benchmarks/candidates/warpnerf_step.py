@@ -84,7 +84,6 @@ class WarpStep:
         self._model = work.warp_model()
         self._weights = work.weights(workers)
         self._grid = work.voxel_grid(workers)
-        self._clear = clear_kernel(self._grid.n_floats)
         self._free = work.free_cells(workers)
         self._steps = work.steps()
         self._batch = work.batch(workers)
@@ -105,15 +104,31 @@ class WarpStep:
         """Zero what the last step touched, then the training pass."""
         gradients = self._pass.gradients
         span = 1 if self._workers.device.is_cuda else NODES_PER_THREAD
-        n = -(-gradients.values.shape[0] // span)
-        self._workers.launch(self._clear, n, span, gradients.struct, cache=self._launches)
+        for name, rule in self._grid.kind.rules.items():
+            array = gradients.arrays[name]
+            if rule != "nodes":
+                array.zero_()
+                continue
+            n, clear = -(-array.shape[0] // span), clear_kernel(array.dtype._length_)
+            entries = gradients.entries(name, "touched")
+            self._workers.launch(clear, n, span, entries, cache=self._launches)
         gradients.touched.zero_()
         gradients.weights.zero_()
         self._pass.run(self._free, self._batch)
 
     def gradient(self) -> np.ndarray:
-        """[X, Y, Z, n_values]"""
+        """[X, Y, Z, n_values] of a dense grid."""
         return self._pass.gradients.values.numpy().reshape(self._size)
+
+    def gradients(self) -> dict[str, np.ndarray]:
+        """Of each array of what a field is stored in, entry by entry; of all workers together."""
+        found = {}
+        for name, values in self._grid.tensors().items():
+            gradient = self._pass.gradients.arrays[name].numpy()
+            if self._grid.kind.rules[name] != "nodes":
+                gradient = gradient.sum(axis=0)[: values.size]
+            found[name] = gradient.reshape(values.shape)
+        return found
 
     def network_gradient(self) -> np.ndarray:
         """[n_parameters], weights and biases in turn; of all workers together."""
@@ -140,7 +155,11 @@ class WarpStep:
 
     def n_samples(self) -> int:
         """Visited steps of the last step."""
-        return int(self._pass.n_samples.numpy().sum())
+        return int(self.samples_of_rays().sum())
+
+    def samples_of_rays(self) -> np.ndarray:
+        """The same of each ray, [n_rays]."""
+        return self._pass.n_samples.numpy()
 
     def scratch_bytes(self) -> tuple[int, int]:
         """Of the training pass but the gradient: what a step uses, and what it has room for."""

@@ -1,6 +1,7 @@
 """The benchmarks' torch for models with features computes what the oracle does."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,11 +9,14 @@ import pytest
 import torch
 
 from tests import reference
+from tests.support.tiny_trainings import ball
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 
+import field_workload
+import throughput
 import workload
-from candidates import torch_adam, torch_models, torch_nodes
+from candidates import torch_adam, torch_fields, torch_models, torch_nodes, warpnerf_step
 
 
 def oracle(work: workload.Workload) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -71,6 +75,29 @@ def test_torch_computes_what_the_oracle_does(model, scene, scaled, grid):
             assert reference.relative_error(found.gradient(), gradient) < 1e-5
             if model != "sh":
                 assert reference.relative_error(found.network_gradient(), of_network) < 1e-5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("unbounded", [False, True])
+@pytest.mark.parametrize("field", ["vm", "hash"])
+def test_torch_reads_fields_as_warpnerf_does(field, unbounded):
+    """Also where space is contracted; what differs does not pass."""
+    scene = replace(ball(), unbounded=unbounded)
+    work = field_workload.late_field(scene, "deferred", field, 250, 2000)
+    assert work.trained.lattice.contracted == unbounded
+    ours = warpnerf_step.load(work, 1, "cpu")
+    ours.step()
+    visited = ours.samples_of_rays()
+    assert np.array_equal(np.bincount(work.ray_of_sample, minlength=len(visited)), visited)
+    theirs = torch_fields.TorchFields(work, torch_fields.FieldChoices(threads=2))
+    runs = {("warpnerf", 1): ours, ("torch", 1): theirs}
+    for choices in theirs.ways():
+        theirs.choices = choices
+        found = throughput.check(runs, 1e-4, 1e-4, of_field=True)["torch, 1 threads"]
+        assert len(found) == {"vm": 5, "hash": 4}[field]
+    theirs._reach *= 1.01
+    with pytest.raises(SystemExit, match="torch on 1 threads differs"):
+        throughput.check(runs, 1e-4, 1e-4, of_field=True)
 
 
 @pytest.mark.parametrize("size", [(4, 4, 4), (3, 5, 7), (2, 2, 3)])

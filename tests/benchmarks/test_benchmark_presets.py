@@ -59,6 +59,19 @@ def test_against_torch(tmp_path, scenes, models):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("field", ["vm", "hash"])
+def test_against_torch_with_other_fields(tmp_path, field):
+    options = ("builtin:room-sparse", "--field", field, "--grid", "10", "--steps", "250")
+    options += ("--downscale", "8", "--rounds", "2", "--threads", "1")
+    record, _ = run("against_torch.py", tmp_path / "record.json", *options)
+    (row,) = record["rows"]
+    assert record["field"] == field and row["model"] == "deferred" and row["n_samples"] > 0
+    assert {"rgb", "decoder", "network"} < set(row["differences"]["torch, 1 threads"])
+    assert is_interval(row["step_over_warpnerf"]) and is_interval(row["pass_over_warpnerf"])
+    assert "read by" in row["torch_choices"]["1"]
+
+
+@pytest.mark.slow
 def test_schedules(tmp_path):
     scene = ("builtin:room-sparse", "--downscale", "8")
     options = (*scene, "--seeds", "1", "2", "--time-limit", "1.5")
