@@ -124,7 +124,7 @@ def trained(scene: wn.Scene, field: str, scaling: str, seed: int, args: Any) -> 
 
 def table(rows: list[dict[str, Any]]) -> list[str]:
     """Lines of a capture: of each field without scaling, and what the others gain, paired."""
-    names = [name for name in FIGURES if name in rows[0]]
+    names = [name for name in FIGURES if any(name in row for row in rows)]
     lines = [f"{'':30}" + "".join(f"{name:>20}" for name in names)]
     for field in dict.fromkeys(row["field"] for row in rows):
         by_seed = {(r["scaling"], r["seed"]): r for r in rows if r["field"] == field}
@@ -132,6 +132,9 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
         for scaling in SCALINGS:
             cells = []
             for name in names:
+                if any(name not in by_seed[which, seed] for which in SCALINGS for seed in seeds):
+                    cells.append("")
+                    continue
                 figures = np.array([by_seed[scaling, seed][name] for seed in seeds])
                 if scaling != "none":
                     figures = figures - [by_seed["none", seed][name] for seed in seeds]

@@ -64,6 +64,7 @@ def scaling(records: Records) -> str:
         ),
         table(head, rows),
         equal_steps(records),
+        by_field(records),
     )
 
 
@@ -95,6 +96,29 @@ def equal_steps(records: Records) -> str:
             *(records.source(name) for name in names),
         ),
         table([*head, "depth error [m]"], rows),
+    )
+
+
+def by_field(records: Records) -> str:
+    record = records["scaling_fields"]
+    rows, settings = record["rows"], record["settings"]
+
+    def gains(field: str) -> str:
+        means = [
+            [
+                np.mean([r["psnr"] for r in of(rows, field=field, scene=scene, scaling=scaling)])
+                for scene in values(rows, "scene")
+            ]
+            for scaling in ("clamped", "none")
+        ]
+        of_captures = np.subtract(*means)
+        return f"`{field}` {of_captures.min():+.2f} to {of_captures.max():+.2f}"
+
+    said = ", ".join(map(gains, values(rows, "field")))
+    return text(
+        f"""{settings["steps"]} equal steps of {settings["rays"]} rays, gain of PSNR in dB
+        ([by capture](decisions/fields.md)): {said}.""",
+        records.source("scaling_fields"),
     )
 
 
