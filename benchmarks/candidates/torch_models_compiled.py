@@ -55,7 +55,7 @@ class CompiledModels(TorchModels):
         """Forward, loss and adjoint."""
         torch.set_num_threads(self.choices.threads)
         part = self._part(slice(0, len(self._work.origins)))
-        node = part.node.long()
+        node = part.place[0].long()
         if self._is_features:
             density, weight = self._read_densities(node, part)
             seen = (weight > MODELS["per_sample"].threshold).nonzero()[:, 0]
@@ -104,7 +104,7 @@ class CompiledModels(TorchModels):
 
     def _densities_of(self, node: torch.Tensor, part: Part) -> tuple[torch.Tensor, torch.Tensor]:
         assert self._densities is not None
-        density = self._gather(self._densities.values, node, part.share)[:, 0]
+        density = self._gather(self._densities.values, node, part.place[1])[:, 0]
         return density, self._composited(density, part)[0]
 
     def _loss(self, rgb: torch.Tensor) -> torch.Tensor:
@@ -138,9 +138,9 @@ class CompiledModels(TorchModels):
             seen = seen + passed[:, None] * self._background
             return self._loss(seen), seen
 
-        raw = self._gather(self._nodes.values, node, part.share)
+        raw = self._gather(self._nodes.values, node, part.place[1])
         (adj_raw, *adj_network), seen = self._differentiated(loss, raw, *self.network)
-        gradient = self._scatter(torch.zeros_like(self._nodes.values), node, part.share, adj_raw)
+        gradient = self._scatter(torch.zeros_like(self._nodes.values), node, part.place[1], adj_raw)
         return gradient, seen, tuple(adj_network)
 
     def _train_features(
@@ -164,7 +164,7 @@ class CompiledModels(TorchModels):
             seen = seen + passed[:, None] * self._background
             return self._loss(seen), seen
 
-        near, share = node[chosen], part.share[chosen]
+        near, share = node[chosen], part.place[1][chosen]
         raw = self._gather(self._nodes.values, near, share)
         (adj_density, adj_raw, *adj_network), seen = self._differentiated(
             loss, density, raw, *self.network
@@ -172,7 +172,7 @@ class CompiledModels(TorchModels):
         gradient = self._scatter(torch.zeros_like(self._nodes.values), near, share, adj_raw)
         assert self._densities is not None
         of_density = torch.zeros_like(self._densities.values)
-        of_density = self._scatter(of_density, node, part.share, adj_density[:, None])
+        of_density = self._scatter(of_density, node, part.place[1], adj_density[:, None])
         gradient = torch.cat([of_density, gradient[:, 1:]], dim=1)
         return gradient, seen, tuple(adj_network)
 
