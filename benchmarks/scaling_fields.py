@@ -28,6 +28,7 @@ from presets import configured, some
 from training import path_of
 
 import warpnerf as wn
+from warpnerf.checks import InputError
 from warpnerf.runtime.parallel import Workers
 
 FIELDS = {
@@ -37,6 +38,7 @@ FIELDS = {
     "hash, epsilon 1e-8": "fast field=hash field.epsilon=1e-8",
     "hash, epsilon 1e-15": "fast field=hash field.epsilon=1e-15",
     "mip360": "mip360",
+    "mip360, no distortion": "mip360 loss.distortion=0",
 }
 SCALINGS = ("none", "quadratic", "clamped")
 FIGURES = ("psnr", "ssim", "lpips", "near_mass", "pulled_psnr", "depth_error")
@@ -86,11 +88,18 @@ def main() -> None:
 
 
 def done_before(output: Path, settings: dict[str, Any]) -> list[dict[str, Any]]:
-    """The rows of a record that an earlier run with the same settings has left, or none."""
+    """The rows of a record that an earlier run has left, or none.
+
+    Raises:
+        InputError: It had other settings or fields.
+    """
     if not output.is_file():
         return []
     record = json.loads(output.read_text())
-    return record["rows"] if record["settings"] == settings else []
+    known = {name: FIELDS.get(name) for name in record["fields"]}
+    if (record["settings"], record["fields"]) != (settings, known):
+        raise InputError(f"{output} has other settings or fields; name another --output.")
+    return list(record["rows"])
 
 
 def trained(scene: wn.Scene, field: str, scaling: str, seed: int, args: Any) -> dict[str, Any]:
@@ -128,7 +137,13 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
     lines = [f"{'':30}" + "".join(f"{name:>20}" for name in names)]
     for field in dict.fromkeys(row["field"] for row in rows):
         by_seed = {(r["scaling"], r["seed"]): r for r in rows if r["field"] == field}
-        seeds = sorted({seed for _, seed in by_seed})
+        seeds = [
+            seed
+            for seed in sorted({seed for _, seed in by_seed})
+            if all((scaling, seed) in by_seed for scaling in SCALINGS)
+        ]
+        if not seeds:  # interrupted before it had all scalings
+            continue
         for scaling in SCALINGS:
             cells = []
             for name in names:

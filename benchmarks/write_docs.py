@@ -116,8 +116,9 @@ def by_field(records: Records) -> str:
 
     said = ", ".join(map(gains, values(rows, "field")))
     return text(
-        f"""{settings["steps"]} equal steps of {settings["rays"]} rays, gain of PSNR in dB
-        ([by capture](decisions/fields.md)): {said}.""",
+        f"""{settings["steps"]} equal steps of {settings["rays"]} rays, what clamped
+        scaling gains over none, PSNR in dB (negative: it loses;
+        [by capture](decisions/fields.md)): {said}.""",
         records.source("scaling_fields"),
     )
 

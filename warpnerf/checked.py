@@ -19,7 +19,8 @@ Checked = TypeVar("Checked", bound=type[Any])
 
 
 def checked(part: str) -> Callable[[Checked], Checked]:
-    """Check the types of fields, after what ``__post_init__`` refuses by itself.
+    """Check the types of fields, after what ``__post_init__`` refuses by itself; before, numbers of
+    NumPy become Python's, as files hold them.
 
     A decorator above ``dataclass``, for classes with a ``__post_init__``.
 
@@ -32,6 +33,8 @@ def checked(part: str) -> Callable[[Checked], Checked]:
 
         @wraps(refuse)
         def __post_init__(self: Any) -> None:
+            for field in fields(self):
+                object.__setattr__(self, field.name, _plain(getattr(self, field.name)))
             try:
                 refuse(self)
             except InputError:
@@ -46,6 +49,14 @@ def checked(part: str) -> Callable[[Checked], Checked]:
         return kind
 
     return decorate
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.generic):
+        return value.item()
+    if type(value) is tuple and any(isinstance(one, np.generic) for one in value):
+        return tuple(map(_plain, value))
+    return value
 
 
 def _require_types(part: str, value: Any, kind: type[Any]) -> None:
@@ -99,7 +110,7 @@ def in_words(hint: Any) -> str:
         return " or ".join(map(str, inner))
     if origin is tuple:
         count = "" if inner[1:] == (...,) else f"{len(inner)} "
-        return f"{count}values, each {in_words(inner[0])}"
-    words = {int: "a whole number", float: "a number", bool: "True or False", str: "text"}
+        return f"a list of {count}values, each {in_words(inner[0])}"
+    words = {int: "a whole number (int)", float: "a number", bool: "True or False", str: "text"}
     words |= {NoneType: "None", Path: "a path", np.ndarray: "an array"}
     return words.get(hint, f"a {getattr(hint, '__name__', hint)}")

@@ -41,14 +41,15 @@ LONGEST = 60
 
 
 def said(value: object) -> str:
-    """A value as sentences quote it: by its type where it is long."""
+    """A value as sentences quote it: its beginning where it is long, its type where that is in
+    lines."""
     try:
         text = repr(value.item() if isinstance(value, np.generic) else value)
     except ValueError:  # a whole number of more digits than Python writes
-        text = ""
-    if text and len(text) <= LONGEST and "\n" not in text:
-        return text
-    return f"one of type {type(value).__name__}"
+        text = "\n"
+    if "\n" in text:
+        return f"a value of type {type(value).__name__}"
+    return text if len(text) <= LONGEST else text[: LONGEST - 3] + "..."
 
 
 def _is_finite(value: object) -> bool:

@@ -323,9 +323,11 @@ class TrainConfig:
         elif self.optim.tv_density == self.optim.tv_rgb == 0.0 and not self.field.has_sparsity:
             for name in ("tv_until", "tv_every"):
                 if getattr(self.optim, name) != getattr(OptimConfig, name):
+                    weights = ["optim.tv_density", "optim.tv_rgb"]
+                    weights += ["field.sparsity"] * hasattr(self.field, "sparsity")
                     raise InputError(
-                        f"optim.{name} is {getattr(self.optim, name):g}, but optim.tv_density and "
-                        f"optim.tv_rgb are 0; set one of them, or leave {name} out."
+                        f"optim.{name} is {getattr(self.optim, name):g}, but "
+                        f"{' and '.join(weights)} are 0; set one of them, or leave {name} out."
                     )
         for part, value, names, why in unused:
             for name in names:
@@ -359,8 +361,6 @@ class TrainConfig:
                 f"{self.coarse_steps}: fewer find nothing."
             )
         require_whole("rays_per_step", self.rays_per_step, 1)
-        if self.rays_per_step >= 2**31:
-            raise InputError("rays_per_step must be below 2^31, which kernels can count.")
         require_whole("occupancy_every", self.occupancy_every, 1)
         require_at_least("alpha_min", self.alpha_min, 0.0)
         if self.alpha_min >= 1.0:

@@ -1,12 +1,13 @@
 """Configurations to begin with, by name.
 
 ``fast`` and ``quality`` are what warpnerf reaches in a minute or three and in a quarter of an hour
-on two cores; docs/decisions/presets.md says how they were chosen. The others are the published
-hyperparameters of DirectVoxGO, TensoRF and Instant-NGP, to compare with; they take hours on two
-cores. First DirectVoxGO.
+on two cores; docs/decisions/presets.md says how they were chosen. The others are there to compare
+with, and take hours on two cores: the published hyperparameters of DirectVoxGO, TensoRF and
+Instant-NGP, and ``mip360``, which samples as Mip-NeRF 360 does.
 
-Source of these: Sun et al. 2022 (CVPR), Sun et al. 2022 (arXiv 2206.05085), and the configurations
-in their repository: default.py, nerf_unbounded_default.py, llff_default.py. Different here:
+``dvgo``, ``dvgo-unbounded`` and ``dvgo-llff`` are DirectVoxGO's: Sun et al. 2022 (CVPR), Sun et
+al. 2022 (arXiv 2206.05085), and default.py, nerf_unbounded_default.py and llff_default.py in their
+repository. Different here:
 
 - Gradients are scaled by distance; ``scaling="none"`` leaves that out.
 - The near plane is 0; theirs is 2 in Blender's scenes.
@@ -72,6 +73,8 @@ is of s; an MLP colours each sample. Different here:
 - One proposal of 64 bins; theirs are two.
 - 25 000 steps of 4096 rays; theirs are 250 000 of 16 384, at the rates of their network.
 - Huber's loss stands for Charbonnier's; gradients are not clipped, but scaled by distance.
+- A loss on opacity is added.
+- The near plane is 0; theirs is 0.2. The colour network has two layers of 64 units.
 - D is the content distance; they scale scenes so that all cameras lie in a cube of edge 2.
 """
 

@@ -18,7 +18,7 @@ many parts as there are threads, which shares the planes.
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -231,8 +231,3 @@ class TorchFields(TorchModels):
             return {"values": entries[0], "decoder": of_decoder}
         planes, lines = np.concatenate(entries[:3]), np.concatenate(entries[3:])
         return {"planes": planes, "lines": lines, "decoder": of_decoder}
-
-
-def first_choices(threads: int) -> Choices:
-    """Of a candidate that is not timed."""
-    return replace(FieldChoices(), threads=threads, parts=16)

@@ -97,6 +97,7 @@ def test_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert "cuda:97" in capsys.readouterr().err
 
 
+@pytest.mark.slow  # compiles for two presets
 def test_warmup_says_what_it_did(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -30,14 +30,14 @@ from warpnerf.model.interface import Model
 from warpnerf.rendering.steps import Steps
 
 MODELS = (
-    pytest.param(SH[0], marks=pytest.mark.slow),
+    SH[0],
     SH[3],
     DEFERRED_SMALL,
     DEFERRED,
     DEFERRED_LARGE,
     FEATURES_SMALL,
     FEATURES,
-    pytest.param(FEATURES_LARGE, marks=pytest.mark.slow),
+    FEATURES_LARGE,
 )
 each_model = pytest.mark.parametrize("model", MODELS, ids=name_of)
 """All of them clamped: a scaling is compiled for."""

@@ -35,10 +35,11 @@ def reports(rise: float, seen: float = 1.0, n: int = 100) -> list[Progress]:
         (3.0, 1.3, 29.0, "time", "rose by 2.9 dB in the last third; try more --steps"),
         (3.0, 1.3, None, "time", "rose by 2.9 dB"),
         (0.3, 1.5, 29.0, "nothing", "neither voxels nor photographs nor time stands out"),
+        (0.3, None, 29.0, "nothing", "as a limit: training views reach 30.0 dB"),
     ],
 )
 def test_the_largest_is_named(
-    rise: float, pixels: float, test_psnr: float | None, name: str, says: str
+    rise: float, pixels: float | None, test_psnr: float | None, name: str, says: str
 ) -> None:
     limit = what_limits(reports(rise), pixels, test_psnr)
     assert limit is not None and limit.name == name

@@ -14,7 +14,7 @@ from warpnerf.sfm.scene_files import Record, remove_written
 
 FILES = (".lock", "config.json", "log.jsonl", "metrics.json", "test.png", "field.safetensors")
 LATER = ("checkpoint-00000010.safetensors", "test/view.png", "previous/config.json")
-FOLDERS = ("test", "previous", "previous/test", "scene", "next", "next/scene")
+FOLDERS = ("test", "previous", "previous/test", "scene", "next", "next/scene", "scene/images")
 
 
 def begun(folder: Path) -> Path:
@@ -39,10 +39,24 @@ def test_a_link_in_place_of_a_file_is_refused(tmp_path: Path, name: str, danglin
 @pytest.mark.parametrize("name", FOLDERS)
 def test_a_link_in_place_of_a_folder_is_refused(tmp_path: Path, name: str) -> None:
     run = begun(tmp_path)
+    (run / name).parent.mkdir(exist_ok=True)
     if (run / name).exists():
         (run / name).rmdir()
     (run / name).symlink_to(tmp_path / "elsewhere")
     with pytest.raises(InputError, match=f"{name} is a link"), only_writer(run):
+        pass
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid") or os.getuid() == 0, reason="root may look anywhere")
+def test_a_folder_that_may_not_be_looked_into(tmp_path: Path) -> None:
+    run = begun(tmp_path)
+    run.chmod(0o600)
+    with pytest.raises(InputError, match=r"run cannot be written: .*give access"), only_writer(run):
+        pass
+
+
+def test_a_name_that_is_too_long(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot be written"), only_writer(tmp_path / ("x" * 300)):
         pass
 
 

@@ -5,7 +5,7 @@ import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import wraps
+from functools import cache, wraps
 from pathlib import Path
 
 import warp as wp
@@ -18,8 +18,8 @@ except ImportError:  # Windows: each compiles for itself
     fcntl = None  # type: ignore[assignment]
 
 OPTION = "optimization_level"
-NOT_FOR_USERS = ("warpnerf_kernels_float64", "warpnerf_kernels.launch.scalar")
-"""Modules of kernels that no training runs on the CPU: those in float64, and the plain form."""
+FLOAT64 = "warpnerf_kernels_float64"
+"""Where modules of kernels are that no training runs."""
 LOCKS = Path(tempfile.gettempdir()) / "warpnerf-tests-locks"
 
 
@@ -35,12 +35,20 @@ def one_at_a_time(name: str) -> Iterator[None]:
         yield
 
 
+@cache
+def unoptimised(kernel: wp.Kernel) -> wp.Kernel:
+    """The same kernel in a module of its own that is not optimised: compiled in a fifth of the
+    time, for tests that launch it a few times."""
+    module = wp.Module(f"{kernel.module.name}_unoptimised", None)
+    module.options.update({**kernel.module.options, OPTION: 0})
+    return wp.Kernel(kernel.func, key=kernel.key, module=module, options=kernel.options)
+
+
 def compile_as_tests_do() -> None:
     """From now on in this process.
 
-    Kernels in float64 and plain ones are for checking what is computed, and are launched a few
-    times: they are not optimised, which halves the time that they take. Those that train on the CPU
-    are as users have them.
+    Kernels in float64 are for checking what is computed, and are launched a few times: they are not
+    optimised. Those that train are as users have them.
     """
     load = Workers.load
 
@@ -48,7 +56,7 @@ def compile_as_tests_do() -> None:
     def quickly(workers: Workers, kernel: wp.Kernel) -> None:
         if kernel in workers._loaded:
             return
-        if kernel.func.__module__.startswith(NOT_FOR_USERS) and not workers.device.is_cuda:
+        if kernel.func.__module__.startswith(FLOAT64) and not workers.device.is_cuda:
             kernel.module.options[OPTION] = 0
         with one_at_a_time(kernel.module.name):
             load(workers, kernel)

@@ -11,6 +11,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+import warp as wp
 
 from tests.model.test_config_options import words
 from tests.runs.test_checkpoint import rewrite
@@ -33,9 +34,11 @@ from warpnerf.config import MarchConfig, TrainConfig
 from warpnerf.config_json import config_from_json, config_to_json, decode
 from warpnerf.evaluation.evaluate import evaluate
 from warpnerf.model.sampler_kinds import MARCHED, Resampled
+from warpnerf.optim_config import OptimConfig
 from warpnerf.rendering import field as rendering
 from warpnerf.rendering.proposal import unit_of
 from warpnerf.runs.checkpoint import load_field, save_field
+from warpnerf.training.growth import require_room
 from warpnerf.training.plan import resolve
 from warpnerf.training.train import train
 from warpnerf.training.trainer import Trainer
@@ -224,3 +227,16 @@ def test_a_plan_counts_its_memory() -> None:
     plans = [resolve(scene, replace(tiny_config(), sampler=s)) for s in (MARCHED, DRAWN)]
     more = plans[1].memory - plans[0].memory
     assert more == DRAWN.training_bytes(300) > 1000 * 12
+
+
+def test_what_needs_too_much_memory_is_named() -> None:
+    scene, cpu = ball(), wp.get_device("cpu")
+    large = replace(tiny_config(), sampler=replace(DRAWN, voxels=10**11))
+    with pytest.raises(InputError, match=r"^rays_per_step: .* or fewer voxels of the sampler"):
+        require_room(resolve(scene, large), cpu)
+    many = replace(tiny_config(), rays_per_step=2**31 - 1)
+    with pytest.raises(InputError, match=r"^rays_per_step: the rays of an update"):
+        require_room(resolve(scene, many), cpu)
+    together = replace(many, optim=OptimConfig(accumulate_at=(0.5,)))
+    with pytest.raises(InputError, match=r"up to 2 steps .* together below 2\^31"):
+        resolve(scene, together)

@@ -16,6 +16,7 @@ _MEANT = {
         *("--data", "--data-dir", "--datadir", "--data-path", "--dataset", "--scene", "--source"),
         *("--source-path", "--input", "--path"),
     ),
+    "--scene": ("--data", "--data-dir", "--datadir", "--dataset", "--source-path", "--input"),
     "--output": (
         *("--output-dir", "--out", "--out-dir", "--save-dir", "--basedir", "--logdir"),
         *("--model-path", "--result-dir", "--workspace", "--expname", "--experiment-name"),
@@ -26,12 +27,12 @@ _MEANT = {
         "--train-num-rays-per-batch",
     ),
     "--resume": ("--ckpt", "--checkpoint", "--load-checkpoint", "--load-dir", "--start-checkpoint"),
-    "--device": ("--gpu", "--gpus", "--cuda"),
-    "--background": ("--background-color", "--white-background", "--white-bkgd"),
-    "--box": ("--aabb", "--aabb-scale", "--bound", "--scene-scale"),
+    "--device": ("--cuda", "--gpu", "--gpus"),
+    "--background": ("--background-color",),
+    "--box": ("--aabb",),
     "--near": ("--near-plane", "--min-near"),
     "--optim.learning-rate-density": ("--lr", "--learning-rate", "--lr-init", "--lrate"),
-    "--grid.voxels": ("--num-voxels", "--n-voxels", "--voxels-per-axis"),
+    "--voxels": ("--num-voxels", "--n-voxels"),
 }
 
 

@@ -51,8 +51,8 @@ COMMANDS: dict[str, Callable[..., int]] = {
 PATHS = ("--output", "--resume", "--config", "--scene", "--masks", "--json")
 """Options whose value may be any name."""
 
-TAKES_A_SCENE = ("train", "inspect")
-"""Subcommands whose first word is a scene."""
+TAKES_A_SCENE = ("train", "inspect", "pose")
+"""Subcommands whose first word is a folder of a scene, or of photographs."""
 
 NARROWEST = 24
 """Columns of a terminal; in fewer, laying out help would not end."""
@@ -106,7 +106,7 @@ def _require_known(name: str, words: Sequence[str]) -> None:
             given, ours = word.partition("=")[0], meant_by(flag, known)
             if ours == SCENE:
                 raise InputError(
-                    f"{name} has no option {given}: what to train on is a word without one, as in "
+                    f"{name} has no option {given}: its folder is a word without one, as in "
                     f"warpnerf {name} FOLDER."
                 )
             hint = near_to(flag, sorted(flags)) if ours is None else f", here it is {ours}"

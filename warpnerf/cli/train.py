@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -393,8 +394,9 @@ def _train(run: Run, scene: Scene, trainer: Trainer, session: Session | None) ->
         with ProgressBar("first view") as bar:
             result = run.evaluate(trainer.field(), scene, split, bar.report)
         print(result)
-        pixels = trainer.plan.voxel_pixels.median
-        limit = what_limits(reports, pixels, result.mean["psnr"] if split == "test" else None)
+        limit = what_limits(
+            reports, _voxel_pixels(trainer), result.mean["psnr"] if split == "test" else None
+        )
         if limit is not None:
             print(limit)
     except Stopped as stopped:
@@ -405,6 +407,16 @@ def _train(run: Run, scene: Scene, trainer: Trainer, session: Session | None) ->
         f"with truth, rendering and depth of every view\nlook at {run.sheet}",
     )
     return 0
+
+
+def _voxel_pixels(trainer: Trainer) -> float | None:
+    """Width of a voxel of the grid that there is now, pixels; None: it says nothing."""
+    from warpnerf.scenes.extent.sharpness import sharpness
+
+    if not trainer.config.field.as_fine_as_nodes:
+        return None
+    lattice = trainer.lattice
+    return sharpness(trainer.scene, lattice.space, math.prod(lattice.size), True).median
 
 
 def _scaling(plan: TrainingPlan) -> str:

@@ -366,7 +366,7 @@ def require_memory(
         model: What is stored.
         size: Nodes of the lattice along each axis.
         device: Where it is to be trained.
-        besides: Bytes that training takes besides the field.
+        besides: Bytes that rays and sampler take besides the field.
 
     Raises:
         InputError: It does not, or kernels cannot count so many nodes.
@@ -376,12 +376,19 @@ def require_memory(
             f"grid.voxels must give fewer than {MAX_VOXELS} nodes, not {math.prod(size)}; use "
             "fewer voxels."
         )
-    needed = kind.training_bytes(model, size) + besides
+    own = kind.training_bytes(model, size)
     total = device.total_memory if device.is_cuda else usable_memory()
     where = device if device.is_cuda else "this machine"
-    if total is not None and needed > total:
+    if total is None or own + besides <= total:
+        return
+    there_is = f"but {where} has {total / 2**30:.1f} GiB"
+    if besides > own:
         raise InputError(
-            f"grid.voxels: {kind.in_words(model, size)} needs {needed / 2**30:.1f} GiB to train, "
-            f"but {where} has {total / 2**30:.1f} GiB; use fewer voxels, or a model with fewer "
-            "features."
+            f"rays_per_step: the rays of an update, and what the sampler keeps, need "
+            f"{besides / 2**30:.1f} GiB to train, {there_is}; use fewer, fewer steps an update "
+            "(optim.accumulate_at), or fewer voxels of the sampler."
         )
+    raise InputError(
+        f"grid.voxels: {kind.in_words(model, size)} needs {own / 2**30:.1f} GiB to train, "
+        f"{there_is}; use fewer voxels, or a model with fewer features."
+    )

@@ -59,14 +59,14 @@ def keep_plain(value: Any, what: str) -> None:
         what: It is, in configurations.
 
     Raises:
-        InputError: A field whose default is a bool is given something else, or one whose default
-            is a number no finite one.
+        InputError: A field whose default is a bool is given something else, or one whose default is
+            a float something that is neither that nor a finite number.
     """
     for f in fields(value):
         given, kind = getattr(value, f.name), type(f.default)
         if kind is bool and not isinstance(given, bool | np.bool_):
             raise InputError(f"{what}.{f.name} must be True or False, not {said(given)}.")
-        if kind is float:
+        if kind is float and given != f.default:
             require_finite(f"{what}.{f.name}", given)
         if kind in (bool, int, float):
             object.__setattr__(value, f.name, kind(given))

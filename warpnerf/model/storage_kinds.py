@@ -58,6 +58,8 @@ class StorageKind(ABC):
     own_epsilon: ClassVar[bool] = False
     """Whether Adam has another epsilon for all of it, so that ``OptimConfig.epsilon`` is for others
     only."""
+    as_fine_as_nodes: ClassVar[bool] = True
+    """Whether the nodes of the lattice say how fine it is."""
     smoothed: ClassVar[bool] = True
     """Whether total variation smooths it, so that what is configured of that does something."""
 
@@ -206,6 +208,7 @@ class Hash(StorageKind):
     box_is_fixed: ClassVar[bool] = True
     own_rates: ClassVar[bool] = True
     own_epsilon: ClassVar[bool] = True
+    as_fine_as_nodes: ClassVar[bool] = False
     smoothed: ClassVar[bool] = False
     seen_share: ClassVar[float] = 0.4
     levels: int = 6

@@ -8,13 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from warpnerf.scenes.extent.space_plan import BLUR_POWER
 from warpnerf.training.state import Progress
 
 SHARP = 1.5
 """Pixels: narrower voxels hardly blur."""
-EXPONENT = 1.25
-"""The squared error that a voxel of w pixels adds is about w^EXPONENT; ``scenes.extent.space_plan``
-goes by the same."""
 USUAL_GAP = 1.5
 """dB by which test views lie below training views where there are photographs enough."""
 USUAL_RISE = 0.5
@@ -41,17 +39,19 @@ class Limit:
 
 
 def what_limits(
-    reports: Sequence[Progress], voxel_pixels: float, test_psnr: float | None
+    reports: Sequence[Progress], voxel_pixels: float | None, test_psnr: float | None
 ) -> Limit | None:
     """What limits the quality of a training.
 
     Args:
         reports: Of the training, from its first to its last.
-        voxel_pixels: Width of a voxel of the final grid where cameras look, pixels.
+        voxel_pixels: Width of a voxel of the final grid where cameras look, pixels; None: voxels do
+            not say how fine the field is.
         test_psnr: Mean PSNR of its test views, dB; None: there are none.
 
     Returns:
-        What costs most, by thresholds that are rules of thumb; None: there are too few reports.
+        What costs most, by thresholds that are rules of thumb; None: there are too few reports, as
+        of a training that was resumed near its end.
     """
     done = np.array([report.fraction for report in reports])
     psnr = np.array([report.picture_psnr for report in reports])
@@ -61,24 +61,26 @@ def what_limits(
     reached = float(psnr[late].mean())
     rise = reached - float(psnr[before].mean())
     gap = 0.0 if test_psnr is None else reached - test_psnr
+    width = "" if voxel_pixels is None else f"voxels are {voxel_pixels:.2g} pixels wide, "
+    pixels = SHARP if voxel_pixels is None else max(voxel_pixels, SHARP)
     limits = [
         Limit(
             name="voxels",
-            cost=10.0 * EXPONENT * math.log10(max(voxel_pixels, SHARP) / SHARP),
-            sentence=f"limited by voxels: one is {voxel_pixels:.2g} pixels wide where cameras "
-            "look; try more --voxels, or a smaller --box",
+            cost=10.0 * BLUR_POWER * math.log10(pixels / SHARP),
+            sentence=f"limited by voxels: one is {pixels:.2g} pixels wide where cameras look; try "
+            "more --voxels, or a smaller --box",
         ),
         Limit(
             name="photographs",
             cost=gap - USUAL_GAP,
             sentence=f"limited by photographs: training views reach {reached:.1f} dB, test views "
-            f"{reached - gap:.1f}; try photographs from more places, fewer --voxels or more --loss",
+            f"{reached - gap:.1f}; try photographs from more places, or fewer --voxels",
         ),
         Limit(
             name="time",
             cost=rise - USUAL_RISE,
             sentence=f"limited by time: PSNR of training views rose by {rise:.1f} dB in the last "
-            "third; try more --steps and a longer --time-limit",
+            "third; try more --steps, and a longer --time-limit where there is one",
         ),
     ]
     most = max(limits, key=lambda limit: limit.cost)
@@ -86,8 +88,7 @@ def what_limits(
         return Limit(
             name="nothing",
             cost=0.0,
-            sentence="neither voxels nor photographs nor time stands out as a limit: voxels are "
-            f"{voxel_pixels:.2g} pixels wide, training views reach {reached:.1f} dB, and rose by "
-            f"{rise:.1f} dB in the last third",
+            sentence=f"neither voxels nor photographs nor time stands out as a limit: {width}"
+            f"training views reach {reached:.1f} dB, and rose by {rise:.1f} dB in the last third",
         )
     return most

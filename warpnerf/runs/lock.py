@@ -1,4 +1,4 @@
-"""One process at a time writes to a run's folder, and only to what lies in it."""
+"""One process at a time writes to a run's folder, and not through links from it."""
 
 from __future__ import annotations
 
@@ -32,15 +32,18 @@ def only_writer(folder: Path) -> Iterator[None]:
         folder: Made if it does not exist, and then removed if nothing was written to it.
 
     Raises:
-        InputError: Another process has it, it cannot be written to, or one of its files is none of
-            its own.
+        InputError: Another process has it, it cannot be written to, or one of its files is a link,
+            a pipe or a device.
     """
-    require_own_files(folder)
+    try:
+        require_own_files(folder)
+        made = [place for place in (folder, *folder.parents) if not place.exists()]
+    except OSError as error:
+        raise cannot_write(str(folder), error) from error
     if fcntl is None:
         yield
         return
     path = folder / NAME
-    made = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -68,6 +71,9 @@ def require_own_files(folder: Path) -> None:
     for place in (folder, older):
         for name in WRITTEN:
             paths += sorted(place.glob(name)) if "*" in name else [place / name]
+    for place in (folder, folder / "next", older):
+        for inside, folders, files in os.walk(place / "scene"):
+            paths += [Path(inside, name) for name in sorted((*folders, *files))]
     for path in paths:
         if path.is_symlink():
             raise InputError(

@@ -18,15 +18,13 @@ from warpnerf.model.interface import Model
 from warpnerf.runtime.parallel import Workers
 from warpnerf.scenes.extent.space import grid_size
 from warpnerf.training.optim import OPTIMISERS
-from warpnerf.training.plan import TrainingPlan
+from warpnerf.training.plan import TrainingPlan, bytes_of_rays
 
 
 def require_room(plan: TrainingPlan, device: wp.Device) -> None:
     """Raise InputError if training the final field of a plan does not fit the device's memory."""
     config = plan.config
-    of_rays = config.sampler.training_bytes(
-        config.rays_per_step * plan.schedule.most_steps_an_update
-    )
+    of_rays = bytes_of_rays(config, plan.schedule)
     require_memory(config.field, _model(config), plan.stages[-1].size, device, of_rays)
 
 

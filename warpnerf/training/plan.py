@@ -30,6 +30,9 @@ from warpnerf.training.schedule import Schedule
 STEPS_SHARE = 0.1
 """Of a training's steps, that a short one which looks for the extent takes at most."""
 
+RAY_BYTES = 100
+"""Memory of a ray of an update: where it comes from and goes, and what it should be and is."""
+
 PROCESS_BYTES = 250_000_000
 """What a training takes besides grid and photographs: Python, Warp, compiled kernels, pictures."""
 
@@ -201,7 +204,7 @@ def planned(
         steps = march_steps(config.march, space, size, reach)
         stages.append(Stage(begins=begins, nodes=nodes, size=size, steps=steps))
     of_field = config.field.training_bytes(config.model, stages[-1].size)
-    of_field += config.sampler.training_bytes(config.rays_per_step * schedule.most_steps_an_update)
+    of_rays = bytes_of_rays(config, schedule)
     return TrainingPlan(
         config=config,
         kind=kind,
@@ -215,9 +218,29 @@ def planned(
         schedule=schedule,
         stages=tuple(stages),
         voxel_pixels=sharpness(scene, space, voxels, config.field.box_is_fixed),
-        memory=of_field + images + PROCESS_BYTES,
+        memory=of_field + of_rays + images + PROCESS_BYTES,
         looks_first=looks_first,
     )
+
+
+def bytes_of_rays(config: TrainConfig, schedule: Schedule) -> int:
+    """Memory in bytes of the rays of an update, and of what the sampler keeps.
+
+    Args:
+        config: Of the training.
+        schedule: How many steps an update has.
+
+    Raises:
+        InputError: There are more rays than kernels can count.
+    """
+    steps = schedule.most_steps_an_update
+    n_rays = config.rays_per_step * steps
+    if n_rays >= 2**31:
+        raise InputError(
+            f"rays_per_step is {config.rays_per_step}, and an update has up to {steps} steps "
+            "(optim.accumulate_at); use fewer, together below 2^31."
+        )
+    return n_rays * RAY_BYTES + config.sampler.training_bytes(n_rays)
 
 
 def needs_search(scene: Scene, config: TrainConfig, space: SpaceKind) -> bool:

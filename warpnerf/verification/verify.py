@@ -67,10 +67,18 @@ VIEW_DEPENDENT: tuple[Model, ...] = (
 STORED: tuple[StorageKind, ...] = (
     Vm(),
     Hash(levels=4, coarsest=3, finest=40, table=64),
+    Hash(levels=4, coarsest=3, finest=40, table=64, hidden=16),
 )
-"""The storages besides dense grids, of which one level of the hash has an entry for each node."""
+"""The storages besides dense grids; one level of a hash has an entry for each node."""
 
 BOUND = "bound of resampled steps"
+
+
+def field_words(kind: StorageKind) -> str:
+    """A storage, as names of checks have it."""
+    hidden = isinstance(kind, Hash) and kind.hidden > 0
+    return f"field {kind.name}{' with a hidden layer' if hidden else ''}"
+
 
 TRAINING = TrainConfig(
     steps=240,
@@ -85,7 +93,7 @@ TRAINING = TrainConfig(
 
 TRAININGS: dict[str, TrainConfig] = {
     "training": replace(TRAINING, model=DEFERRED),
-    **{f"training with field {kind.name}": replace(TRAINING, field=kind) for kind in STORED},
+    **{f"training with {field_words(kind)}": replace(TRAINING, field=kind) for kind in STORED},
     "training with resampled steps": replace(
         TRAINING, sampler=Resampled(samples=16, bins=32, voxels=1000)
     ),
@@ -194,7 +202,7 @@ def _checks(workers: Workers) -> Iterator[tuple[str, float, Measure]]:
         measure = partial(
             _worst, gradient_errors.against_differences, partial(_with_storage, kind), exact
         )
-        yield f"float64 adjoint = central differences, field {kind.name}", 1e-7, measure
+        yield f"float64 adjoint = central differences, {field_words(kind)}", 1e-7, measure
     measure = partial(_worst, gradient_errors.bound_against_differences, partly_free, exact)
     yield f"float64 adjoint = central differences, {BOUND}", 1e-7, measure
     for name, kernels, tolerance in (("float64", exact, 1e-15), ("float32", plain, 1e-6)):
@@ -255,7 +263,7 @@ def _checks(workers: Workers) -> Iterator[tuple[str, float, Measure]]:
             path = partial(_with_storage, kind)
             measure = partial(_worst, gradient_errors.trained_forms, path, kernels, other)
             # Fine levels of a hash amplify the rounding of positions, to 7e-6 as measured.
-            yield f"{name}, field {kind.name}", 5e-5, measure
+            yield f"{name}, {field_words(kind)}", 5e-5, measure
         measure = partial(_worst, gradient_errors.bound_forms, partly_free, kernels, other)
         yield f"{name}, {BOUND}", 1e-5, measure
     yield (
@@ -273,7 +281,7 @@ def _checks(workers: Workers) -> Iterator[tuple[str, float, Measure]]:
         for kind in STORED:
             path = partial(_with_storage, kind)
             measure = partial(_worst, gradient_errors.threads, path, one, more)
-            name = f"float32, 1 thread = {several} threads within rounding, field {kind.name}"
+            name = f"float32, 1 thread = {several} threads within rounding, {field_words(kind)}"
             yield name, 1e-5, measure
         for name, config in TRAININGS.items():
             measure = partial(_trained_twice, replace(config, threads=workers.count))
