@@ -98,6 +98,21 @@ def test_training_leaves_a_whole_run(trained: tuple[Path, str]) -> None:
     assert (config["scene"], config["downscale"]) == ("builtin:room-sparse", 8)
 
 
+@pytest.mark.parametrize(("views", "looked_at"), [("1", 1), ("none", None)])
+def test_fewer_views_are_looked_at(views: str, looked_at: int | None, tmp_path: Path) -> None:
+    small = "16" if views == "none" else "8"  # too small for SSIM
+    options = ("--steps", "2", "--output", str(tmp_path / "run"), "--eval-views", views)
+    code, out, err = run("train", "builtin:room-sparse", "--downscale", small, *options)
+    assert code == 0, err
+    written = {path.name for path in (tmp_path / "run").iterdir()}
+    assert "field.safetensors" in written
+    if looked_at is None:
+        assert "metrics.json" not in written and out.splitlines()[-1].startswith("wrote ")
+    else:
+        metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+        assert len(metrics["images"]) == looked_at
+
+
 def test_eval_repeats_the_figures(trained: tuple[Path, str], tmp_path: Path) -> None:
     folder, _ = trained
     target = tmp_path / "figures.json"

@@ -7,7 +7,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache, wraps
 from pathlib import Path
+from typing import Any
 
+import pytest
 import warp as wp
 
 from warpnerf.runtime.parallel import Workers
@@ -42,6 +44,17 @@ def unoptimised(kernel: wp.Kernel) -> wp.Kernel:
     module = wp.Module(f"{kernel.module.name}_unoptimised", None)
     module.options.update({**kernel.module.options, OPTION: 0})
     return wp.Kernel(kernel.func, key=kernel.key, module=module, options=kernel.options)
+
+
+def launch_unoptimised(patch: pytest.MonkeyPatch) -> None:
+    """Have all kernels launched as ``unoptimised`` ones on the CPU, while a test runs."""
+    launch = Workers._launch
+
+    @wraps(launch)
+    def quickly(workers: Workers, kernel: wp.Kernel, *given: Any) -> None:
+        launch(workers, kernel if workers.device.is_cuda else unoptimised(kernel), *given)
+
+    patch.setattr(Workers, "_launch", quickly)
 
 
 def compile_as_tests_do() -> None:

@@ -9,7 +9,6 @@ import warp as wp
 from numpy.typing import NDArray
 from warpnerf_kernels.base import precision, tiles
 
-from tests.support.compiling import unoptimised
 from tests.support.problems import Float64, Problem
 from warpnerf.fields.gradients import gradient_struct
 from warpnerf.fields.lattice import box_struct, frustum_struct, grid_struct
@@ -55,10 +54,6 @@ class Kernels:
     def module(self, name: str) -> Any:
         """Another module of the kernels in this precision."""
         return precision.load(self.precision, name)
-
-    def kernel(self, kernel: wp.Kernel) -> wp.Kernel:
-        """A kernel as it is launched here: on the CPU not optimised."""
-        return kernel if self.device.is_cuda else unoptimised(kernel)
 
     def array(self, values: Any, dtype: Any = None) -> wp.array:
         """[...] numbers, or [..., n] of a vector type, on the device."""
@@ -141,7 +136,7 @@ class Kernels:
         variant = self.variant(p)
         seen = render_outputs_struct(variant, p.n_rays, self.workers, self.assembly)
         self.workers.launch_owned(
-            self.kernel(self.assembly.render_forward_kernel(variant)),
+            self.assembly.render_forward_kernel(variant),
             -(-p.n_rays // variant.batch),
             p.n_rays,
             self.scene(p),
@@ -198,7 +193,7 @@ class Kernels:
         """How to launch a kernel that ends in a gradient."""
         length = float(np.linalg.norm(p.box_max - p.box_min))
         most = p.model.most_steps(p.steps, math.inf if p.contraction != "none" else length)
-        return AdjointLaunch(self.kernel(kernel), variant, most, p.n_rays, self.workers)
+        return AdjointLaunch(kernel, variant, most, p.n_rays, self.workers)
 
     def no_gradient(self, p: Problem) -> Any:
         """A kernel's Gradient for a problem, zero."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from warpnerf.checks import InputError
+from warpnerf.checks import InputError, require_whole
 from warpnerf.cli.arguments import Settings, Usual
 from warpnerf.cli.configured import begun_with, configured
 from warpnerf.cli.given import NOTHING, Given
@@ -71,6 +70,9 @@ class TrainOptions:
     images: Literal["auto", "memory", "disk"] = "auto"
     """Where the photographs' pixels are during the training: memory, disk (decoded once, into a
     file without a name in the output folder, gone at the end), or by what is free."""
+    eval_views: Literal["all", "none"] | int = "all"
+    """Test views that are rendered and measured at the end: all, none, or so many, spread.
+    warpnerf eval does it at any time."""
     view: bool = False
     """Serve a page to look at the training in a browser."""
     host: str | None = None
@@ -88,6 +90,12 @@ class TrainOptions:
     def page(self) -> PageOptions | None:
         """Where the page of the training is served; None: nowhere."""
         return PageOptions.chosen(self.view, self.host, self.port)
+
+    def require_usable(self) -> None:
+        """Raise InputError where an option cannot be followed, before anything is read."""
+        PageOptions.chosen(self.view, self.host, self.port)
+        if isinstance(self.eval_views, int):
+            require_whole("--eval-views", self.eval_views, 1)
 
 
 USUAL = Usual(
@@ -125,7 +133,7 @@ def train_command(options: TrainOptions, given: Annotated[Given, USUAL] = NOTHIN
 
     --help-all shows them all. Defaults are those of the --preset beside it.
     """
-    page = options.page
+    options.require_usable()
 
     def changed(config: TrainConfig) -> TrainConfig:
         return configured(config, given, options.model_options, options.loss)
@@ -137,7 +145,7 @@ def train_command(options: TrainOptions, given: Annotated[Given, USUAL] = NOTHIN
                     f"--{name} does not go with --resume: the run in {options.resume} continues as "
                     "it was begun; leave it out."
                 )
-        return _resume(options.resume, options.scene, options.masks, options.images, changed, page)
+        return _resume(options.resume, options, changed)
     begin, options = _starting_point(options)
     config = begun_with(changed(begin), given)
     if options.scene is None or options.output is None:
@@ -148,16 +156,7 @@ def train_command(options: TrainOptions, given: Annotated[Given, USUAL] = NOTHIN
         from warpnerf.rendering.losses import parts_with
 
         parts_with(config.model, "float32", config.loss)
-    return _begin(
-        options.scene,
-        options.output,
-        1 if options.downscale is None else options.downscale,
-        options.masks,
-        options.images,
-        config,
-        options.overwrite,
-        page,
-    )
+    return _begin(options.scene, options.output, options, config)
 
 
 def _starting_point(options: TrainOptions) -> tuple[TrainConfig, TrainOptions]:
@@ -181,21 +180,12 @@ def _starting_point(options: TrainOptions) -> tuple[TrainConfig, TrainOptions]:
     return run.train, options
 
 
-def _begin(
-    source: str,
-    output: Path,
-    downscale: int,
-    masks: Path | None,
-    images: Place,
-    config: TrainConfig,
-    overwrite: bool,
-    page: PageOptions | None,
-) -> int:
+def _begin(source: str, output: Path, options: TrainOptions, config: TrainConfig) -> int:
     """Train from the first step on."""
-    _require_free(output, overwrite)
+    _require_free(output, options.overwrite)
     with lock.only_writer(output):
-        _require_free(output, overwrite)  # once more, now that nobody else begins there
-        return _begin_alone(source, output, downscale, masks, images, config, page)
+        _require_free(output, options.overwrite)  # once more, now that nobody else begins there
+        return _begin_alone(source, output, options, config)
 
 
 def _require_free(output: Path, overwrite: bool) -> None:
@@ -210,22 +200,15 @@ def _require_free(output: Path, overwrite: bool) -> None:
         Run.require_free(output, overwrite)
 
 
-def _begin_alone(
-    source: str,
-    output: Path,
-    downscale: int,
-    masks: Path | None,
-    images: Place,
-    config: TrainConfig,
-    page: PageOptions | None,
-) -> int:
+def _begin_alone(source: str, output: Path, options: TrainOptions, config: TrainConfig) -> int:
     """Train from the first step on, as the only one that writes to the folder."""
     _require_machine(config)
-    photographs = source
+    photographs, masks = source, options.masks
+    downscale = 1 if options.downscale is None else options.downscale
     source = with_poses(photographs, output, masks, config.threads)
     if source != photographs:
         masks = None  # the posed scene brings them
-    scene = _read(source, downscale, masks, images, output, config.threads)
+    scene = _read(source, downscale, masks, output, options, config.threads)
 
     # Not before: these load Warp, and bad input is refused at once.
     from warpnerf.inspection.diagnostics import diagnostics
@@ -252,48 +235,36 @@ def _begin_alone(
     for finding in found_odd:
         print(f"  warning: {finding}", flush=True)
     run = Run(output)
-    with training_page(page, trained, trainer) as session:
+    with training_page(options.page, trained, trainer) as session:
         folder = None if masks is None else str(masks.resolve())
         found = trainer.observed is not None
         run.create(trained, _absolute(source), downscale, distance, config, folder, found)
-        return _train(run, trained, trainer, session)
+        return _train(run, trained, trainer, session, options.eval_views)
 
 
 def _resume(
-    folder: Path,
-    moved: str | None,
-    masks: Path | None,
-    images: Place,
-    changed: Callable[[TrainConfig], TrainConfig],
-    page: PageOptions | None,
+    folder: Path, options: TrainOptions, changed: Callable[[TrainConfig], TrainConfig]
 ) -> int:
     """Train from the last checkpoint on."""
     from warpnerf.runs.run import Run
 
     Run(folder).read_config()
     with Run(folder).only_writer():
-        return _go_on(Run(folder), moved, masks, images, changed, page)
+        return _go_on(Run(folder), options, changed)
 
 
-def _go_on(
-    run: Run,
-    moved: str | None,
-    masks: Path | None,
-    images: Place,
-    changed: Callable[[TrainConfig], TrainConfig],
-    page: PageOptions | None,
-) -> int:
+def _go_on(run: Run, options: TrainOptions, changed: Callable[[TrainConfig], TrainConfig]) -> int:
     from warpnerf.runs.scene import masks_of, path_of
     from warpnerf.training.trainer import Trainer
 
-    begun = run.read_config()
+    begun, moved = run.read_config(), options.scene
     state, notes = run.load_state()
     config = changed(state.config)
     state.require_same_config(config)
     _require_machine(config)
-    masks = masks or masks_of(begun, moved)
+    masks = options.masks or masks_of(begun, moved)
     source = path_of(begun, moved)
-    scene = _read(source, begun.downscale, masks, images, run.folder, config.threads)
+    scene = _read(source, begun.downscale, masks, run.folder, options, config.threads)
     trainer = Trainer(scene, config, state)
     scene = begun.as_trained(scene)
     _describe(scene, trainer)
@@ -304,10 +275,10 @@ def _go_on(
         if new != old:
             print(f"  note: {name} {new} instead of {old}: sums are rounded in another order")
     print(f"  resuming after step {trainer.steps_done}")
-    with training_page(page, scene, trainer) as session:
+    with training_page(options.page, scene, trainer) as session:
         run.rewind_log(trainer.steps_done)
         del state  # the trainer has copies
-        return _train(run, scene, trainer, session)
+        return _train(run, scene, trainer, session, options.eval_views)
 
 
 def _require_machine(config: TrainConfig) -> None:
@@ -328,8 +299,8 @@ def _read(
     source: str,
     downscale: int,
     masks: Path | str | None,
-    images: Place,
     output: Path,
+    options: TrainOptions,
     threads: int | None,
 ) -> Scene:
     """The scene, whose photographs are kept where the run will be if they are kept on disk."""
@@ -342,11 +313,12 @@ def _read(
         source,
         downscale=downscale,
         masks=masks,
-        images=images,
+        images=options.images,
         image_folder=there,
         threads=threads,
     )
-    require_measurable(scene, _split_to_look_at(scene))
+    if options.eval_views != "none":
+        require_measurable(scene, _split_to_look_at(scene))
     return scene
 
 
@@ -354,9 +326,24 @@ def _split_to_look_at(scene: Scene) -> str:
     return "test" if scene.splits.get("test") else "train"
 
 
-def _train(run: Run, scene: Scene, trainer: Trainer, session: Session | None) -> int:
+def _some_views(scene: Scene, split: str, count: Literal["all"] | int) -> Scene:
+    """The scene with so many of a split's views, spread."""
+    indices = scene.splits[split]
+    if count == "all" or count >= len(indices):
+        return scene
+    chosen = tuple(indices[len(indices) * k // count] for k in range(count))
+    return dataclasses.replace(scene, splits={**scene.splits, split: chosen})
+
+
+def _train(
+    run: Run,
+    scene: Scene,
+    trainer: Trainer,
+    session: Session | None,
+    eval_views: Literal["all", "none"] | int,
+) -> int:
     """Train to the end, or until asked to stop; look at the test views."""
-    from warpnerf.reports.limits import what_limits
+    from warpnerf.reports.limits import voxel_pixels, what_limits
 
     between = None if session is None else session.after_update
     reports: list[Progress] = []
@@ -388,14 +375,18 @@ def _train(run: Run, scene: Scene, trainer: Trainer, session: Session | None) ->
         saved = f"stopped and saved after step {step}; continue with: {run.resume_command}"
         print(saved if run.last_step == step else f"stopped; {run.way_on()}", flush=True)
         return stop.exit_code
+    if eval_views == "none":
+        print(f"wrote {run.folder}: field.safetensors, log.jsonl and config.json")
+        return 0
     split = _split_to_look_at(scene)
+    scene = _some_views(scene, split, eval_views)
     print(f"rendering the {'test' if split == 'test' else 'training'} views", flush=True)
     try:
         with ProgressBar("first view") as bar:
             result = run.evaluate(trainer.field(), scene, split, bar.report)
         print(result)
         limit = what_limits(
-            reports, _voxel_pixels(trainer), result.mean["psnr"] if split == "test" else None
+            reports, voxel_pixels(trainer), result.mean["psnr"] if split == "test" else None
         )
         if limit is not None:
             print(limit)
@@ -407,16 +398,6 @@ def _train(run: Run, scene: Scene, trainer: Trainer, session: Session | None) ->
         f"with truth, rendering and depth of every view\nlook at {run.sheet}",
     )
     return 0
-
-
-def _voxel_pixels(trainer: Trainer) -> float | None:
-    """Width of a voxel of the grid that there is now, pixels; None: it says nothing."""
-    from warpnerf.scenes.extent.sharpness import sharpness
-
-    if not trainer.config.field.as_fine_as_nodes:
-        return None
-    lattice = trainer.lattice
-    return sharpness(trainer.scene, lattice.space, math.prod(lattice.size), True).median
 
 
 def _scaling(plan: TrainingPlan) -> str:

@@ -5,11 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from warpnerf.scenes.extent.sharpness import sharpness
 from warpnerf.scenes.extent.space_plan import BLUR_POWER
 from warpnerf.training.state import Progress
+
+if TYPE_CHECKING:
+    from warpnerf.training.trainer import Trainer
 
 SHARP = 1.5
 """Pixels: narrower voxels hardly blur."""
@@ -38,15 +43,30 @@ class Limit:
         return self.sentence
 
 
+def voxel_pixels(trainer: Trainer) -> float | None:
+    """Width of a voxel of the grid that a training has now, where cameras look.
+
+    Args:
+        trainer: Of the training.
+
+    Returns:
+        Pixels, the median; None: nodes do not say how fine the field is.
+    """
+    if not trainer.config.field.as_fine_as_nodes:
+        return None
+    lattice = trainer.lattice
+    return sharpness(trainer.scene, lattice.space, math.prod(lattice.size), True).median
+
+
 def what_limits(
-    reports: Sequence[Progress], voxel_pixels: float | None, test_psnr: float | None
+    reports: Sequence[Progress], width: float | None, test_psnr: float | None
 ) -> Limit | None:
     """What limits the quality of a training.
 
     Args:
         reports: Of the training, from its first to its last.
-        voxel_pixels: Width of a voxel of the final grid where cameras look, pixels; None: voxels do
-            not say how fine the field is.
+        width: Of a voxel of the final grid where cameras look, pixels; None: voxels do not say how
+            fine the field is.
         test_psnr: Mean PSNR of its test views, dB; None: there are none.
 
     Returns:
@@ -61,8 +81,8 @@ def what_limits(
     reached = float(psnr[late].mean())
     rise = reached - float(psnr[before].mean())
     gap = 0.0 if test_psnr is None else reached - test_psnr
-    width = "" if voxel_pixels is None else f"voxels are {voxel_pixels:.2g} pixels wide, "
-    pixels = SHARP if voxel_pixels is None else max(voxel_pixels, SHARP)
+    wide = "" if width is None else f"voxels are {width:.2g} pixels wide, "
+    pixels = SHARP if width is None else max(width, SHARP)
     limits = [
         Limit(
             name="voxels",
@@ -88,7 +108,7 @@ def what_limits(
         return Limit(
             name="nothing",
             cost=0.0,
-            sentence=f"neither voxels nor photographs nor time stands out as a limit: {width}"
+            sentence=f"neither voxels nor photographs nor time stands out as a limit: {wide}"
             f"training views reach {reached:.1f} dB, and rose by {rise:.1f} dB in the last third",
         )
     return most
