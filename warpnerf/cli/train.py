@@ -27,7 +27,6 @@ from warpnerf.runtime.signals import Stopped, StopRequest
 
 if TYPE_CHECKING:
     from warpnerf.runs.run import Run
-    from warpnerf.scenes.images.photographs import Place
     from warpnerf.scenes.scene import Scene
     from warpnerf.training.plan import TrainingPlan
     from warpnerf.training.state import Progress
