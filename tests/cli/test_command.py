@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shlex
 import shutil
 import signal
@@ -394,11 +395,20 @@ def test_another_scene_is_refused(trained: tuple[Path, str], tmp_path: Path) -> 
     assert "scene is not what the training to be resumed has seen" in err
 
 
-def test_a_new_run_wants_scene_and_output(tmp_path: Path) -> None:
-    for arguments in ((), ("builtin:room",), ("--output", tmp_path / "run")):
+def test_a_new_run_wants_a_scene(tmp_path: Path) -> None:
+    for arguments in ((), ("--output", tmp_path / "run")):
         code, _, err = run("train", *arguments)
         assert code == 2
-        assert "SCENE" in err and "--output" in err and "--resume" in err
+        assert "SCENE" in err and "--resume" in err
+
+
+def test_a_run_is_named_by_scene_and_time(tmp_path: Path) -> None:
+    options = ("--downscale", "16", "--steps", "1", "--eval-views", "none")
+    done = cli_process.run("train", "builtin:room-sparse", *options, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    (folder,) = (tmp_path / "runs").iterdir()
+    assert re.fullmatch(r"room-sparse-\d{4}-\d\d-\d\d-\d{6}", folder.name)
+    assert f"wrote runs/{folder.name}: " in done.stdout
 
 
 SPOIL = """

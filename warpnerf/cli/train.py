@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,7 +44,7 @@ class TrainOptions:
     builtin:room-sparse; or photographs without poses or a video, whose poses are then estimated
     first, as by `warpnerf pose`."""
     output: Path | None = None
-    """Folder for the configuration, the field, the log, the figures and the pictures."""
+    """Folder for configuration, field, log, figures and pictures; by default runs/SCENE-TIME."""
     preset: (
         Literal[
             "fast", "quality", "dvgo", "dvgo-unbounded", "dvgo-llff", "tensorf", "ngp", "mip360"
@@ -147,15 +148,21 @@ def train_command(options: TrainOptions, given: Annotated[Given, USUAL] = NOTHIN
         return _resume(options.resume, options, changed)
     begin, options = _starting_point(options)
     config = begun_with(changed(begin), given)
-    if options.scene is None or options.output is None:
-        raise InputError(
-            "train wants a SCENE and --output DIR for a new run, or --resume DIR to resume one."
-        )
+    if options.scene is None:
+        raise InputError("train wants a SCENE for a new run, or --resume DIR to resume one.")
     if config.loss.sample_colour > 0.0:  # before photographs are posed or read; loads Warp
         from warpnerf.rendering.losses import parts_with
 
         parts_with(config.model, "float32", config.loss)
-    return _begin(options.scene, options.output, options, config)
+    output = options.output or _named_by(options.scene)
+    return _begin(options.scene, output, options, config)
+
+
+def _named_by(source: str) -> Path:
+    """A folder for a run of a scene, named by it and by the time."""
+    builtin = source.startswith("builtin:")
+    name = source.removeprefix("builtin:") if builtin else Path(source).resolve().stem
+    return Path("runs", f"{name or 'scene'}-{time.strftime('%Y-%m-%d-%H%M%S')}")
 
 
 def _starting_point(options: TrainOptions) -> tuple[TrainConfig, TrainOptions]:
