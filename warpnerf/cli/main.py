@@ -26,6 +26,7 @@ from warpnerf.cli.inspect import inspect_command
 from warpnerf.cli.machine import FAILED, check_command, warmup_command
 from warpnerf.cli.pose import pose_command
 from warpnerf.cli.render import render_command
+from warpnerf.cli.runs import runs_command
 from warpnerf.cli.train import train_command
 from warpnerf.cli.view import view_command
 from warpnerf.presets import PRESETS
@@ -44,6 +45,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "render": render_command,
     "export": export_command,
     "view": view_command,
+    "runs": runs_command,
     "check": check_command,
     "warmup": warmup_command,
 }

@@ -1,0 +1,198 @@
+"""All runs in a folder: how far each is, its metrics, its disk usage, and its configuration."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from warpnerf.checks import InputError
+from warpnerf.config import TrainConfig
+from warpnerf.config_json import config_to_json
+from warpnerf.presets import PRESETS
+from warpnerf.runs import files, lock
+from warpnerf.runs.config import RunConfig
+from warpnerf.runtime.terminal import table_text
+
+DEPTH = 3
+"""Folders within folders in which runs are looked for."""
+LEFT_OUT = ("steps", "time_limit", "device", "threads", "checkpoint_every")
+"""Fields of a configuration that are not listed."""
+METRICS = {"psnr": ("PSNR", ".2f"), "ssim": ("SSIM", ".4f"), "flip": ("FLIP", ".4f")}
+"""Heading and format of the metrics of test views that are listed."""
+
+
+class Report(msgspec.Struct, frozen=True):
+    """A line of log.jsonl, as far as it is listed."""
+
+    step: int = 0
+    fraction: float = 0.0
+    seconds: float = 0.0
+
+
+class Metrics(msgspec.Struct, frozen=True):
+    """metrics.json, as far as it is listed."""
+
+    mean: dict[str, float] = {}
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunSummary:
+    """A run: progress, metrics of its test views, configuration and disk usage."""
+
+    folder: Path
+    """Of the run."""
+    config: RunConfig
+    """What was requested."""
+    step: int
+    """Of the last report; 0: there is none."""
+    fraction: float
+    """Of the training that is done, [0, 1]."""
+    seconds: float
+    """Of training."""
+    metrics: Mapping[str, float]
+    """Means over the test views, by name; empty: they were not looked at."""
+    n_bytes: int
+    """Of all its files."""
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether the training is at its end and its field is there."""
+        return self.fraction >= 1.0 and (self.folder / "field.safetensors").exists()
+
+
+def runs_in(folder: Path) -> list[RunSummary]:
+    """Summaries of the runs in a folder, by name.
+
+    Args:
+        folder: Of a run, or of folders of runs.
+
+    Raises:
+        InputError: It is no folder, or holds no run.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder} is no folder; name one that holds runs.")
+    found = []
+    for depth in range(DEPTH):
+        for path in sorted(folder.glob("*/" * depth + "config.json")):
+            try:
+                found.append(_summary(path.parent))
+            except InputError:
+                continue  # of another program
+    if not found:
+        raise InputError(f"{folder} holds no run; name a folder that holds runs.")
+    return sorted(found, key=lambda run: run.folder)
+
+
+def in_words(config: TrainConfig) -> str:
+    """A configuration as the preset that it is nearest to, and what is changed of that.
+
+    Args:
+        config: Any. How long it trains and on what is left out.
+
+    Returns:
+        Such as ``fast grid.voxels=8000000``.
+    """
+    own = _flat(config)
+    changes = {
+        preset: {name: value for name, value in own.items() if value != begin.get(name)}
+        for preset, begin in ((preset, _flat(other)) for preset, other in PRESETS.items())
+    }
+    preset = min(changes, key=lambda name: len(changes[name]))
+    return " ".join([preset, *(f"{name}={_said(v)}" for name, v in changes[preset].items())])
+
+
+def remove_checkpoints(run: RunSummary) -> int:
+    """Remove the checkpoints of a finished run; its field stays.
+
+    Args:
+        run: Any; one that is not finished is left alone.
+
+    Returns:
+        Bytes that were removed.
+
+    Raises:
+        InputError: Another process trains into its folder, or they cannot be removed.
+    """
+    if not run.is_finished:
+        return 0
+    n_bytes = 0
+    with lock.only_writer(run.folder):
+        for path in files.checkpoints(run.folder):
+            n_bytes += path.stat().st_size
+            path.unlink()
+    return n_bytes
+
+
+def runs_table(runs: Sequence[RunSummary], folder: Path) -> str:
+    """A table with a line for each run, and at its end how it is configured."""
+    metrics = {k: how for k, how in METRICS.items() if any(k in run.metrics for run in runs)}
+    headings = ["run", "scene", "steps", "done", "time", *(name for name, _ in metrics.values())]
+    rows = []
+    for run in runs:
+        name = run.folder.relative_to(folder).as_posix()
+        minutes, seconds = divmod(round(run.seconds), 60)
+        found = [
+            format(run.metrics[key], how) if key in run.metrics else ""
+            for key, (_, how) in metrics.items()
+        ]
+        rows.append(
+            [
+                folder.name if name == "." else name,
+                Path(run.config.scene).name,
+                str(run.step),
+                f"{run.fraction:.0%}",
+                f"{minutes}:{seconds:02}",
+                *found,
+                f"{run.n_bytes / 1e6:.0f} MB",
+            ]
+        )
+    lines = table_text([*headings, "disk"], rows).splitlines()
+    configured = ["configuration", *(in_words(run.config.train) for run in runs)]
+    return "\n".join(f"{a}  {b}" for a, b in zip(lines, configured, strict=True))
+
+
+def _summary(folder: Path) -> RunSummary:
+    config = files.read_config(folder)
+    last, metrics = _last_report(folder / "log.jsonl"), Metrics()
+    with suppress(OSError, msgspec.MsgspecError):
+        metrics = msgspec.json.decode((folder / "metrics.json").read_bytes(), type=Metrics)
+    return RunSummary(
+        folder=folder,
+        config=config,
+        step=last.step,
+        fraction=last.fraction,
+        seconds=last.seconds,
+        metrics=metrics.mean,
+        n_bytes=sum(p.lstat().st_size for p in folder.rglob("*") if not p.is_dir()),
+    )
+
+
+def _last_report(log: Path) -> Report:
+    """The last line of a log that is whole: a crash may have cut one off."""
+    with suppress(OSError):
+        for line in reversed(log.read_bytes().splitlines()):
+            with suppress(msgspec.MsgspecError):
+                return msgspec.json.decode(line, type=Report)
+    return Report()
+
+
+def _flat(config: TrainConfig) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name, value in config_to_json(config).items():
+        if isinstance(value, dict):  # a part, which is named if there are several kinds of it
+            found |= {f"{name}.{inner}".removesuffix(".name"): v for inner, v in value.items()}
+        elif name not in LEFT_OUT:
+            found[name] = value
+    return found
+
+
+def _said(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:g}"
+    return json.dumps(value).replace(" ", "") if isinstance(value, list | tuple) else str(value)
