@@ -12,7 +12,8 @@ repository. Different here:
 - Gradients are scaled by distance; ``scaling="none"`` leaves that out.
 - The near plane is 0; theirs is 2 in Blender's scenes.
 - In dvgo a coarse stage gives free space and a box 5 % larger on each axis than what it finds; here
-  the grid's own first steps do.
+  the grid's own first steps do. So that space that no camera sees is free, densities begin with an
+  opacity of 1e-4 and count as free below 1e-3; theirs begin with 1e-2, and are free below 1e-4.
 - In dvgo-unbounded their box is a cube that holds all cameras' rays at the near clip; here it is
   0.75 content distances to each side.
 - Outside the box their samples are thinned to 0.95 of a step in contracted space; here steps grow.
@@ -101,7 +102,7 @@ _DVGO = TrainConfig(
         voxels=160**3,
         grow_at=(0.05, 0.1, 0.15, 0.2),
         shift_at_growth=1.0,
-        alpha_init=1e-2,
+        alpha_init=1e-4,
     ),
     march=MarchConfig(step_voxels=0.5, jitter=False),
     optim=OptimConfig(
@@ -125,7 +126,7 @@ PRESETS: dict[str, TrainConfig] = {
         grid=GridConfig(voxels=224**3),
         optim=OptimConfig(decay=0.03),
     ),
-    "dvgo": _DVGO,
+    "dvgo": replace(_DVGO, alpha_min=1e-3),
     "dvgo-unbounded": replace(
         _DVGO,
         steps=40_000,
