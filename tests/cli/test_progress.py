@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from warpnerf.cli import progress
-from warpnerf.cli.progress import ProgressBar
+from warpnerf.runtime.progress import ProgressBar
 
 Lines = Callable[[list[tuple[float, float, str]]], list[str]]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from warpnerf.cli.progress import ProgressBar
+from warpnerf.runtime.progress import ProgressBar
 
 
 def demo_command(

@@ -8,7 +8,7 @@ from typing import Literal
 
 from warpnerf.cli.arguments import RunFolder
 from warpnerf.cli.machine import require_writable, write_json
-from warpnerf.cli.progress import ProgressBar
+from warpnerf.runtime.progress import ProgressBar
 
 
 def eval_command(

@@ -10,7 +10,7 @@ import tyro
 
 from warpnerf.checks import InputError
 from warpnerf.cli.arguments import Corners, RunFolder
-from warpnerf.cli.progress import ProgressBar
+from warpnerf.runtime.progress import ProgressBar
 
 
 def export_command(

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from warpnerf.cli.progress import ProgressBar
+from warpnerf.runtime.progress import ProgressBar
 from warpnerf.sfm.config import PoseConfig
 
 

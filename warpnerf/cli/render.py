@@ -12,7 +12,7 @@ import tyro
 
 from warpnerf.checks import InputError, cannot_write, require_positive
 from warpnerf.cli.arguments import RunFolder
-from warpnerf.cli.progress import ProgressBar
+from warpnerf.runtime.progress import ProgressBar
 
 if TYPE_CHECKING:
     from warpnerf.media.recorded_path import RecordedPath

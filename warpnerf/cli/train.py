@@ -18,12 +18,12 @@ from warpnerf.cli.configured import begun_with, configured
 from warpnerf.cli.given import NOTHING, Given
 from warpnerf.cli.machine import FAILED
 from warpnerf.cli.pose import with_poses
-from warpnerf.cli.progress import ProgressBar
 from warpnerf.cli.view import PageOptions, training_page
 from warpnerf.config import TrainConfig
 from warpnerf.presets import PRESETS
 from warpnerf.runs import lock
 from warpnerf.runtime.memory import require_threads
+from warpnerf.runtime.progress import ProgressBar
 from warpnerf.runtime.signals import Stopped, StopRequest
 
 if TYPE_CHECKING:
