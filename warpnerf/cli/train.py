@@ -228,7 +228,7 @@ def _begin_alone(source: str, output: Path, options: TrainOptions, config: Train
         print("looking for how far the cameras see", flush=True)
         with ProgressBar("first step") as bar:
             trainer = prepare_trainer(
-                scene, plan, on_progress=lambda found: bar.report(found.fraction, _text(found))
+                scene, plan, on_progress=lambda found: bar.report(found.fraction, str(found))
             )
     else:
         trainer = prepare_trainer(scene, plan)
@@ -360,7 +360,7 @@ def _train(
                 def on_progress(progress: Progress) -> None:
                     run.log(progress)
                     reports.append(progress)
-                    bar.report(progress.fraction, _text(progress))
+                    bar.report(progress.fraction, str(progress))
 
                 trainer.run(on_progress, run.save_checkpoint, lambda: stop.asked, between)
         except FloatingPointError as error:
@@ -438,14 +438,3 @@ def _describe(scene: Scene, trainer: Trainer) -> None:
 
 def _absolute(source: str) -> str:
     return source if source.startswith("builtin:") else str(Path(source).resolve())
-
-
-def _text(progress: Progress) -> str:
-    speed = progress.step / max(progress.seconds, 1e-6)
-    size = " x ".join(str(n) for n in progress.size)
-    drawn = f" ({progress.psnr:.2f} over {progress.seen:.0%} of pixels)"
-    return (
-        f"step {progress.step}  loss {progress.loss:.5f}  "
-        f"PSNR {progress.picture_psnr:.2f}{drawn if progress.seen < 1.0 else ''}  "
-        f"grid {size}  {speed:.1f} steps/s"
-    )

@@ -12,6 +12,14 @@ LINE_EVERY = 5.0
 """Seconds from one plain line to the next."""
 
 
+def has_bar() -> bool:
+    """Whether progress is a bar here, in a terminal or a notebook; elsewhere it is lines."""
+    from rich.console import Console
+
+    console = Console()
+    return console.is_terminal or console.is_jupyter
+
+
 class ProgressBar:
     """How far something is, within a `with` statement."""
 
@@ -31,7 +39,7 @@ class ProgressBar:
 
         console = Console()
         self._began = time.monotonic()
-        if console.is_terminal:
+        if has_bar():
             self._bar = Progress(
                 TextColumn("{task.percentage:3.0f}%"),
                 BarColumn(bar_width=16),

@@ -55,6 +55,17 @@ class Progress:
         """PSNR over whole pictures, dB: pixels that rays are not drawn from count as exact."""
         return self.psnr - 10.0 * math.log10(self.seen)
 
+    def __str__(self) -> str:
+        """Step, loss, PSNR, grid size and steps per second, in a line."""
+        speed = self.step / max(self.seconds, 1e-6)
+        size = " x ".join(str(n) for n in self.size)
+        drawn = f" ({self.psnr:.2f} over {self.seen:.0%} of pixels)"
+        return (
+            f"step {self.step}  loss {self.loss:.5f}  "
+            f"PSNR {self.picture_psnr:.2f}{drawn if self.seen < 1.0 else ''}  "
+            f"grid {size}  {speed:.1f} steps/s"
+        )
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrainingState:

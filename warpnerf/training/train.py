@@ -1,14 +1,16 @@
-"""Train a voxel radiance field, by one call. No files, no terminal."""
+"""Train a voxel radiance field, by one call. No files."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 
 from warpnerf.checks import require_kind
 from warpnerf.config import TrainConfig
 from warpnerf.presets import PRESETS
 from warpnerf.rendering.field import Field
+from warpnerf.runtime.progress import ProgressBar, has_bar
 from warpnerf.scenes.scene import Scene
 from warpnerf.training.coarse import prepare_trainer
 from warpnerf.training.state import Progress, TrainingState
@@ -35,6 +37,7 @@ def train(
     on_progress: Callable[[Progress], None] | None = None,
     on_checkpoint: Callable[[TrainingState], None] | None = None,
     resume: TrainingState | None = None,
+    progress: bool | None = None,
 ) -> TrainResult:
     """Train a voxel grid on a scene's training views.
 
@@ -50,6 +53,8 @@ def train(
             ``save_checkpoint`` takes, whose arrays the next update changes.
         resume: Where to resume, from ``load_checkpoint``. On the CPU and with the same number of
             threads, the result is that of a training that was never interrupted, bit for bit.
+        progress: Whether to show a progress bar; None: in a terminal or a notebook, where
+            ``on_progress`` is not given.
 
     Returns:
         The field, and how training ended.
@@ -66,11 +71,21 @@ def train(
         require_kind(config, TrainConfig, "train wants a configuration", way_out)
     if config is None:
         config = PRESETS["fast"] if resume is None else resume.config
-    trainer = prepare_trainer(scene, config, resume)
-    progress = trainer.run(on_progress, on_checkpoint)
+    if progress is None:
+        progress = on_progress is None and has_bar()
+    with ProgressBar("first step") if progress else nullcontext() as bar:
+
+        def report(found: Progress) -> None:
+            if bar is not None:
+                bar.report(found.fraction, str(found))
+            if on_progress is not None:
+                on_progress(found)
+
+        trainer = prepare_trainer(scene, config, resume)
+        last = trainer.run(report, on_checkpoint)
     return TrainResult(
         field=trainer.field(),
         content_distance=trainer.plan.content_distance,
-        progress=progress,
+        progress=last,
         scene=trainer.scene,
     )

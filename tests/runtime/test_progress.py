@@ -6,8 +6,11 @@ from collections.abc import Callable
 
 import pytest
 
-from warpnerf.cli import progress
+from tests.support.tiny_trainings import ball, tiny_config
+from warpnerf.runtime import progress
 from warpnerf.runtime.progress import ProgressBar
+from warpnerf.training import train as training
+from warpnerf.training.state import Progress
 
 Lines = Callable[[list[tuple[float, float, str]]], list[str]]
 
@@ -43,3 +46,33 @@ def test_what_came_before_the_first_report_is_not_expected_again(lines_of: Lines
         " 50%  step 50",
         " 60%  step 60  40 s left",
     ]
+
+
+@pytest.mark.parametrize(
+    ("asked", "is_bar", "shown"),
+    [
+        (None, False, False),
+        (None, True, True),
+        (True, False, True),
+        (False, True, False),
+    ],
+)
+def test_train_shows_it_where_somebody_looks(
+    asked: bool | None,
+    is_bar: bool,
+    shown: bool,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(training, "has_bar", lambda: is_bar)
+    training.train(ball(), tiny_config(steps=2), progress=asked)
+    assert ("step 2  loss" in capsys.readouterr().out) == shown
+
+
+def test_who_has_a_report_of_their_own_sees_no_bar(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(training, "has_bar", lambda: True)
+    reports: list[Progress] = []
+    training.train(ball(), tiny_config(steps=2), on_progress=reports.append)
+    assert reports[-1].step == 2 and not capsys.readouterr().out
