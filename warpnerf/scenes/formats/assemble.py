@@ -16,15 +16,27 @@ from warpnerf.scenes.cameras.focus import estimate_extent
 from warpnerf.scenes.cameras.lens import Lens
 from warpnerf.scenes.cameras.undistort import seen_pixels
 from warpnerf.scenes.extent.points import Points, extent_by_points
-from warpnerf.scenes.files import exists, find_image
+from warpnerf.scenes.files import exists
 from warpnerf.scenes.images.depths import Depth, DepthFile, read_depth
-from warpnerf.scenes.images.images import exif_orientation, image_shape
-from warpnerf.scenes.images.masks import Mask, PackedMask, masks_of_folder, read_mask
+from warpnerf.scenes.images.images import exif_orientation, image_shape, read_image
+from warpnerf.scenes.images.masks import (
+    Mask,
+    PackedMask,
+    all_of_blocks,
+    masks_of_folder,
+    read_mask,
+)
 from warpnerf.scenes.images.photographs import Keeping, Photograph, keep
+from warpnerf.scenes.images.transparency import show_an_object, shows_nothing
 from warpnerf.scenes.scene import Scene, View
 
 LITTLE = 0.1
 """Share of the pixels that masks leave, below which they are likely to be inverted."""
+
+LOOKED_AT = 16
+"""Training photographs, at most, whose transparent pixels tell what the scene is."""
+LOOKED_AT_PIXELS = 128
+"""Rows and columns of each, about, that are looked at."""
 
 POSED = "pose.json"
 """Lies beside a scene that `warpnerf pose` wrote, whose poses are those of the stored pixels."""
@@ -52,51 +64,6 @@ class Frame:
     """As a view has it, where it was read already; None: it is in ``path``."""
     bounds: tuple[float, float] | None = None
     """Depth of the nearest and of the farthest content, scene units; None: not known."""
-
-
-def find_images(
-    folder: Path, file: Path, file_paths: Sequence[str]
-) -> tuple[dict[int, Path], list[str]]:
-    """Find the images of a scene file's frames; leave out the missing ones and the repeated ones.
-
-    Returns:
-        The image of each frame that is kept, by the frame's index, and warnings of the others.
-
-    Raises:
-        InputError: A path leaves the folder, or no image is there.
-    """
-    found: dict[int, Path] = {}
-    seen: set[Path] = set()
-    missing: list[str] = []
-    repeated: list[str] = []
-    for index, file_path in enumerate(file_paths):
-        path = find_image(folder, file_path, field=f"{file}: $.frames[{index}].file_path")
-        if path is None:
-            missing.append(file_path)
-        elif path in seen:
-            repeated.append(file_path)
-        else:
-            found[index] = path
-            seen.add(path)
-    if not file_paths:
-        raise InputError(f"{file}: $.frames: is empty; a scene needs posed images.")
-    if not found:
-        raise InputError(
-            f"{file}: $.frames[0].file_path: no image of {len(missing)} frames is in the folder "
-            f"(first: {missing[0]}); put the images next to the file."
-        )
-    warnings = []
-    if missing:
-        warnings.append(
-            f"{file.name}: left out {len(missing)} of {len(file_paths)} frames for want of an "
-            f"image (first: {missing[0]})"
-        )
-    if repeated:
-        warnings.append(
-            f"{file.name}: left out {len(repeated)} of {len(file_paths)} frames for naming an "
-            f"image again (first: {repeated[0]})"
-        )
-    return found, warnings
 
 
 def assemble(
@@ -138,11 +105,15 @@ def assemble(
 
     # Decoders release the interpreter lock. The first error cancels what is not yet read.
     with ThreadPoolExecutor(keeping.threads or usable_cores()) as pool:
-        read = list(pool.map(lambda frame: _read_frame(frame, downscale), frames))
+        trained = [frame for frame in frames if frame.name in complete["train"]]
+        some = trained[:: -(-len(trained) // LOOKED_AT)]
+        is_object = show_an_object(list(pool.map(_transparent, some)))
+        read = list(pool.map(lambda frame: _read_frame(frame, downscale, is_object), frames))
         turned = list(pool.map(_may_lie, frames))
     left = [entry for entry in read if entry is not None]
     complete, mask_warnings = _without_masked(file, frames, left, complete)
     notes += _mask_notes(left)
+    warnings = [*warnings, *_transparency_warning(left)]
     kept = keep([entry.photograph for entry in left], keeping, file=file, downscale=downscale)
     views = [
         View(
@@ -160,7 +131,7 @@ def assemble(
         split: tuple(sorted(index[name] for name in names)) for split, names in complete.items()
     }
     training = [views[i] for i in indices["train"]]
-    unbounded = sum(kept.see_through[i] for i in indices["train"]) < len(training) / 2
+    unbounded = not is_object
     transparent = {view.name for view, see in zip(views, kept.see_through, strict=True) if see}
     try:
         extent = estimate_extent([view.camera for view in training], unbounded=unbounded)
@@ -287,6 +258,31 @@ def _mask_notes(read: Sequence[_Read]) -> list[str]:
     ]
 
 
+def _transparency_warning(read: Sequence[_Read]) -> list[str]:
+    """That transparent pixels are ignored."""
+    shares = {view.name: view.ignored for view in read if view.ignored > 0.0}
+    if not shares:
+        return []
+    return [
+        f"transparent pixels, {np.mean(list(shares.values())):.1%} of {len(shares)} of {len(read)} "
+        f"images (first: {min(shares)}), are ignored: too few, or too much alike, to be what "
+        "surrounds an object"
+    ]
+
+
+def _transparent(frame: Frame) -> np.ndarray:
+    """Where a photograph shows nothing, [H, W] bool, reduced by leaving pixels out."""
+    shape = image_shape(frame.path) if frame.image is None else frame.image.shape
+    if shape[2] == 3:
+        return np.zeros((1, 1), dtype=bool)
+    every = max(1, min(shape[:2]) // LOOKED_AT_PIXELS)
+    return shows_nothing(_pixels(frame)[::every, ::every])
+
+
+def _pixels(frame: Frame) -> np.ndarray:
+    return read_image(frame.path) if frame.image is None else frame.image
+
+
 def _share_kept(read: Sequence[_Read]) -> float:
     pixels = sum(view.camera.width * view.camera.height for view in read)
     count = sum(
@@ -370,10 +366,18 @@ class _Read:
     photograph: Photograph
     depth: Depth | None
     mask: PackedMask | None
+    ignored: float = 0.0
+    """Share of its pixels that are ignored as transparent."""
 
 
-def _read_frame(frame: Frame, downscale: int) -> _Read | None:
-    """What belongs to a frame; None where its mask leaves no pixel of it."""
+def _read_frame(frame: Frame, downscale: int, is_object: bool) -> _Read | None:
+    """What belongs to a frame; None where its mask leaves no pixel of it.
+
+    Args:
+        frame: To read.
+        downscale: Edge of the blocks of pixels that become one.
+        is_object: Whether alpha counts; else transparent pixels are ignored.
+    """
     shape = image_shape(frame.path) if frame.image is None else frame.image.shape
     height, width, channels = shape
     whole = frame.lens.camera(width=width, height=height, c2w=frame.c2w, image=frame.name)
@@ -387,15 +391,24 @@ def _read_frame(frame: Frame, downscale: int) -> _Read | None:
     if frame.mask is not None:
         given = read_mask(frame.mask, width=width, height=height, downscale=downscale)
         mask = given if mask is None else mask & given
+    ignored = 0.0
+    if channels == 4 and not is_object:
+        seen = ~shows_nothing(_pixels(frame))
+        if not seen.all():
+            ignored = 1.0 - float(seen.mean())
+            size = (height // downscale, width // downscale)
+            seen = all_of_blocks(seen, downscale, size)
+            mask = seen if mask is None else mask & seen
     if mask is not None and not mask.any():
         return None
     if mask is not None and mask.all():
         mask = None
     photograph = Photograph(
         path=frame.path,
-        shape=(camera.height, camera.width, channels),
+        shape=(camera.height, camera.width, channels if is_object else 3),
         downscale=downscale,
         image=frame.image,
+        drops_alpha=channels == 4 and not is_object,
     )
     depth = None if frame.depth is None else read_depth(frame.depth, whole, downscale)
     return _Read(
@@ -404,4 +417,5 @@ def _read_frame(frame: Frame, downscale: int) -> _Read | None:
         photograph=photograph,
         depth=depth,
         mask=None if mask is None else PackedMask.of(mask),
+        ignored=ignored,
     )

@@ -141,11 +141,20 @@ def read_mask(mask: Mask, *, width: int, height: int, downscale: int) -> np.ndar
             f"{mask.path}: has {columns}x{rows} pixels, but its photograph {width}x{height}; make "
             "the mask as large as the photograph."
         )
-    return _all_of_blocks(counts, times * downscale, small)
+    return all_of_blocks(counts, times * downscale, small)
 
 
-def _all_of_blocks(counts: np.ndarray, edge: int, size: tuple[int, int]) -> np.ndarray:
-    """Whether all pixels of each block do; those at the right and bottom that fill none are cut."""
+def all_of_blocks(counts: np.ndarray, edge: int, size: tuple[int, int]) -> np.ndarray:
+    """Which blocks of pixels count as wholes.
+
+    Args:
+        counts: Which pixels do, [H, W] bool.
+        edge: Of a block, pixels.
+        size: Rows and columns of blocks; pixels at the right and bottom that fill none are cut.
+
+    Returns:
+        [rows, columns] bool.
+    """
     rows, columns = size
     blocks = counts[: rows * edge, : columns * edge].reshape(rows, edge, columns, edge)
     return np.asarray(blocks.all(axis=(1, 3)))

@@ -75,6 +75,8 @@ class Photograph:
     """Edge of the blocks of pixels that become one."""
     image: np.ndarray | None = None
     """Its pixels before that, [H, W, 3 or 4] uint8, where they are in memory anyway."""
+    drops_alpha: bool = False
+    """Whether alpha in its file is left out."""
 
     @property
     def n_bytes(self) -> int:
@@ -93,6 +95,8 @@ class Photograph:
         image = read_image(self.path) if self.image is None else self.image
         if self.downscale > 1:
             image = box_filter(image, self.downscale)
+        if self.drops_alpha and image.shape[2] == 4:
+            image = np.ascontiguousarray(image[..., :3])
         if image.shape != self.shape:
             raise InputError(f"{self.path}: has changed while it was read; begin again.")
         return image

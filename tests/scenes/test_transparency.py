@@ -1,0 +1,89 @@
+"""Transparent pixels are nothing around an object, or are ignored: what the scene is must not hang
+on a few."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.support.tiny_scenes import picture, write_transforms
+from warpnerf.scenes.formats.load import load_scene
+from warpnerf.scenes.images.transparency import show_an_object, shows_nothing
+
+H, W = 60, 80
+V, U = np.mgrid[0:H, 0:W]
+
+
+def border(share: float) -> np.ndarray:
+    """A frame of about so large a share of the picture."""
+    edge = (1.0 - np.sqrt(1.0 - share)) / 2.0
+    inside = (abs(V - H / 2) < H * (0.5 - edge)) & (abs(U - W / 2) < W * (0.5 - edge))
+    return ~inside
+
+
+def around(seed: int, share: float) -> np.ndarray:
+    """What is not a disc, somewhere, of so large a share of the picture left over."""
+    at = np.random.default_rng(seed).uniform(0.35, 0.65, size=2)
+    radius = np.sqrt((1.0 - share) * H * W / np.pi)
+    return (V - at[0] * H) ** 2 + (U - at[1] * W) ** 2 > radius**2
+
+
+NOTHING = np.zeros((H, W), dtype=bool)
+ONE = NOTHING.copy()
+ONE[0, 0] = True
+
+
+@pytest.mark.parametrize(
+    ("transparent", "is_object"),
+    [
+        pytest.param([], False, id="no photograph"),
+        pytest.param([NOTHING] * 9, False, id="opaque"),
+        pytest.param([ONE] * 9, False, id="a pixel of each"),
+        pytest.param([border(0.05)] * 9, False, id="undistorted"),
+        pytest.param([border(0.12)] * 9, False, id="undistorted, wide"),
+        pytest.param([around(k, 0.6) for k in range(9)], True, id="an object"),
+        pytest.param([around(0, 0.6)] * 9, True, id="an object that looks alike from all sides"),
+        pytest.param([around(k, 0.3) for k in range(9)], True, id="an object, close"),
+        pytest.param([around(k, 0.6) for k in range(4)] + [NOTHING] * 5, False, id="in a few"),
+        pytest.param(
+            [border(0.05), border(0.05)[:50, :70], border(0.05)] * 3, False, id="two sizes"
+        ),
+    ],
+)
+def test_what_they_mean(transparent: list[np.ndarray], is_object: bool) -> None:
+    assert show_an_object(transparent) == is_object
+
+
+def test_an_object_that_fills_the_picture_is_told_by_its_outline() -> None:
+    few = [3 + 2 * k > U for k in range(9)]
+    assert 0.02 < np.median([image.mean() for image in few]) < 0.15
+    assert show_an_object(few)
+
+
+def test_almost_opaque_is_opaque() -> None:
+    image = np.zeros((2, 2, 4), np.uint8)
+    image[..., 3] = [[0, 127], [128, 255]]
+    assert shows_nothing(image).tolist() == [[True, True], [False, False]]
+    assert not shows_nothing(image[..., :3]).any()
+
+
+@pytest.mark.parametrize("downscale", [1, 2])
+def test_the_few_are_ignored(tmp_path: Path, downscale: int) -> None:
+    write_transforms(tmp_path, 9)
+    plain = load_scene(tmp_path, downscale=downscale)
+    for i in range(9):
+        rgba = np.dstack([picture(i), np.full((6, 8), 255, np.uint8)])
+        rgba[0, :2, 3], rgba[5, 5, 3] = 0, 254
+        Image.fromarray(rgba).save(tmp_path / f"images/{i:03d}.png")
+    scene = load_scene(tmp_path, downscale=downscale)
+    assert scene.unbounded and not scene.has_alpha and scene.kind == plain.kind
+    (warning,) = [w for w in scene.warnings if "transparent" in w]
+    assert warning.startswith("transparent pixels, 4.2% of 9 of 9 images")
+    for ours, theirs in zip(scene.views, plain.views, strict=True):
+        mask = np.ones((6 // downscale, 8 // downscale), bool)
+        mask[0, : 2 // downscale] = False
+        assert ours.mask is not None and np.array_equal(ours.mask, mask)
+        np.testing.assert_allclose(ours.image[mask], theirs.image[mask], atol=1)
