@@ -29,6 +29,7 @@ from warpnerf.config import GridConfig
 from warpnerf.evaluation.evaluate import evaluate
 from warpnerf.inspection.inspection import inspect
 from warpnerf.scenes.builtin.room import room_scene
+from warpnerf.scenes.formats.contents import photographs_in
 from warpnerf.scenes.formats.load import load_scene
 from warpnerf.scenes.images.masks import Mask, read_mask
 from warpnerf.scenes.scene import Scene, View
@@ -153,6 +154,32 @@ def test_masks_of_instant_ngp_lie_beside_the_photographs(tmp_path: Path) -> None
     found = masks_of(load_scene(tmp_path))
     assert np.array_equal(found["images/002.png"], KEPT)
     assert found["images/001.png"] is None
+
+
+@pytest.mark.parametrize("name", ["001.png.mask.png", "001.mask.png", "001_mask.png"])
+@pytest.mark.parametrize("colmap", [False, True])
+def test_masks_that_lie_beside_photographs_are_used(
+    tmp_path: Path, name: str, colmap: bool
+) -> None:
+    (scene_with_model if colmap else write_transforms)(tmp_path)
+    save_mask(tmp_path / "images" / name)
+    found = masks_of(load_scene(tmp_path))
+    photograph = "001.png" if colmap else "images/001.png"
+    assert np.array_equal(found.pop(photograph), KEPT)
+    assert set(found.values()) == {None}
+    assert [path.name for path in photographs_in(tmp_path)] == [f"{k:03}.png" for k in range(4)]
+    save_mask(tmp_path / "given" / "003.png")
+    given = masks_of(load_scene(tmp_path, masks=tmp_path / "given"))
+    assert given[photograph] is None
+
+
+def test_a_photograph_may_be_called_a_mask(tmp_path: Path) -> None:
+    content = write_transforms(tmp_path)
+    frame = content["frames"][3]
+    (tmp_path / frame["file_path"]).rename(tmp_path / "images" / "002_mask.png")
+    frame["file_path"] = "images/002_mask.png"
+    save(tmp_path / "transforms.json", content)
+    assert set(masks_of(load_scene(tmp_path)).values()) == {None}
 
 
 @pytest.mark.parametrize("name", ["001.png.png", "001.png", "001.jpg"])

@@ -11,6 +11,7 @@ from PIL import ExifTags, Image
 
 from tests.support.tiny_scenes import picture
 from warpnerf.checks import InputError
+from warpnerf.scenes.formats.contents import photographs_in
 from warpnerf.sfm.photographs import UnposedPhotograph, put_into, read_photographs
 
 
@@ -132,3 +133,16 @@ def test_files_are_linked_and_copied_where_that_is_not_possible(
     put_into(tmp_path / "in", path, "c.jpg")
     assert (tmp_path / "in" / "c.jpg").read_bytes() == path.read_bytes()
     assert not (tmp_path / "in" / "c.jpg").samefile(path)
+
+
+def test_masks_beside_photographs_are_used_and_are_none_themselves(tmp_path: Path) -> None:
+    for number in range(3):
+        Image.new("RGB", (8, 6)).save(tmp_path / f"{number}.jpg")
+    Image.new("L", (8, 6)).save(tmp_path / "1.jpg.mask.png")
+    found = read_photographs(photographs_in(tmp_path), lenses="auto", masks=None)
+    assert [photograph.path.name for photograph in found] == ["0.jpg", "1.jpg", "2.jpg"]
+    assert [None if p.mask is None else p.mask.path.name for p in found] == [
+        None,
+        "1.jpg.mask.png",
+        None,
+    ]

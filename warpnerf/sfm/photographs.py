@@ -21,7 +21,7 @@ from warpnerf.scenes.images.images import (
     read_exif,
     require_whole_image,
 )
-from warpnerf.scenes.images.masks import Mask, masks_of_folder
+from warpnerf.scenes.images.masks import Mask, mask_beside, masks_of_folder
 from warpnerf.sfm.config import Lenses
 
 UPRIGHT = {
@@ -62,7 +62,7 @@ def read_photographs(
         paths: Of photographs.
         lenses: Which of them share a lens: those of the same size, camera and focal length by
             EXIF (auto), all (one), or none (each).
-        masks: Folder of masks, named after the photographs.
+        masks: Folder of masks, named after the photographs; None: those beside them, if any.
         threads: That look at them; None: one per usable core.
 
     Returns:
@@ -88,7 +88,11 @@ def read_photographs(
         list(pool.map(require_whole_image, paths))
     keys: dict[object, int] = {}
     photographs = []
-    found = masks_of_folder(masks, [p.name for p in paths]) if masks else [None] * len(paths)
+    if masks is None:
+        beside = map(mask_beside, paths)
+        found = [mask if mask is not None and mask.white_counts else None for mask in beside]
+    else:
+        found = masks_of_folder(masks, [path.name for path in paths])
     for number, (path, mask) in enumerate(zip(paths, found, strict=True)):
         size = image_size(path)
         key = {"auto": (size, read_exif(path, _camera)), "one": "one", "each": number}[lenses]

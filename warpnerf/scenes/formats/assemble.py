@@ -23,6 +23,7 @@ from warpnerf.scenes.images.masks import (
     Mask,
     PackedMask,
     all_of_blocks,
+    mask_beside,
     masks_of_folder,
     read_mask,
 )
@@ -102,6 +103,8 @@ def assemble(
     if masks is not None:
         found = masks_of_folder(masks, [frame.name for frame in frames])
         frames = [replace(frame, mask=mask) for frame, mask in zip(frames, found, strict=True)]
+    else:
+        frames = _with_masks_beside(frames)
 
     # Decoders release the interpreter lock. The first error cancels what is not yet read.
     with ThreadPoolExecutor(keeping.threads or usable_cores()) as pool:
@@ -171,6 +174,19 @@ def _bounds(frames: Sequence[Frame], views: Sequence[View]) -> np.ndarray | None
     if len(given) < len(frames):
         return None
     return np.array([given[view.name] for view in views])
+
+
+def _with_masks_beside(frames: Sequence[Frame]) -> list[Frame]:
+    """Frames with the masks that lie beside their photographs, where they have none."""
+    photographs = {frame.path for frame in frames}
+    found = []
+    for frame in frames:
+        mask = frame.mask
+        if mask is None and frame.image is None:
+            mask = mask_beside(frame.path)
+            mask = None if mask is None or mask.path in photographs else mask
+        found.append(replace(frame, mask=mask))
+    return found
 
 
 def complete_splits(

@@ -12,6 +12,7 @@ from warpnerf.scenes.formats import llff
 from warpnerf.scenes.formats.blender import SPLITS, split_file
 from warpnerf.scenes.formats.colmap import find_model
 from warpnerf.scenes.formats.npz import is_scene_file, single_npz
+from warpnerf.scenes.images.masks import without_masks
 
 UNREAD_PHOTOGRAPHS = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf")
 """Endings of photographs that phones and cameras write and that are not read."""
@@ -48,8 +49,7 @@ def photographs_in(folder: Path) -> list[Path]:
         InputError: The folder cannot be read.
     """
     for place in (folder, folder / "images"):
-        found = _with_endings(place, llff.ENDINGS)
-        photographs = [path for path in found if not path.name.startswith("dynamic_mask_")]
+        photographs = without_masks(_with_endings(place, llff.ENDINGS))
         if photographs:
             return photographs
     return []

@@ -22,7 +22,7 @@ from warpnerf.scenes.formats.colmap import points_beside
 from warpnerf.scenes.formats.frame_images import find_images
 from warpnerf.scenes.formats.ply import read_ply
 from warpnerf.scenes.images.depths import DEFAULT_UNIT, DepthFile
-from warpnerf.scenes.images.masks import Mask, mask_beside
+from warpnerf.scenes.images.masks import Mask
 from warpnerf.scenes.images.photographs import KEEPING, Keeping
 from warpnerf.scenes.scene import Scene
 
@@ -181,7 +181,7 @@ def read_frames(file: Path) -> tuple[TransformsFile, list[Frame], list[str]]:
                 path=path,
                 c2w=check_pose(entry.transform_matrix, field=f"{file}: {place}.transform_matrix"),
                 lens=read_lens(file, [(place, entry), ("$", data)]),
-                mask=mask_beside(path) if mask is None else Mask(mask),
+                mask=None if mask is None else Mask(mask),
                 depth=None if depth is None else DepthFile(depth, unit),
             )
         )

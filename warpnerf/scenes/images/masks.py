@@ -50,9 +50,24 @@ class PackedMask:
 
 
 def mask_beside(photograph: Path) -> Mask | None:
-    """instant-ngp's mask of a photograph, dynamic_mask_NAME.png in the same folder."""
+    """The mask of a photograph in the same folder, by its name: dynamic_mask_NAME.png, as of
+    instant-ngp; NAME.jpg.mask.png or NAME.mask.png, as of RealityScan; or NAME_mask.png."""
     path = photograph.with_name(f"dynamic_mask_{photograph.stem}.png")
-    return Mask(path, white_counts=False) if os.path.isfile(path) else None  # noqa: PTH113
+    if os.path.isfile(path):  # noqa: PTH113, never raises
+        return Mask(path, white_counts=False)
+    stems = (f"{photograph.name}.mask", f"{photograph.stem}.mask", f"{photograph.stem}_mask")
+    for name in (f"{stem}{suffix}" for stem in stems for suffix in SUFFIXES):
+        path = photograph.with_name(name)
+        if os.path.isfile(path):  # noqa: PTH113
+            return Mask(path)
+    return None
+
+
+def without_masks(paths: Sequence[Path]) -> list[Path]:
+    """Those of some images that are no mask of another one of them, in the same order."""
+    found = (mask_beside(path) for path in paths if not path.name.startswith("dynamic_mask_"))
+    masks = {mask.path for mask in found if mask is not None}
+    return [p for p in paths if p not in masks and not p.name.startswith("dynamic_mask_")]
 
 
 def mask_in(folder: Path, name: str) -> Mask | None:
