@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -93,6 +94,23 @@ def test_through_passes_every_camera_in_order() -> None:
     distances = np.linalg.norm(places[:, None] - wanted[None], axis=2)
     assert distances.min(axis=0).max() < 0.02
     assert (np.diff(distances.argmin(axis=0)) > 0).all()
+
+
+def test_through_goes_by_the_numbers_in_names() -> None:
+    """A walk whose views are in the order of letters: 0, 1, 10, 11, ..., 2, 20, ..."""
+    scene = walk(60)
+    scene = replace(scene, splits={"train": tuple(range(60))})
+    names = [str(number) for number in range(len(scene.views))]
+    order = sorted(range(len(names)), key=lambda index: names[index])
+    views = [replace(scene.views[index], name=names[index]) for index in order]
+    by_letters = replace(scene, views=views)
+    named = replace(
+        scene, views=[replace(v, name=n) for v, n in zip(scene.views, names, strict=True)]
+    )
+    np.testing.assert_array_equal(
+        positions(camera_path(by_letters, "through", 60)),
+        positions(camera_path(named, "through", 60)),
+    )
 
 
 def test_through_goes_at_even_speed_however_far_cameras_are_apart() -> None:

@@ -20,6 +20,7 @@ from tests.support.tiny_scenes import (
     write_transforms,
 )
 from warpnerf.checks import InputError
+from warpnerf.scenes.files import by_number
 from warpnerf.scenes.formats.load import load_scene
 
 
@@ -390,3 +391,21 @@ def test_lund_door_is_loaded() -> None:
     scene = load_scene(DATA / "lund_door")
     assert [len(scene.splits[split]) for split in ("train", "test")] == [10, 2]
     assert scene.content_distance == pytest.approx(20.4, abs=0.1)  # its points say
+
+
+def test_numbers_in_names_count_as_numbers_for_every_8th(tmp_path: Path) -> None:
+    content = write_transforms(tmp_path, 20)
+    for frame, number in zip(content["frames"], range(20), strict=True):
+        path = tmp_path / frame["file_path"]
+        path.rename(path.with_name(f"frame_{number}.png"))
+        frame["file_path"] = f"images/frame_{number}.png"
+    save(tmp_path / "transforms.json", content)
+    scene = load_scene(tmp_path)
+    tested = {scene.views[index].name for index in scene.splits["test"]}
+    assert tested == {f"images/frame_{number}.png" for number in (0, 8, 16)}
+
+
+def test_names_are_sorted_by_their_numbers() -> None:
+    names = ["b", "a10b2", "a2", "a10b10", "a01", "a1", "10", "9"]
+    expected = ["9", "10", "a01", "a1", "a2", "a10b2", "a10b10", "b"]
+    assert sorted(names, key=by_number) == expected

@@ -13,6 +13,7 @@ from warpnerf.checks import InputError, require_one_of, require_positive, requir
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.cameras.fisheye import angle_of
 from warpnerf.scenes.cameras.focus import MIN_SHARE_AIMED, find_focus, share_aimed_at, up_direction
+from warpnerf.scenes.files import by_number
 from warpnerf.scenes.scene import Scene
 
 PathKind = Literal["orbit", "through", "back"]
@@ -79,7 +80,9 @@ def camera_path(
     if kind == "orbit":
         poses = _orbit(cameras, n_frames)
     else:
-        poses = _through(cameras, n_frames, scene.content_distance)
+        training = (scene.views[index] for index in scene.splits["train"])
+        in_order = sorted(training, key=lambda view: by_number(view.name))
+        poses = _through([v.camera for v in in_order], n_frames, scene.content_distance)
     path = [replace(lens, c2w=pose) for pose in poses]
     if kind == "back":
         end = BACK_SHARE * scene.content_distance if distance is None else distance

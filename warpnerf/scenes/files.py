@@ -227,6 +227,12 @@ def photograph_folder(folder: Path) -> Path | None:
     return sizes[min(sizes)] if sizes else None
 
 
+def by_number(name: str) -> tuple[tuple[str | int, ...], str]:
+    """A key to sort names by in which numbers count as numbers: frame_2 comes before frame_10."""
+    parts = re.split(r"([0-9]+)", name)
+    return tuple(int(part) if index % 2 else part for index, part in enumerate(parts)), name
+
+
 def printable(text: str) -> str:
     """Text out of a file for a terminal: what would steer it is spelled out."""
     return text if text.isprintable() else _quoted(text)

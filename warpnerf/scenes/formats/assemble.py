@@ -16,7 +16,7 @@ from warpnerf.scenes.cameras.focus import estimate_extent
 from warpnerf.scenes.cameras.lens import Lens
 from warpnerf.scenes.cameras.undistort import seen_pixels
 from warpnerf.scenes.extent.points import Points, extent_by_points
-from warpnerf.scenes.files import exists
+from warpnerf.scenes.files import by_number, exists
 from warpnerf.scenes.images.depths import Depth, DepthFile, read_depth
 from warpnerf.scenes.images.images import exif_orientation, image_shape, read_image
 from warpnerf.scenes.images.masks import (
@@ -195,7 +195,7 @@ def complete_splits(
     """Fill in the splits that a file leaves out.
 
     Without a training split, it is all images of no other split. Without a test split, every 8th
-    training image is for testing instead, counted by name from the first.
+    training image is for testing instead, counted by name from the first, numbers as such.
 
     Returns:
         Names for "train" and "test", and "val" where it is given; notes.
@@ -208,7 +208,7 @@ def complete_splits(
     train = given.get("train", set(names) - set().union(*given.values()))
     test = given.get("test", set())
     if not test:
-        test = set(sorted(train)[::HOLD_OUT])
+        test = set(sorted(train, key=by_number)[::HOLD_OUT])
         train = train - test
         notes.append(f"the file has no test split: every {HOLD_OUT}th image is for testing")
     if not train:
