@@ -134,3 +134,25 @@ def test_lego_is_loaded() -> None:
     np.testing.assert_allclose(scene.box_max, 1.451, atol=0.001)
     np.testing.assert_allclose(scene.box_min, -1.451, atol=0.001)
     assert scene.views[0].image.shape == (200, 200, 4)
+
+
+@pytest.mark.parametrize("frames", [3, 0])
+def test_a_split_without_pictures_is_not_used(tmp_path: Path, frames: int) -> None:
+    """As cameras of a path are written beside renderings for training."""
+    write_blender(tmp_path, "train", ring(9))
+    content = write_blender(tmp_path, "test", ring(3))
+    for image in (tmp_path / "test").iterdir():
+        image.unlink()
+    save(tmp_path / "transforms_test.json", {**content, "frames": content["frames"][:frames]})
+    scene = load_scene(tmp_path)
+    assert (len(scene.views), len(scene.splits["test"])) == (9, 2)
+    (warning,) = scene.warnings
+    first = r" (first: ./test/r_0)" if frames else ""
+    assert warning == (
+        f"transforms_test.json is not used: none of the {frames} images that it names is in the "
+        f"folder{first}"
+    )
+    for image in (tmp_path / "train").iterdir():
+        image.unlink()
+    with pytest.raises(InputError, match="transforms_train.json: .* no image of 9 frames is in"):
+        load_scene(tmp_path)

@@ -32,7 +32,7 @@ def load_blender(
 ) -> Scene:
     """Load a scene from transforms_train.json and its siblings.
 
-    Without transforms_test.json every 8th training image is for testing.
+    Without transforms_test.json, or without its images, every 8th training image is for testing.
 
     Args:
         folder: The scene's folder; image paths are relative to it and stay inside it.
@@ -50,7 +50,7 @@ def load_blender(
         file = folder / split_file(split)
         if split != "train" and not exists(file):
             continue
-        _, found, found_warnings = read_frames(file)
+        _, found, found_warnings = read_frames(file, required=split == "train")
         # An image in two files keeps the first file's pose.
         for frame in found:
             frames.setdefault(frame.name, frame)

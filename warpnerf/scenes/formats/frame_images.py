@@ -10,15 +10,21 @@ from warpnerf.scenes.files import find_image
 
 
 def find_images(
-    folder: Path, file: Path, file_paths: Sequence[str]
+    folder: Path, file: Path, file_paths: Sequence[str], required: bool = True
 ) -> tuple[dict[int, Path], list[str]]:
     """Find the images of a scene file's frames; leave out the missing ones and the repeated ones.
+
+    Args:
+        folder: That paths are relative to, and must not leave.
+        file: The scene file, for messages.
+        file_paths: Of each frame, as the file has it.
+        required: Whether one image at least must be there.
 
     Returns:
         The image of each frame that is kept, by the frame's index, and warnings of the others.
 
     Raises:
-        InputError: A path leaves the folder, or no image is there.
+        InputError: A path leaves the folder, or no image is there though one is required.
     """
     found: dict[int, Path] = {}
     seen: set[Path] = set()
@@ -33,6 +39,12 @@ def find_images(
         else:
             found[index] = path
             seen.add(path)
+    if not found and not required:
+        first = f" (first: {missing[0]})" if missing else ""
+        return {}, [
+            f"{file.name} is not used: none of the {len(file_paths)} images that it names is in the "
+            f"folder{first}"
+        ]
     if not file_paths:
         raise InputError(f"{file}: $.frames: is empty; a scene needs posed images.")
     if not found:

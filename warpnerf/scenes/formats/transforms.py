@@ -149,8 +149,12 @@ def _points(
     return Points(positions=positions, tracks=None, source=ply_file_path), ""
 
 
-def read_frames(file: Path) -> tuple[TransformsFile, list[Frame], list[str]]:
+def read_frames(file: Path, required: bool = True) -> tuple[TransformsFile, list[Frame], list[str]]:
     """Read a file of frames and check everything but the images' pixels.
+
+    Args:
+        file: To read.
+        required: Whether one of its images at least must be there.
 
     Returns:
         The file's content, the frames whose images are there, and warnings of the others.
@@ -159,7 +163,9 @@ def read_frames(file: Path) -> tuple[TransformsFile, list[Frame], list[str]]:
         InputError: As ``load_transforms``.
     """
     data = read_json(file, TransformsFile)
-    found, warnings = find_images(file.parent, file, [entry.file_path for entry in data.frames])
+    found, warnings = find_images(
+        file.parent, file, [entry.file_path for entry in data.frames], required
+    )
     unit = data.depth_unit_scale_factor * data.applied_scale
     if not (unit > 0.0 and math.isfinite(unit)):
         raise InputError(
