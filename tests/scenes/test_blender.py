@@ -154,5 +154,5 @@ def test_a_split_without_pictures_is_not_used(tmp_path: Path, frames: int) -> No
     )
     for image in (tmp_path / "train").iterdir():
         image.unlink()
-    with pytest.raises(InputError, match="transforms_train.json: .* no image of 9 frames is in"):
+    with pytest.raises(InputError, match=r"transforms_train\.json: .* no image of 9 frames is in"):
         load_scene(tmp_path)

@@ -42,8 +42,8 @@ def find_images(
     if not found and not required:
         first = f" (first: {missing[0]})" if missing else ""
         return {}, [
-            f"{file.name} is not used: none of the {len(file_paths)} images that it names is in the "
-            f"folder{first}"
+            f"{file.name} is not used: none of the {len(file_paths)} images that it names is in "
+            f"the folder{first}"
         ]
     if not file_paths:
         raise InputError(f"{file}: $.frames: is empty; a scene needs posed images.")
