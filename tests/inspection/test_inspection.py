@@ -142,7 +142,12 @@ def test_a_camera_far_away_and_one_upside_down(tmp_path: Path) -> None:
     ("given", "says"),
     [
         ({"cx": 0.0}, "principal point far from the middle of the image: 9 of 9 cameras"),
-        ({"cx": 0.5, "cy": 0.5}, "principal point far from the middle"),  # shares
+        ({"cx": 0.5, "cy": 0.9}, "principal point far from the middle"),  # shares
+        ({"cx": 6.0, "cy": 8.0}, "is that of a picture turned by 90 degrees: 9 of 9 cameras"),
+        ({"cx": 4.0, "cy": 3.0}, "are pixels of a picture 0.5 times as wide"),
+        ({"cx": 2.67, "cy": 2.0}, "are pixels of a picture 0.334 times as wide"),
+        ({"cx": 12.8, "cy": 9.6}, "are pixels of a picture 1.6 times as wide"),
+        ({"cx": 7.2, "cy": 6.6}, None),
         ({"fl_x": 0.9, "fl_y": 1.2}, "focal length below 0.15 of the image's width: 9 of 9"),
         ({}, None),
     ],
@@ -156,7 +161,7 @@ def test_lenses_in_other_units_are_said(
     found = odd(inspect(tmp_path))
     assert (says or "") in found
     if says is None:
-        assert "principal" not in found and "focal" not in found
+        assert "principal" not in found and "turned" not in found and "focal" not in found
 
 
 @pytest.mark.parametrize(

@@ -371,3 +371,28 @@ def test_what_masks_hide_is_not_learnt(device: str) -> None:
         psnr[kind] = evaluate(result.field, clean).mean["psnr"]
     assert psnr["person"] < psnr["clean"] - 1.0, psnr
     assert psnr["clean"] - psnr["masked"] < 0.5 * (psnr["clean"] - psnr["person"]), psnr
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(12, 16), (11, 15), (13, 17), (11, 17)])
+def test_a_mask_of_the_whole_picture_fits_a_reduced_one(
+    tmp_path: Path, rows: int, columns: int
+) -> None:
+    """Whoever reduces rounds: to 8 x 6 from 15 x 11, and from 17 x 13."""
+    kept = np.ones((rows, columns), bool)
+    kept[3, 4] = kept[-1, -1] = False
+    Image.fromarray(kept).save(tmp_path / "mask.png")
+    found = read_mask(Mask(tmp_path / "mask.png"), width=8, height=6, downscale=1)
+    expected = np.ones((6, 8), bool)
+    expected[1, 2] = expected[5, 7] = False
+    if rows == 13:  # the last row and column are left over
+        expected[5, 7] = True
+    if (rows, columns) == (11, 17):
+        expected[5, 7] = True
+    assert np.array_equal(found, expected)
+
+
+@pytest.mark.parametrize("size", [(18, 12), (16, 14), (7, 6), (8, 8)])
+def test_a_mask_of_another_size_is_refused(tmp_path: Path, size: tuple[int, int]) -> None:
+    Image.new("L", size, 255).save(tmp_path / "mask.png")
+    with pytest.raises(InputError, match="make the mask as large as the photograph"):
+        read_mask(Mask(tmp_path / "mask.png"), width=8, height=6, downscale=1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from tests.support.tiny_scenes import ring, save, write_blender, write_transforms
 from warpnerf.scenes.formats.survey import survey
@@ -70,3 +71,13 @@ def test_what_cannot_be_read_is_left_to_loading(tmp_path: Path) -> None:
     (tmp_path / "transforms.json").write_text("{")
     found = survey(tmp_path)
     assert (found.refused, found.diagnostics) == ((), ())
+
+
+@pytest.mark.parametrize(("times", "said"), [((0.0, 0.0, 0.0, 0.0), False), ((0, 1, 1, 2), True)])
+def test_times_of_what_moves_are_said(tmp_path: Path, times: tuple[float, ...], said: bool) -> None:
+    content = write_transforms(tmp_path)
+    for frame, time in zip(content["frames"], times, strict=True):
+        frame["time"] = time
+    save(tmp_path / "transforms.json", content)
+    found = " ".join(survey(tmp_path).diagnostics)
+    assert ("frames have 3 different times, but the scene is trained as if" in found) == said

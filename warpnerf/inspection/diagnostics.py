@@ -24,6 +24,12 @@ FAR_OFF = 10.0
 
 OFF_CENTRE = 0.3
 """Of the image's width or height, from the middle to the principal point: no lens is so far off."""
+ASIDE = 0.05
+"""Of that, from where on it may be that of another picture."""
+NOTABLE = 0.15
+"""Of that, from where on it is, if it is as far off along both sides."""
+ALIKE = 0.02
+"""Of that, by which such shares may differ."""
 SHORT = 0.15
 """Focal length as a share of the image's width: 147 degrees, which no lens but a fisheye sees."""
 
@@ -167,14 +173,33 @@ def _odd_places(scene: Scene) -> list[str]:
 def _odd_lenses(scene: Scene) -> list[str]:
     """Lenses as hardly any photograph has them: numbers in other units, perhaps."""
     odd = []
-    aside, wide = [], []
+    aside, turned, other_size, wide = [], [], [], []
     for view in scene.views:
         camera = view.camera
-        shares = np.array([camera.cx / camera.width, camera.cy / camera.height])
-        if np.abs(shares - 0.5).max() > OFF_CENTRE:
+        size = np.array([camera.width, camera.height])
+        shares = np.array([camera.cx, camera.cy]) / size
+        off = np.abs(shares - 0.5).max()
+        if off > ASIDE and np.abs(shares - 0.5 * size[::-1] / size).max() < ALIKE:
+            turned.append(view.name)
+        elif off > NOTABLE and np.ptp(shares) < ALIKE:
+            other_size.append((view.name, 2.0 * float(shares.mean())))
+        elif off > OFF_CENTRE:
             aside.append(view.name)
         if not camera.fisheye and min(camera.fx, camera.fy) < SHORT * camera.width:
             wide.append(view.name)
+    if turned:
+        odd.append(
+            f"the principal point is that of a picture turned by 90 degrees: {len(turned)} of "
+            f"{len(scene.views)} cameras (first: {turned[0]}), whose cx is half the height and cy "
+            "half the width; swap them, and fx and fy, if the pictures stand upright"
+        )
+    if other_size:
+        name, times = other_size[0]
+        odd.append(
+            f"the principal point is at the same share of width and height, far from the middle: "
+            f"{len(other_size)} of {len(scene.views)} cameras (first: {name}); cx, cy, and perhaps "
+            f"fx, fy, are pixels of a picture {times:.3g} times as wide"
+        )
     if aside:
         odd.append(
             f"principal point far from the middle of the image: {len(aside)} of "

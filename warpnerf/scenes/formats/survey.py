@@ -73,6 +73,12 @@ def survey(path: str | Path) -> Survey:
                 f"{file.name}: {bent} of {len(data.frames)} poses are not quite rigid: the nearest "
                 "rotations are used"
             )
+        times = {repr(frame["time"]) for frame in raw["frames"] if "time" in frame}
+        if len(times) > 1:
+            diagnostics.append(
+                f"{file.name}: frames have {len(times)} different times, but the scene is trained "
+                "as if nothing moved: what does is smeared; keep the frames of one time, or mask it"
+            )
         unread = _unread_keys(raw)
         if unread:
             diagnostics.append(f"{file.name}: keys that are not read: {', '.join(unread)}")

@@ -120,7 +120,7 @@ def masks_of_folder(folder: Path, names: Sequence[str]) -> list[Mask | None]:
 
 
 def read_mask(mask: Mask, *, width: int, height: int, downscale: int) -> np.ndarray:
-    """Read a mask for a photograph, of its size or a whole number of times as large.
+    """Read a mask for a photograph, of its size or a whole number of times as large, rounded.
 
     White is more than half of the largest value that a pixel can have, in any channel, where it is
     opaque; where no pixel has more than 1 of 255, it is 1. A pixel that stands for several counts
@@ -150,8 +150,9 @@ def read_mask(mask: Mask, *, width: int, height: int, downscale: int) -> np.ndar
     small = (height // downscale, width // downscale)
     if (rows, columns) == small:
         return counts
-    times = round(columns / width)
-    if times < 1 or (rows // times, columns // times) != (height, width):
+    times = max(1, round(columns / width))
+    # What fills no whole pixel of a reduced photograph was dropped, or has one of its own.
+    if max(abs(columns / times - width), abs(rows / times - height)) >= 1.0:
         raise InputError(
             f"{mask.path}: has {columns}x{rows} pixels, but its photograph {width}x{height}; make "
             "the mask as large as the photograph."
@@ -165,11 +166,15 @@ def all_of_blocks(counts: np.ndarray, edge: int, size: tuple[int, int]) -> np.nd
     Args:
         counts: Which pixels do, [H, W] bool.
         edge: Of a block, pixels.
-        size: Rows and columns of blocks; pixels at the right and bottom that fill none are cut.
+        size: Rows and columns of blocks; pixels at the right and bottom that fill none are cut, and
+            where blocks are not full, the last pixels are repeated.
 
     Returns:
         [rows, columns] bool.
     """
     rows, columns = size
+    missing = [max(0, n * edge - there) for n, there in zip(size, counts.shape, strict=True)]
+    if any(missing):
+        counts = np.pad(counts, [(0, n) for n in missing], mode="edge")
     blocks = counts[: rows * edge, : columns * edge].reshape(rows, edge, columns, edge)
     return np.asarray(blocks.all(axis=(1, 3)))
