@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,21 @@ def test_every_ending_becomes_a_file(
     assert f"nodes as {kind if kind.endswith('s') else 'a ' + kind}\n" in said
     assert f"wrote {target}" in said
     assert "10 of 10 training cameras" in said
+
+
+@pytest.mark.parametrize("k1", [0.0, 0.01])
+def test_lenses_that_3dgs_does_not_read_are_said(
+    run_folder: Path, tmp_path: Path, k1: float, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = load_scene(run_folder.parent / "scene")
+    views = [replace(view, camera=replace(view.camera, k1=k1)) for view in scene.views]
+    export(ball_field(), tmp_path / "scene", scene=replace(scene, views=views), level=LEVEL)
+    run = Run(tmp_path / "run")
+    run.create(scene, str(tmp_path / "scene"), 1, scene.content_distance, TrainConfig())
+    run.save_field(ball_field())
+    assert export_command(tmp_path / "run", tmp_path / "out", threads=1) == 0
+    said = capsys.readouterr().out
+    assert ("3DGS reads PINHOLE only: colmap image_undistorter --image_path" in said) == (k1 > 0.0)
 
 
 def test_options_reach_the_surface(run_folder: Path, tmp_path: Path) -> None:

@@ -34,6 +34,23 @@ def psnr(image: np.ndarray, other: np.ndarray) -> float:
     return float(-10.0 * np.log10(np.mean((image - other) ** 2)))
 
 
+@pytest.mark.parametrize(
+    ("up", "axis"),
+    [
+        ((0.0, 0.0, 1.0), b"z"),
+        ((0.1, -0.99, 0.0), b"-y"),
+        ((0.7, 0.7, 0.0), None),
+        (None, None),
+    ],
+)
+def test_the_header_names_the_vertical_axis(
+    up: tuple[float, float, float] | None, axis: bytes | None
+) -> None:
+    header = splats_ply(splats_of(ball_field()), None if up is None else np.array(up))[0]
+    lines = [line for line in header.splitlines() if line.startswith(b"comment Vertical Axis: ")]
+    assert [line.rpartition(b" ")[2] for line in lines] == ([] if axis is None else [axis])
+
+
 def test_the_file_has_the_fields_of_3dgs_in_their_order() -> None:
     made = splats_of(ball_field())
     columns = read_splats(b"".join(splats_ply(made)))

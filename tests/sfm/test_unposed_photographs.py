@@ -146,3 +146,23 @@ def test_masks_beside_photographs_are_used_and_are_none_themselves(tmp_path: Pat
         "1.jpg.mask.png",
         None,
     ]
+
+
+def gpano(path: Path, width: int) -> Path:
+    """A photograph whose XMP says that it shows all directions."""
+    xmp = b'<rdf:Description GPano:ProjectionType="equirectangular"/>'
+    Image.new("RGB", (width, 30)).save(path, xmp=xmp)
+    return path
+
+
+def test_panoramas_are_refused_with_a_way_out(tmp_path: Path) -> None:
+    for number, width in enumerate((60, 60, 60, 70)):
+        Image.new("RGB", (width, 30)).save(tmp_path / f"{number}.jpg")
+    paths = photographs_in(tmp_path)
+    with pytest.raises(InputError, match=r"0\.jpg: looks like a panorama .*3 of 3 .* as wide as"):
+        read_photographs(paths[:3], lenses="auto", masks=None)
+    assert len(read_photographs(paths, lenses="auto", masks=None)) == 4
+    gpano(tmp_path / "4.jpg", 61)
+    gpano(tmp_path / "5.webp", 61)
+    with pytest.raises(InputError, match=r"4\.jpg: looks .*2 of 6 photographs say so.* 90 deg"):
+        read_photographs(photographs_in(tmp_path), lenses="auto", masks=None)

@@ -46,13 +46,15 @@ def export_command(
         device: cpu, cuda, cuda:1, ...
         threads: CPU threads; by default one per usable core.
     """
+    from warpnerf.exporting.cameras import camera_model
     from warpnerf.exporting.export import FORMATS, checked_ending, export
     from warpnerf.runs.run import Run
     from warpnerf.runs.scene import load_run_scene
 
     run = Run(folder)
     config = run.read_config()
-    kind = FORMATS[checked_ending(file)]
+    ending = checked_ending(file)
+    kind = FORMATS[ending]
     field, notes = run.load_field(device, threads)
     for note in notes:
         print(f"warpnerf: note: {note}", file=sys.stderr)
@@ -84,4 +86,10 @@ def export_command(
                 "room."
             ) from error
     print(f"wrote {file}")
+    if ending == "" and any(camera_model(camera) != "PINHOLE" for camera in views.cameras):
+        print(
+            "note: the lenses have distortion, as in the photographs; 3DGS reads PINHOLE only: "
+            f"colmap image_undistorter --image_path {file}/images --input_path {file}/sparse/0 "
+            "--output_path NEW makes such a folder of it"
+        )
     return 0

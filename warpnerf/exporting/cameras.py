@@ -140,6 +140,11 @@ def _masked(scene: Scene) -> bool:
     return any(view.mask is not None for view in scene.views)
 
 
+def camera_model(camera: Camera) -> str:
+    """COLMAP's camera model that a lens is exported as, such as PINHOLE or OPENCV."""
+    return _lens(camera).partition(" ")[0]
+
+
 def _lens(camera: Camera) -> str:
     """A lens as cameras.txt has it, in the simplest of COLMAP's models that holds it."""
     model, numbers = "PINHOLE", [camera.fx, camera.fy, camera.cx, camera.cy]

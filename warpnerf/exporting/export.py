@@ -92,12 +92,13 @@ def export(
         volume.checked_block(field, crop)
     views = [] if scene is None else [scene.views[index] for index in scene.splits["train"]]
     visible = visibility(field, views, on_camera) if views else None
+    up = None if scene is None else up_direction(scene.training_cameras)
     if ending in SPLATS:
         made = splats.splats_of(field, visible, unseen=unseen, crop=crop)
         if scene is not None and ending == ".html":
             pieces = page.splats_html(made, scene, field.background)
         else:
-            pieces = splats.splats_ply(made)
+            pieces = splats.splats_ply(made, up)
     elif ending in VOLUMES:
         block = volume.volume_of(field, visible, unseen=unseen, crop=crop)
         pieces = volume.volume_nvdb(block) if ending == ".nvdb" else volume.volume_npz(block)
@@ -109,7 +110,6 @@ def export(
             scenes.write_scene(path, scene, found)
             return path
         if ending == ".glb":
-            up = None if scene is None else up_direction(scene.training_cameras)
             pieces = mesh.mesh_glb(found, up)
         else:
             write = {".obj": mesh.mesh_obj, ".ply": mesh.mesh_ply, ".points.ply": mesh.points_ply}

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 KINDS = {"f4": "float", "u1": "uchar"}
 """PLY's names of numbers, by numpy's."""
 
 
-def ply(columns: dict[str, np.ndarray], faces: np.ndarray | None = None) -> list[bytes]:
+def ply(
+    columns: dict[str, np.ndarray],
+    faces: np.ndarray | None = None,
+    comments: Sequence[str] = (),
+) -> list[bytes]:
     """The pieces of a PLY file.
 
     Args:
         columns: A vertex's properties in the order of the file, [n_vertices] float32 or uint8 each.
         faces: [n_faces, 3] of vertices; None: the file has only vertices.
+        comments: Lines of the header, besides the one that names the program.
 
     Returns:
         Header, vertices, and faces where there are any.
@@ -23,6 +30,7 @@ def ply(columns: dict[str, np.ndarray], faces: np.ndarray | None = None) -> list
         [(name, f"<{column.dtype.str[1:]}") for name, column in columns.items()],
     )
     lines = ["ply", "format binary_little_endian 1.0", "comment warpnerf"]
+    lines += [f"comment {comment}" for comment in comments]
     lines += [f"element vertex {len(table)}"]
     for name, column in columns.items():
         table[name] = column

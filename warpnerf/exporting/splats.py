@@ -40,6 +40,9 @@ SPREAD = 0.5
 FAINTEST = 0.02
 """Opacity of a cell that gets a splat, at least."""
 
+ALONG_AN_AXIS = 0.9
+"""Cosine of the angle to an axis from which on it is the vertical one: 26 degrees."""
+
 LEAST_LIGHT = 0.2
 """Pixels whose light comes from a node that gets a splat, at least."""
 
@@ -125,10 +128,18 @@ def splats_of(
     )
 
 
-def splats_ply(splats: Splats) -> list[bytes]:
+def splats_ply(splats: Splats, up: np.ndarray | None = None) -> list[bytes]:
     """The PLY file that 3DGS writes, with harmonics of degree 0.
 
     Opacities are logits, scales logarithms, and colours coefficients: rgb = 1/2 + 0.282 f_dc.
+
+    Args:
+        splats: To write, in the scene's coordinates.
+        up: Direction in which the cameras stand upright, [3] unit vector; None: not known. If it is
+            near an axis, the header names that as the vertical axis, as nerfstudio and Brush do.
+
+    Returns:
+        The pieces of the file.
     """
     zero = np.zeros((len(splats.centres), 3), np.float32)
     opacity = splats.opacity[:, None]
@@ -145,7 +156,14 @@ def splats_ply(splats: Splats) -> list[bytes]:
         for names, values in named
         for k, name in enumerate(names)
     }
-    return ply(columns)
+    return ply(columns, comments=_vertical_axis(up))
+
+
+def _vertical_axis(up: np.ndarray | None) -> list[str]:
+    if up is None or np.abs(up).max() < ALONG_AN_AXIS:
+        return []
+    k = int(np.abs(up).argmax())
+    return [f"Vertical Axis: {'-' if up[k] < 0.0 else ''}{'xyz'[k]}"]
 
 
 def _cells(field: Field, nodes: np.ndarray) -> np.ndarray:

@@ -20,6 +20,7 @@ from warpnerf.scenes.images.images import (
     image_size,
     read_exif,
     require_whole_image,
+    says_equirectangular,
 )
 from warpnerf.scenes.images.masks import Mask, mask_beside, masks_of_folder
 from warpnerf.sfm.config import Lenses
@@ -69,8 +70,8 @@ def read_photographs(
         One for each path.
 
     Raises:
-        InputError: Too few, one is no whole photograph or has a name that scenes cannot hold, sizes
-            differ where one lens is requested, or no mask is there.
+        InputError: Too few, panoramas, one is no whole photograph or has a name that scenes cannot
+            hold, sizes differ where one lens is requested, or no mask is there.
     """
     if len(paths) < NEEDED:
         raise InputError(
@@ -83,6 +84,7 @@ def read_photographs(
                 f"{printable(str(path))}: a scene's file cannot name it; leave out control "
                 "characters and backslashes."
             )
+    _refuse_panoramas(paths)
     # Decoders release the interpreter lock. COLMAP would continue with half a picture.
     with ThreadPoolExecutor(threads or usable_cores()) as pool:
         list(pool.map(require_whole_image, paths))
@@ -133,6 +135,20 @@ def put_into(folder: Path, file: Path, name: str) -> None:
         os.link(os.path.realpath(file), folder / name)
     except OSError:  # another disk, or a file system without links
         shutil.copyfile(file, folder / name)
+
+
+def _refuse_panoramas(paths: Sequence[Path]) -> None:
+    """Raise InputError where photographs show all directions, by their metadata or their shape."""
+    said = [path for path in paths if says_equirectangular(path)]
+    alike = all(width == 2 * height for width, height in map(image_size, paths))
+    if said or alike:
+        how = "say so" if said else "are all exactly twice as wide as high"
+        raise InputError(
+            f"{(said or paths)[0]}: looks like a panorama of 360 degrees, which has no lens that "
+            f"poses could be estimated for ({len(said or paths)} of {len(paths)} photographs "
+            f"{how}); cut each into pictures of 90 degrees first, or, where they are none, cut "
+            "off a row of pixels."
+        )
 
 
 def _camera(exif: Image.Exif) -> tuple[str, ...]:

@@ -100,6 +100,17 @@ def read_exif(path: Path, look: Callable[[Image.Exif], T]) -> T | None:
         return None
 
 
+def says_equirectangular(path: Path) -> bool:
+    """Whether a photograph's XMP says that it shows all directions: GPano's ProjectionType."""
+    try:
+        with Image.open(path, formats=("JPEG", "WEBP", "PNG")) as image:
+            xmp = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or b""
+    except Exception:  # damaged, which is told where it is read
+        return False
+    text = xmp if isinstance(xmp, bytes) else str(xmp).encode()
+    return b"ProjectionType" in text and b"equirectangular" in text
+
+
 def image_size(path: Path) -> tuple[int, int]:
     """Width and height of an image, pixels as they are stored, without reading these.
 
