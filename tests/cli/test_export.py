@@ -57,8 +57,11 @@ def test_every_ending_becomes_a_file(
 def test_lenses_that_3dgs_does_not_read_are_said(
     run_folder: Path, tmp_path: Path, k1: float, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    bent = dict.fromkeys(("k2", "k3", "k4", "k5", "k6", "p1", "p2"), 0.0)
     scene = load_scene(run_folder.parent / "scene")
-    views = [replace(view, camera=replace(view.camera, k1=k1)) for view in scene.views]
+    views = [
+        replace(view, camera=replace(view.camera, **(bent | {"k1": k1}))) for view in scene.views
+    ]
     export(ball_field(), tmp_path / "scene", scene=replace(scene, views=views), level=LEVEL)
     run = Run(tmp_path / "run")
     run.create(scene, str(tmp_path / "scene"), 1, scene.content_distance, TrainConfig())
