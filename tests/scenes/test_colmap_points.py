@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from tests.support.tiny_scenes import DATA, needs_capture
 from warpnerf.checks import InputError
-from warpnerf.scenes.formats.colmap import _images_of_bytes
+from warpnerf.scenes.formats.colmap_files import images_of_bytes
 from warpnerf.scenes.formats.colmap_points import read_points
 
 NAMES = {1: "a.jpg", 5: "sub/b.jpg", 9: "unseen.jpg"}
@@ -150,7 +150,7 @@ def test_pycolmap_reads_the_same() -> None:
     pycolmap = pytest.importorskip("pycolmap")
     model = DATA / "cup_colmap" / "sparse" / "0"
     theirs = pycolmap.Reconstruction(model)
-    images = _images_of_bytes(model / "images.bin")
+    images = images_of_bytes(model / "images.bin")
     ours = read_points(model, {image.number: image.name for image in images}, DATA / "cup_colmap")
     assert ours is not None and ours.tracks is not None
     expected = {tuple(point.xyz): point for point in theirs.points3D.values()}
