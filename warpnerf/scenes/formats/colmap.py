@@ -154,6 +154,13 @@ def load_colmap(
             f"{image_file.name}: says that it lists {stated} images, but lists {len(images)}: if "
             "it was not shortened on purpose, export it again"
         )
+    bare = [image.name for image in images if not image.keypoints]
+    if bare:
+        warnings.append(
+            f"{image_file.name}: {len(bare)} of {len(images)} images have no line for their "
+            f"keypoints (first: {printable(bare[0][:80])}): all are read, but other programs lose "
+            "every second one"
+        )
     if missing:
         warnings.append(
             f"{image_file.name}: left out {len(missing)} of {len(images)} images for want of a "

@@ -8,11 +8,14 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from warpnerf.checks import InputError
+from warpnerf.scenes.files import printable
 
 PARAMETERS = {
     "SIMPLE_PINHOLE": ("fl", "cx", "cy"),
@@ -37,6 +40,10 @@ MODEL_NAMES = (
 )
 """By their numbers in cameras.bin."""
 
+DIGITS = "0123456789+-.eE"
+NUMERIC = DIGITS + " \tnaif"
+"""Of lines of numbers, which may be nan or inf."""
+
 
 @dataclass(frozen=True)
 class ModelCamera:
@@ -58,6 +65,8 @@ class ModelImage:
     rotation: tuple[float, float, float, float]
     """World to camera, quaternion w, x, y, z."""
     translation: tuple[float, float, float]
+    keypoints: bool = True
+    """Whether a line for its keypoints, empty or not, follows that of its pose in images.txt."""
 
 
 class _Bytes:
@@ -141,9 +150,9 @@ def images_of_bytes(file: Path) -> list[ModelImage]:
 
 
 def _lines(file: Path) -> list[tuple[int, str]]:
-    """Lines with their numbers, without comments; empty lines stay, they mean something."""
+    """Lines with their numbers, without comments; empty lines stay: they may be of no keypoints."""
     try:
-        text = file.read_text(encoding="utf-8")
+        text = file.read_text(encoding="utf-8-sig")  # editors of Windows begin it with a mark
     except UnicodeDecodeError:
         raise InputError(f"{file}: is no text in UTF-8; export it again.") from None
     lines = enumerate(text.splitlines(), 1)
@@ -183,18 +192,58 @@ def stated_images(file: Path) -> int:
 
 
 def images_of_text(file: Path) -> list[ModelImage]:
-    """Images of images.txt, in its order; InputError where a line is none."""
-    images = []
-    lines = _lines(file)
-    while lines and not lines[-1][1]:
-        lines.pop()
-    for number, line in lines[::2]:  # each is followed by a line of its points
-        words = line.split(maxsplit=9)
+    """Images of images.txt, in its order: a line of the pose each, and one of its keypoints.
 
-        def parse(words: list[str] = words) -> ModelImage:
-            w, x, y, z, *translation = map(float, words[1:8])
-            a, b, c = translation
-            return ModelImage(int(words[0]), words[9], int(words[8]), (w, x, y, z), (a, b, c))
+    As in COLMAP's reader, empty lines are skipped before the line of a pose. The line after it is
+    that of the keypoints, unless it is another pose: some programs leave keypoints out.
 
-        images.append(_parsed(file, number, "image", parse))
+    Raises:
+        InputError: A line is neither.
+    """
+    images: list[ModelImage] = []
+    posed = False  # the line before was that of a pose
+    for number, line in _lines(file):
+        if posed and _are_keypoints(line):
+            posed = False
+            continue
+        if not line:
+            continue
+        image: ModelImage | None = None
+        if not posed:
+            image = _parsed(file, number, "image", partial(_image, line))
+        else:
+            with suppress(ValueError, IndexError):
+                image = _image(line)
+            if image is None or not image.name.strip(DIGITS):
+                raise InputError(
+                    f"{file}: line {number}: is neither the keypoints of image "
+                    f"{printable(images[-1].name[:80])!r}, X Y POINT3D_ID of each, nor another "
+                    "image; give each image two lines, of which the second may be empty."
+                )
+            images[-1] = replace(images[-1], keypoints=False)
+        images.append(image)
+        posed = True
+    if posed and not all(image.keypoints for image in images):
+        images[-1] = replace(images[-1], keypoints=False)
     return images
+
+
+def _image(line: str) -> ModelImage:
+    """A line of IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME; ValueError or IndexError if not."""
+    words = line.split(maxsplit=9)
+    w, x, y, z, *translation = map(float, words[1:8])
+    a, b, c = translation
+    return ModelImage(int(words[0]), words[9], int(words[8]), (w, x, y, z), (a, b, c))
+
+
+def _are_keypoints(line: str) -> bool:
+    """Whether a line has three numbers each of any number of keypoints, the third of them whole."""
+    if line.strip(NUMERIC):
+        return False
+    words = line.split()
+    if len(words) % 3:
+        return False
+    try:
+        return all(float(word).is_integer() for word in words[2:3])
+    except ValueError:
+        return False

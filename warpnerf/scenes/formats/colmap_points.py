@@ -105,7 +105,7 @@ def _of_bytes(file: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _of_text(file: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """As ``_of_bytes``, from lines of id, position, colour, error, and the track."""
     positions, numbers, lengths = array("d"), array("I"), array("q")
-    with file.open(encoding="utf-8", errors="replace") as lines:
+    with file.open(encoding="utf-8-sig", errors="replace") as lines:
         for number, line in enumerate(iter(lambda: lines.readline(MAX_LINE), ""), 1):
             words = line.split()
             if not words or words[0].startswith("#"):
