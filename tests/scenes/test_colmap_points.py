@@ -159,3 +159,36 @@ def test_pycolmap_reads_the_same() -> None:
     seen = {(names[e.image_id], xyz) for xyz, p in expected.items() for e in p.track.elements}
     found = {(n, tuple(ours.positions[i])) for n, track in ours.tracks.items() for i in track}
     assert found == seen
+
+
+def write_ply(file: Path) -> None:
+    head = f"ply\nformat ascii 1.0\nelement vertex {len(POINTS) + 1}\n"
+    head += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
+    rows = [*(xyz for xyz, _ in POINTS), (float("nan"), 0.0, 0.0)]
+    file.write_text(head + "".join(f"{x} {y} {z}\n" for x, y, z in rows))
+
+
+@pytest.mark.parametrize("place", ["sparse/0", "sparse", "."])
+@pytest.mark.parametrize("empty", [False, True])
+def test_points_as_ply_are_read_without_tracks(tmp_path: Path, place: str, empty: bool) -> None:
+    model = tmp_path / "sparse" / "0"
+    model.mkdir(parents=True)
+    if empty:  # a file that COLMAP requires, of a program that has no points
+        write(model, True, [])
+    write_ply(tmp_path / place / "points3D.ply")
+    points = read_points(model, NAMES, tmp_path)
+    assert points is not None and points.tracks is None
+    np.testing.assert_array_equal(points.positions, [xyz for xyz, _ in POINTS])
+    assert points.source == (Path(place) / "points3D.ply").as_posix()
+    write(model, False)  # tracks come first
+    points = read_points(model, NAMES, tmp_path)
+    assert points is not None and points.source == "sparse/0/points3D.bin"
+    write_ply(tmp_path.parent / "points3D.ply")
+    assert read_points(tmp_path / "sparse", NAMES, tmp_path / "sparse") is None or place == "sparse"
+    (tmp_path.parent / "points3D.ply").unlink()
+
+
+def test_a_damaged_ply_is_named(tmp_path: Path) -> None:
+    (tmp_path / "points3D.ply").write_text("no")
+    with pytest.raises(InputError, match=r"points3D.ply: is no PLY file"):
+        read_points(tmp_path, NAMES, tmp_path)
