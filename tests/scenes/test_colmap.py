@@ -16,7 +16,7 @@ from PIL import Image
 from tests.support.tiny_scenes import DATA, needs_capture, ring, write_transforms
 from warpnerf.checks import InputError
 from warpnerf.inspection.inspection import inspect
-from warpnerf.scenes.formats import colmap
+from warpnerf.scenes.formats import colmap, colmap_files
 from warpnerf.scenes.formats.load import load_scene
 from warpnerf.scenes.scene import Scene
 
@@ -76,7 +76,7 @@ def write_model(
             lines.append(" ".join(["1.5 2.5 -1"] * (points if number else 0)))
         (target / "images.txt").write_text("\n".join(lines) + "\n")
         return target
-    number = colmap.MODEL_NAMES.index(model)
+    number = colmap_files.MODEL_NAMES.index(model)
     (target / "cameras.bin").write_bytes(
         struct.pack("<Q", 1)
         + struct.pack("<IiQQ", 7, number, 8, 6)
@@ -165,7 +165,7 @@ def test_reduced_photographs_have_whole_pixels(
     tmp_path: Path, size: tuple[int, int], reduced: tuple[int, int]
 ) -> None:
     # size * (reduced / size) misses one of these sides by its last bit.
-    camera = colmap._Camera("SIMPLE_PINHOLE", *size, (900.0, 1000.0, 500.0))
+    camera = colmap_files.ModelCamera("SIMPLE_PINHOLE", *size, (900.0, 1000.0, 500.0))
     Image.new("L", reduced).save(tmp_path / "a.png")
     lens = colmap._lens(Path("cameras.bin"), 1, camera, tmp_path / "a.png", True)
     assert (lens.values["w"], lens.values["h"]) == reduced

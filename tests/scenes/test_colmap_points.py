@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from tests.support.tiny_scenes import DATA, needs_capture
 from warpnerf.checks import InputError
-from warpnerf.scenes.formats.colmap import _images_of_bytes
+from warpnerf.scenes.formats.colmap_files import images_of_bytes
 from warpnerf.scenes.formats.colmap_points import read_points
 
 NAMES = {1: "a.jpg", 5: "sub/b.jpg", 9: "unseen.jpg"}
@@ -150,7 +150,7 @@ def test_pycolmap_reads_the_same() -> None:
     pycolmap = pytest.importorskip("pycolmap")
     model = DATA / "cup_colmap" / "sparse" / "0"
     theirs = pycolmap.Reconstruction(model)
-    images = _images_of_bytes(model / "images.bin")
+    images = images_of_bytes(model / "images.bin")
     ours = read_points(model, {image.number: image.name for image in images}, DATA / "cup_colmap")
     assert ours is not None and ours.tracks is not None
     expected = {tuple(point.xyz): point for point in theirs.points3D.values()}
@@ -159,3 +159,36 @@ def test_pycolmap_reads_the_same() -> None:
     seen = {(names[e.image_id], xyz) for xyz, p in expected.items() for e in p.track.elements}
     found = {(n, tuple(ours.positions[i])) for n, track in ours.tracks.items() for i in track}
     assert found == seen
+
+
+def write_ply(file: Path) -> None:
+    head = f"ply\nformat ascii 1.0\nelement vertex {len(POINTS) + 1}\n"
+    head += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
+    rows = [*(xyz for xyz, _ in POINTS), (float("nan"), 0.0, 0.0)]
+    file.write_text(head + "".join(f"{x} {y} {z}\n" for x, y, z in rows))
+
+
+@pytest.mark.parametrize("place", ["sparse/0", "sparse", "."])
+@pytest.mark.parametrize("empty", [False, True])
+def test_points_as_ply_are_read_without_tracks(tmp_path: Path, place: str, empty: bool) -> None:
+    model = tmp_path / "sparse" / "0"
+    model.mkdir(parents=True)
+    if empty:  # a file that COLMAP requires, of a program that has no points
+        write(model, True, [])
+    write_ply(tmp_path / place / "points3D.ply")
+    points = read_points(model, NAMES, tmp_path)
+    assert points is not None and points.tracks is None
+    np.testing.assert_array_equal(points.positions, [xyz for xyz, _ in POINTS])
+    assert points.source == (Path(place) / "points3D.ply").as_posix()
+    write(model, False)  # tracks come first
+    points = read_points(model, NAMES, tmp_path)
+    assert points is not None and points.source == "sparse/0/points3D.bin"
+    write_ply(tmp_path.parent / "points3D.ply")
+    assert read_points(tmp_path / "sparse", NAMES, tmp_path / "sparse") is None or place == "sparse"
+    (tmp_path.parent / "points3D.ply").unlink()
+
+
+def test_a_damaged_ply_is_named(tmp_path: Path) -> None:
+    (tmp_path / "points3D.ply").write_text("no")
+    with pytest.raises(InputError, match=r"points3D.ply: is no PLY file"):
+        read_points(tmp_path, NAMES, tmp_path)

@@ -20,7 +20,7 @@ import numpy as np
 
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.cameras.focus import up_direction
-from warpnerf.scenes.formats.colmap import PARAMETERS
+from warpnerf.scenes.formats.colmap_files import PARAMETERS
 
 SEED = 0
 MAX_FEATURES = 4096

@@ -2,19 +2,14 @@
 
 cameras.bin, images.bin or cameras.txt, images.txt lie in sparse/0, sparse or colmap/sparse/0, and
 photographs in images/, or smaller ones in images_2/, images_4/, ... Poses are world to camera in
-OpenCV axes, and pixels have their centres at halves, as here. Counts in the files are believed only
-as far as the file is long.
+OpenCV axes, and pixels have their centres at halves, as here.
 """
 
 from __future__ import annotations
 
 import math
-import re
-import struct
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -30,6 +25,16 @@ from warpnerf.scenes.files import (
     require_regular_file,
 )
 from warpnerf.scenes.formats.assemble import Frame, assemble
+from warpnerf.scenes.formats.colmap_files import (
+    PARAMETERS,
+    ModelCamera,
+    ModelImage,
+    cameras_of_bytes,
+    cameras_of_text,
+    images_of_bytes,
+    images_of_text,
+    stated_images,
+)
 from warpnerf.scenes.formats.colmap_points import read_points
 from warpnerf.scenes.images.images import image_size
 from warpnerf.scenes.images.masks import mask_in
@@ -39,56 +44,10 @@ from warpnerf.scenes.scene import Scene
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", ".")
 """Where a model is looked for in a scene's folder, in this order."""
 
-PARAMETERS = {
-    "SIMPLE_PINHOLE": ("fl", "cx", "cy"),
-    "PINHOLE": ("fl_x", "fl_y", "cx", "cy"),
-    "SIMPLE_RADIAL": ("fl", "cx", "cy", "k1"),
-    "RADIAL": ("fl", "cx", "cy", "k1", "k2"),
-    "OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"),
-    "FULL_OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
-    "OPENCV_FISHEYE": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4"),
-    "SIMPLE_RADIAL_FISHEYE": ("fl", "cx", "cy", "k1"),
-    "RADIAL_FISHEYE": ("fl", "cx", "cy", "k1", "k2"),
-    "SIMPLE_FISHEYE": ("fl", "cx", "cy"),
-    "FISHEYE": ("fl_x", "fl_y", "cx", "cy"),
-}
-"""Of the lenses that are read, in the order of the files."""
-
-MODEL_NAMES = (
-    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"),
-    *("FULL_OPENCV", "FOV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE"),
-    *("RAD_TAN_THIN_PRISM_FISHEYE", "SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE"),
-    "EUCM",
-)
-"""By their numbers in cameras.bin."""
-
-
 SAME = 0.02
 """Largest difference of two cameras that are one: in spreads of all, and of unit vectors."""
 MIN_SAME = 0.5
 """Share of a scene's cameras that must be a model's for the model's points to be the scene's."""
-
-
-@dataclass(frozen=True)
-class _Camera:
-    """A lens of a model."""
-
-    model: str
-    width: int
-    height: int
-    parameters: tuple[float, ...]
-
-
-@dataclass(frozen=True)
-class _Image:
-    """A posed photograph of a model."""
-
-    number: int
-    name: str
-    camera: int
-    rotation: tuple[float, float, float, float]
-    """World to camera, quaternion w, x, y, z."""
-    translation: tuple[float, float, float]
 
 
 def find_model(folder: Path) -> Path | None:
@@ -159,9 +118,7 @@ def load_colmap(
     for file in (camera_file, image_file):
         require_regular_file(file)
     read_cameras, read_images = (
-        (_cameras_of_bytes, _images_of_bytes)
-        if kind == "bin"
-        else (_cameras_of_text, _images_of_text)
+        (cameras_of_bytes, images_of_bytes) if kind == "bin" else (cameras_of_text, images_of_text)
     )
     cameras, images = read_cameras(camera_file), read_images(image_file)
     folder = scene_folder(model)
@@ -191,11 +148,18 @@ def load_colmap(
             f"(first: {missing[0] if missing else 'none'}); put them there."
         )
     warnings = []
-    stated = 0 if kind == "bin" else _stated_images(image_file)
+    stated = 0 if kind == "bin" else stated_images(image_file)
     if stated > len(images):
         warnings.append(
             f"{image_file.name}: says that it lists {stated} images, but lists {len(images)}: if "
             "it was not shortened on purpose, export it again"
+        )
+    bare = [image.name for image in images if not image.keypoints]
+    if bare:
+        warnings.append(
+            f"{image_file.name}: {len(bare)} of {len(images)} images have no line for their "
+            f"keypoints (first: {printable(bare[0][:80])}): all are read, but other programs lose "
+            "every second one"
         )
     if missing:
         warnings.append(
@@ -232,7 +196,7 @@ def points_beside(folder: Path, frames: Sequence[Frame]) -> tuple[Points | None,
     place = model.relative_to(folder).as_posix()
     try:
         kind = model_kind(model)
-        images = (_images_of_bytes if kind == "bin" else _images_of_text)(model / f"images.{kind}")
+        images = (images_of_bytes if kind == "bin" else images_of_text)(model / f"images.{kind}")
         by_name = {image.name.replace("\\", "/").rpartition("/")[2]: image for image in images}
         pairs = [(f, by_name[f.path.name]) for f in frames if f.path.name in by_name]
         poses = np.array([_pose(image, f"{model}: {image.name}") for _, image in pairs])
@@ -254,7 +218,7 @@ def _same_cameras(ours: np.ndarray, theirs: np.ndarray) -> bool:
     return bool(np.mean((apart < SAME * spread) & (turned < SAME)) > MIN_SAME)
 
 
-def _pose(image: _Image, field: str) -> np.ndarray:
+def _pose(image: ModelImage, field: str) -> np.ndarray:
     """Camera to world, [3, 4], OpenGL axes."""
     w, x, y, z = image.rotation
     length = math.sqrt(w * w + x * x + y * y + z * z)
@@ -274,7 +238,7 @@ def _pose(image: _Image, field: str) -> np.ndarray:
     return check_pose(c2w.tolist(), field=field)
 
 
-def _lens(file: Path, number: int, camera: _Camera, photograph: Path, reduced: bool) -> Lens:
+def _lens(file: Path, number: int, camera: ModelCamera, photograph: Path, reduced: bool) -> Lens:
     """A camera as a lens for a photograph, which is smaller than the model says if reduced."""
     place = f"camera {number}"
     if camera.model not in PARAMETERS:
@@ -314,137 +278,3 @@ def _lens(file: Path, number: int, camera: _Camera, photograph: Path, reduced: b
         fields={name: f"{place}: {name}" for name in values},
         fisheye=camera.model.endswith("FISHEYE"),
     )
-
-
-class _Bytes:
-    """A binary file, read from its beginning; what is beyond its end is refused."""
-
-    def __init__(self, file: Path) -> None:
-        self._file = file
-        self._data = file.read_bytes()
-        self._at = 0
-
-    def take(self, format: str) -> tuple[Any, ...]:
-        """Numbers, by a format of ``struct`` without the order of bytes."""
-        size = struct.calcsize("<" + format)
-        self._require(size)
-        values = struct.unpack_from("<" + format, self._data, self._at)
-        self._at += size
-        return values
-
-    def count(self, least: int, what: str) -> int:
-        """A number of things that take at least so many bytes each."""
-        (n,) = self.take("Q")
-        if n * least > len(self._data) - self._at:
-            raise InputError(
-                f"{self._file}: is damaged: it counts {n} {what}, but ends before; export it again."
-            )
-        return int(n)
-
-    def text(self) -> str:
-        """Up to the next zero byte."""
-        end = self._data.find(b"\0", self._at)
-        if end < 0:
-            self._require(len(self._data))
-        text = self._data[self._at : end].decode("utf-8", "replace")
-        self._at = end + 1
-        return text
-
-    def skip(self, size: int) -> None:
-        """Leave out so many bytes."""
-        self._require(size)
-        self._at += size
-
-    def _require(self, size: int) -> None:
-        if self._at + size > len(self._data):
-            raise InputError(
-                f"{self._file}: is damaged: it ends after {len(self._data)} bytes, within an "
-                "entry; export it again."
-            )
-
-
-def _cameras_of_bytes(file: Path) -> dict[int, _Camera]:
-    data = _Bytes(file)
-    cameras = {}
-    for _ in range(data.count(24, "cameras")):
-        number, model, width, height = data.take("IiQQ")
-        if not 0 <= model < len(MODEL_NAMES):
-            raise InputError(f"{file}: camera {number}: its lens has the unknown number {model}.")
-        name = MODEL_NAMES[model]
-        parameters = PARAMETERS.get(name)
-        if parameters is None:
-            raise InputError(
-                f"{file}: camera {number}: the lens {name} is not modelled; undistort the images "
-                "to a pinhole camera (colmap image_undistorter)."
-            )
-        cameras[number] = _Camera(name, width, height, data.take(f"{len(parameters)}d"))
-    return cameras
-
-
-def _images_of_bytes(file: Path) -> list[_Image]:
-    data = _Bytes(file)
-    images = []
-    for _ in range(data.count(4 + 7 * 8 + 4 + 1 + 8, "images")):
-        (number,) = data.take("I")
-        values = data.take("7d")
-        (camera,) = data.take("I")
-        name = data.text()
-        data.skip(24 * data.count(24, "points of an image"))
-        images.append(_Image(number, name, camera, values[:4], values[4:]))
-    return images
-
-
-def _lines(file: Path) -> list[tuple[int, str]]:
-    """Lines with their numbers, without comments; empty lines stay, they mean something."""
-    try:
-        text = file.read_text(encoding="utf-8")
-    except UnicodeDecodeError:
-        raise InputError(f"{file}: is no text in UTF-8; export it again.") from None
-    lines = enumerate(text.splitlines(), 1)
-    return [(number, line.strip()) for number, line in lines if not line.lstrip().startswith("#")]
-
-
-def _parsed(file: Path, number: int, what: str, parse: Callable[[], Any]) -> Any:
-    try:
-        return parse()
-    except (ValueError, IndexError):
-        raise InputError(f"{file}: line {number}: is no {what} as COLMAP writes it.") from None
-
-
-def _cameras_of_text(file: Path) -> dict[int, _Camera]:
-    cameras = {}
-    for number, line in _lines(file):
-        if not line:
-            continue
-        words = line.split()
-
-        def parse(words: list[str] = words) -> tuple[int, _Camera]:
-            camera = _Camera(words[1], int(words[2]), int(words[3]), tuple(map(float, words[4:])))
-            return int(words[0]), camera
-
-        key, camera = _parsed(file, number, "camera", parse)
-        cameras[key] = camera
-    return cameras
-
-
-def _stated_images(file: Path) -> int:
-    """How many images a comment of COLMAP's says there are; 0 where there is none."""
-    comment = re.search(r"^# Number of images: (\d{1,9})\b", file.read_text("utf-8"), re.MULTILINE)
-    return int(comment[1]) if comment else 0
-
-
-def _images_of_text(file: Path) -> list[_Image]:
-    images = []
-    lines = _lines(file)
-    while lines and not lines[-1][1]:
-        lines.pop()
-    for number, line in lines[::2]:  # each is followed by a line of its points
-        words = line.split(maxsplit=9)
-
-        def parse(words: list[str] = words) -> _Image:
-            w, x, y, z, *translation = map(float, words[1:8])
-            a, b, c = translation
-            return _Image(int(words[0]), words[9], int(words[8]), (w, x, y, z), (a, b, c))
-
-        images.append(_parsed(file, number, "image", parse))
-    return images

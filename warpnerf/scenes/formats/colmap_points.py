@@ -1,4 +1,7 @@
-"""The points of a COLMAP model, points3D.bin or points3D.txt, and which photograph shows which."""
+"""The points of a COLMAP model, points3D.bin or points3D.txt, and which photograph shows which.
+
+Where these are not there, or empty, points3D.ply takes their place, as 3DGS and exporters write it.
+"""
 
 from __future__ import annotations
 
@@ -13,11 +16,13 @@ import numpy as np
 from warpnerf.checks import InputError
 from warpnerf.scenes.extent.points import Points, usable
 from warpnerf.scenes.files import exists, require_regular_file
+from warpnerf.scenes.formats.ply import read_ply
 
 HEAD_BYTES = 8 + 3 * 8 + 3 + 8
 """Of a point in points3D.bin before its track: number, position, colour, error."""
 TRACK_BYTES = 4 + 4
 """Of an entry of a track: the image's number, and which of its keypoints it is."""
+PLY = "points3D.ply"
 MAX_LINE = 2**22
 """Characters of a line of points3D.txt: a track of some 300 000 photographs."""
 
@@ -31,11 +36,13 @@ def read_points(model: Path, images: Mapping[int, str], folder: Path) -> Points 
         folder: The scene's folder, which ``Points.source`` is relative to.
 
     Returns:
-        The points, with the indices of those that each photograph shows; None without such a file.
+        The points, with the indices of those that each photograph shows, but for points3D.ply,
+        which does not tell; None without such a file.
 
     Raises:
         InputError: The file is damaged.
     """
+    found: Points | None = None
     for name, read in (("points3D.bin", _of_bytes), ("points3D.txt", _of_text)):
         file = model / name
         if not exists(file):
@@ -48,8 +55,24 @@ def read_points(model: Path, images: Mapping[int, str], folder: Path) -> Points 
                 f"{file}: cannot be read: {error.strerror or error}; change that, or move it away."
             ) from None
         source = Path(os.path.relpath(file, folder)).as_posix()
-        return _tracked(positions, numbers, lengths, images, source)
-    return None
+        found = _tracked(positions, numbers, lengths, images, source)
+        break
+    if found is not None and len(found.positions):
+        return found
+    for place in _up_to(model, folder):
+        file = place / PLY
+        if exists(file):
+            positions = read_ply(file)
+            source = Path(os.path.relpath(file, folder)).as_posix()
+            return Points(positions=positions[usable(positions)], tracks=None, source=source)
+    return found
+
+
+def _up_to(model: Path, folder: Path) -> list[Path]:
+    """A model's folder and those around it, to the scene's."""
+    places = [model.resolve(), *model.resolve().parents]
+    end = folder.resolve()
+    return places[: places.index(end) + 1] if end in places else places[:1]
 
 
 def _tracked(
@@ -105,7 +128,7 @@ def _of_bytes(file: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _of_text(file: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """As ``_of_bytes``, from lines of id, position, colour, error, and the track."""
     positions, numbers, lengths = array("d"), array("I"), array("q")
-    with file.open(encoding="utf-8", errors="replace") as lines:
+    with file.open(encoding="utf-8-sig", errors="replace") as lines:
         for number, line in enumerate(iter(lambda: lines.readline(MAX_LINE), ""), 1):
             words = line.split()
             if not words or words[0].startswith("#"):
