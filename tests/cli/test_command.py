@@ -174,7 +174,7 @@ def test_a_time_limit_takes_the_place_of_the_presets_steps(tmp_path: Path) -> No
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(PRESETS, "fast", few)
         begun = []
-        patch.setattr(train, "_begin", lambda *a: begun.append(a[5]) or 0)
+        patch.setattr(train, "_begin", lambda *a: begun.append(a[3]) or 0)
         for given in (
             "--time-limit 9",
             "--time-limit 9 --steps 7",

@@ -273,10 +273,18 @@ class Trained(Exception):
 
 
 def trained(monkeypatch: pytest.MonkeyPatch, *line: str | Path) -> tuple[Any, ...]:
-    """What `warpnerf train` begins: scene, output, downscale, masks, images, configuration."""
+    """What `warpnerf train` begins: scene, output, downscale, masks, images, configuration, and
+    whether it replaces a run, and its page."""
     begun: list[tuple[Any, ...]] = []
+
+    def begin(source: str, output: Path, options: Any, config: wn.TrainConfig) -> int:
+        downscale = 1 if options.downscale is None else options.downscale
+        scene = source, output, downscale, options.masks, options.images
+        begun.append((*scene, config, options.overwrite, options.page))
+        return 0
+
     with monkeypatch.context() as patch:
-        patch.setattr(train, "_begin", lambda *given: begun.append(given) or 0)
+        patch.setattr(train, "_begin", begin)
         assert main(["train", *map(str, line)]) == 0
     return begun[0]
 

@@ -2,6 +2,7 @@
 once."""
 
 import os
+import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -41,7 +42,8 @@ def one_at_a_time(name: str) -> Iterator[None]:
 def unoptimised(kernel: wp.Kernel) -> wp.Kernel:
     """The same kernel in a module of its own that is not optimised: compiled in a fifth of the
     time, for tests that launch it a few times."""
-    module = wp.Module(f"{kernel.module.name}_unoptimised", None)
+    key = re.sub(r"\W", "_", kernel.key)  # a module may have several
+    module = wp.Module(f"{kernel.module.name}_{key}_unoptimised", None)
     module.options.update({**kernel.module.options, OPTION: 0})
     return wp.Kernel(kernel.func, key=kernel.key, module=module, options=kernel.options)
 

@@ -121,7 +121,8 @@ def test_it_says_what_is_trained() -> None:
         assert stage.steps.step == pytest.approx(float((edges / (np.array(stage.size) - 1)).min()))
     views = sum(18 * 24 * 4 for _ in ball().views)
     nodes = math.prod(plan.stages[-1].size)
-    assert plan.memory == 12 * 16 * nodes + views + planning.PROCESS_BYTES
+    of_rays = 4096 * plan.schedule.most_steps_an_update * planning.RAY_BYTES
+    assert plan.memory == 12 * 16 * nodes + views + of_rays + planning.PROCESS_BYTES
     blind = resolve(ball(), tiny_config(background="random"))
     assert blind.random_background and blind.background == (1.0, 1.0, 1.0)
 
