@@ -317,7 +317,16 @@ def test_nothing_flows_back_from_behind_an_opaque_wall(kernels32: Kernels) -> No
         assert not gradient[6:].any()
 
 
-def test_float32_against_float64_on_300_000_samples(kernels64: Kernels, kernels32: Kernels) -> None:
+def test_float32_against_float64_on_300_000_samples(kernels64: Kernels, packed: Kernels) -> None:
+    require_float32_like_float64(kernels64, packed)
+
+
+@pytest.mark.slow
+def test_the_plain_form_on_300_000_samples(kernels64: Kernels, device: str) -> None:
+    require_float32_like_float64(kernels64, Kernels("float32", device))
+
+
+def require_float32_like_float64(kernels64: Kernels, kernels32: Kernels) -> None:
     rng = np.random.default_rng(8)
     n_rays, n_steps = 1500, 200
     p = make_problem(8, n_rays=n_rays, size=(48, 48, 48))

@@ -8,7 +8,10 @@ OpenCV axes, and pixels have their centres at halves, as here.
 from __future__ import annotations
 
 import math
+import os
+import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -36,13 +39,18 @@ from warpnerf.scenes.formats.colmap_files import (
     stated_images,
 )
 from warpnerf.scenes.formats.colmap_points import read_points
+from warpnerf.scenes.formats.llff import ENDINGS
+from warpnerf.scenes.formats.split_lists import read_split_lists
 from warpnerf.scenes.images.images import image_size
-from warpnerf.scenes.images.masks import mask_in
+from warpnerf.scenes.images.masks import mask_in, without_masks
 from warpnerf.scenes.images.photographs import KEEPING, Keeping
 from warpnerf.scenes.scene import Scene
 
-MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", ".")
-"""Where a model is looked for in a scene's folder, in this order."""
+MODEL_FOLDERS = ("sparse", "colmap/sparse", ".")
+"""Where models are looked for in a scene's folder, in this order: in 0, 1, ... there, and there."""
+
+UNPOSED = 0.1
+"""Share of the photographs that are not in the model, above which that is a warning."""
 
 SAME = 0.02
 """Largest difference of two cameras that are one: in spreads of all, and of unit vectors."""
@@ -51,7 +59,7 @@ MIN_SAME = 0.5
 
 
 def find_model(folder: Path) -> Path | None:
-    """The folder of a model that belongs to a scene's folder.
+    """The folder of a model that belongs to a scene's folder: of several the one of most images.
 
     Args:
         folder: The scene's.
@@ -59,10 +67,77 @@ def find_model(folder: Path) -> Path | None:
     Returns:
         Where cameras and images are; None where there is no model.
     """
+    return next(iter(_find_models(folder)), None)
+
+
+def _find_models(folder: Path) -> list[Path]:
+    """All models at the first place that has some, that of most images first."""
     for name in MODEL_FOLDERS:
-        if model_kind(folder / name) is not None:
-            return folder / name
-    return None
+        models = _models_in(folder / name)
+        if models:
+            return models if len(models) == 1 else sorted(models, key=_size, reverse=True)
+    return []
+
+
+def _models_in(place: Path) -> list[Path]:
+    """The models 0, 1, ... of a folder, and itself if it is one."""
+    try:
+        numbered = [path for path in place.iterdir() if re.fullmatch(r"\d{1,4}", path.name)]
+    except OSError:
+        numbered = []
+    numbered.sort(key=lambda path: int(path.name))
+    return [path for path in (*numbered, place) if model_kind(path) is not None]
+
+
+def _size(model: Path) -> int:
+    """How many images a model has; 0 where that cannot be read."""
+    try:
+        return len(_images(model))
+    except (InputError, OSError):
+        return 0
+
+
+def _images(model: Path) -> list[ModelImage]:
+    kind = model_kind(model)
+    file = model / f"images.{kind}"
+    require_regular_file(file)
+    return (images_of_bytes if kind == "bin" else images_of_text)(file)
+
+
+def _others(model: Path, n: int, folder: Path) -> tuple[list[str], list[str]]:
+    """Notes and warnings of models beside that of n images that is read."""
+    model = model.resolve()
+    place = model.parent if model.name.isdecimal() else model
+    sizes = {path: _size(path) for path in _models_in(place) if path != model}
+    if not sizes:
+        return [], []
+
+    def name(path: Path) -> str:
+        return printable(Path(os.path.relpath(path, folder)).as_posix())
+
+    rest = ", ".join(f"{name(path)} has {size}" for path, size in sizes.items())
+    said = [f"the model {name(model)} of {n} images is read; {rest}"]
+    return ([], said) if max(sizes.values()) > n else (said, [])
+
+
+def _unposed(photographs: Path, used: set[Path]) -> tuple[list[str], list[str]]:
+    """Notes and warnings of photographs that the model does not have."""
+    there = without_masks(
+        [
+            Path(root) / name
+            for root, _, names in os.walk(photographs)
+            for name in names
+            if name.lower().endswith(ENDINGS) and not name.startswith(".")
+        ]
+    )
+    left = sorted(path for path in there if path not in used)
+    if not left:
+        return [], []
+    said = [
+        f"{len(left)} of {len(there)} photographs in {printable(photographs.name)} are not in the "
+        f"model (first: {printable(left[0].relative_to(photographs).as_posix()[:80])})"
+    ]
+    return ([], said) if len(left) > UNPOSED * len(there) else (said, [])
 
 
 def model_kind(folder: Path) -> str | None:
@@ -84,6 +159,8 @@ def scene_folder(model: Path) -> Path:
         if photograph_folder(folder) is not None:
             return folder
     names = ("colmap", "sparse", "0")  # of folders in a scene's that lead to its model
+    if model.name.isdecimal():
+        folders = folders[1:]
     return next((folder for folder in folders if folder.name not in names), model)
 
 
@@ -166,17 +243,23 @@ def load_colmap(
             f"{image_file.name}: left out {len(missing)} of {len(images)} images for want of a "
             f"photograph (first: {missing[0]})"
         )
-    return assemble(
+    notes, larger = _others(model, len(images), folder)
+    few, many = _unposed(photographs, {frame.path for frame in frames})
+    splits, listed, lost = read_split_lists(folder, {frame.name for frame in frames})
+    notes = [*notes, *few, *listed]
+    warnings = [*warnings, *larger, *many, *lost]
+    scene = assemble(
         folder=folder,
         file=image_file,
         frames=frames,
-        splits={},
+        splits=splits,
         warnings=warnings,
         downscale=downscale,
         masks=masks,
         keeping=keeping,
         points=read_points(model, {image.number: image.name for image in images}, folder),
     )
+    return replace(scene, notes=(*notes, *scene.notes))
 
 
 def points_beside(folder: Path, frames: Sequence[Frame]) -> tuple[Points | None, str]:
@@ -190,13 +273,20 @@ def points_beside(folder: Path, frames: Sequence[Frame]) -> tuple[Points | None,
         The points, with tracks by names of frames, where the model's cameras are the scene's; else
         None, and why a model that is there is not used.
     """
-    model = find_model(folder)
-    if model is None:
-        return None, ""
+    why_not = ""
+    for model in _find_models(folder):
+        points, why = _points_of(model, folder, frames)
+        if not why:
+            return points, ""
+        why_not = why_not or why
+    return None, why_not
+
+
+def _points_of(model: Path, folder: Path, frames: Sequence[Frame]) -> tuple[Points | None, str]:
+    """As ``points_beside``, of one model."""
     place = model.relative_to(folder).as_posix()
     try:
-        kind = model_kind(model)
-        images = (images_of_bytes if kind == "bin" else images_of_text)(model / f"images.{kind}")
+        images = _images(model)
         by_name = {image.name.replace("\\", "/").rpartition("/")[2]: image for image in images}
         pairs = [(f, by_name[f.path.name]) for f in frames if f.path.name in by_name]
         poses = np.array([_pose(image, f"{model}: {image.name}") for _, image in pairs])

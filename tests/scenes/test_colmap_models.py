@@ -1,0 +1,56 @@
+"""Captures that COLMAP has split into several models."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.scenes.test_colmap import scene_with_model, write_model
+from tests.support.tiny_scenes import write_transforms
+from warpnerf.inspection.inspection import inspect
+from warpnerf.scenes.formats.load import load_scene
+
+
+def two_models(folder: Path, text: bool) -> None:
+    """sparse/0 of 4 images, sparse/1 of 9, of 12 photographs."""
+    write_transforms(folder, 12)
+    (folder / "transforms.json").unlink()
+    write_model(folder, 9, text=text).rename(folder / "sparse" / "1")
+    write_model_into(folder, 4, text)
+
+
+def write_model_into(folder: Path, n: int, text: bool) -> None:
+    write_model(folder / "part", n, text=text).rename(folder / "sparse" / "0")
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_the_largest_model_is_read_and_the_others_are_named(tmp_path: Path, text: bool) -> None:
+    two_models(tmp_path, text)
+    for path in (tmp_path, tmp_path / "sparse"):
+        scene = load_scene(path)
+        assert len(scene.views) == 9
+        assert "the model sparse/1 of 9 images is read; sparse/0 has 4" in scene.notes
+    assert inspect(tmp_path).format.startswith("COLMAP (sparse/1, ")
+    said = "3 of 12 photographs in images are not in the model (first: 009.png)"
+    assert said in scene.warnings
+
+
+def test_a_model_that_is_named_is_read_and_a_larger_one_is_a_warning(tmp_path: Path) -> None:
+    two_models(tmp_path, False)
+    scene = load_scene(tmp_path / "sparse" / "0")
+    assert len(scene.views) == 4
+    assert "the model sparse/0 of 4 images is read; sparse/1 has 9" in scene.warnings
+
+
+def test_a_damaged_model_is_not_the_largest(tmp_path: Path) -> None:
+    two_models(tmp_path, False)
+    (tmp_path / "sparse" / "1" / "images.bin").write_bytes(b"no")
+    scene = load_scene(tmp_path)
+    assert "the model sparse/0 of 4 images is read; sparse/1 has 0" in scene.notes
+
+
+def test_one_model_of_all_photographs_needs_no_word(tmp_path: Path) -> None:
+    scene_with_model(tmp_path)
+    scene = load_scene(tmp_path)
+    assert not any("model" in text for text in (*scene.notes, *scene.warnings))

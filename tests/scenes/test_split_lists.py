@@ -1,0 +1,54 @@
+"""Lists of photographs beside a COLMAP model are its split."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.scenes.test_colmap import scene_with_model
+from warpnerf.checks import InputError
+from warpnerf.scenes.formats.load import load_scene
+from warpnerf.scenes.scene import Scene
+
+
+def names_of(scene: Scene) -> dict[str, list[str]]:
+    return {
+        split: [scene.views[index].name for index in indices]
+        for split, indices in scene.splits.items()
+    }
+
+
+def test_the_lists_are_the_split(tmp_path: Path) -> None:
+    scene_with_model(tmp_path)
+    (tmp_path / "train_list.txt").write_text("000.png\r\n002.png\r\n")
+    (tmp_path / "test_list.txt").write_text("\n003.png\n")
+    scene = load_scene(tmp_path)
+    assert names_of(scene) == {"train": ["000.png", "002.png"], "test": ["003.png"]}
+    notes = " ".join(scene.notes)
+    assert "training and test photographs are those of train_list.txt, test_list.txt" in notes
+    assert "in no split and not used: 1 of 4 images (first: 001.png)" in notes
+
+
+def test_what_is_not_for_testing_is_for_training(tmp_path: Path) -> None:
+    scene_with_model(tmp_path)
+    (tmp_path / "test_list.txt").write_text("images/001.png\n")
+    assert names_of(load_scene(tmp_path)) == {
+        "train": ["000.png", "002.png", "003.png"],
+        "test": ["001.png"],
+    }
+
+
+def test_photographs_that_are_not_in_the_model_are_said(tmp_path: Path) -> None:
+    scene_with_model(tmp_path)
+    (tmp_path / "test_list.txt").write_text("001.png\ngone.png\n")
+    (warning,) = load_scene(tmp_path).warnings
+    assert warning == "test_list.txt: 1 of 2 photographs are not in the model (first: gone.png)"
+
+
+@pytest.mark.parametrize("content", [b"a.jpg\nb.jpg\n", b"\xff\xfe\x00"])
+def test_a_list_of_something_else_is_refused(tmp_path: Path, content: bytes) -> None:
+    scene_with_model(tmp_path)
+    (tmp_path / "train_list.txt").write_bytes(content)
+    with pytest.raises(InputError, match=r"train_list\.txt: .* remove (it|the file)\."):
+        load_scene(tmp_path)
