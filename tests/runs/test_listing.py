@@ -64,6 +64,17 @@ def test_a_configuration_in_words(name: str) -> None:
     assert in_words(other) == f"{name} alpha_min=0.321 grid.grow_at=[0.25,0.5]"
 
 
+@pytest.mark.parametrize(
+    ("field", "said"),
+    [
+        (wn.Vm(), "fast field=vm"),
+        (wn.Vm(density=8, appearance=8), "fast field=vm field.density=8 field.appearance=8"),
+    ],
+)
+def test_another_storage_in_words(field: wn.Vm, said: str) -> None:
+    assert in_words(replace(wn.PRESETS["fast"], field=field)) == said
+
+
 def test_clean_leaves_fields_and_unfinished_runs(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

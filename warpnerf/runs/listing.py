@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -98,11 +98,7 @@ def in_words(config: TrainConfig) -> str:
     Returns:
         Such as ``fast grid.voxels=8000000``.
     """
-    own = _flat(config)
-    changes = {
-        preset: {name: value for name, value in own.items() if value != begin.get(name)}
-        for preset, begin in ((preset, _flat(other)) for preset, other in PRESETS.items())
-    }
+    changes = {preset: _changes(config, begin) for preset, begin in PRESETS.items()}
     preset = min(changes, key=lambda name: len(changes[name]))
     return " ".join([preset, *(f"{name}={_said(v)}" for name, v in changes[preset].items())])
 
@@ -180,6 +176,17 @@ def _last_report(log: Path) -> Report:
             with suppress(msgspec.MsgspecError):
                 return msgspec.json.decode(line, type=Report)
     return Report()
+
+
+def _changes(config: TrainConfig, begin: TrainConfig) -> dict[str, Any]:
+    """What is configured differently, by dotted name; a part of another kind by what is not its
+    default."""
+    before = _flat(begin)
+    for part in ("model", "field", "sampler"):
+        kind = type(getattr(config, part))
+        if kind is not type(getattr(begin, part)):
+            before |= {f"{part}.{name}": value for name, value in asdict(kind()).items()}
+    return {name: value for name, value in _flat(config).items() if value != before.get(name)}
 
 
 def _flat(config: TrainConfig) -> dict[str, Any]:
