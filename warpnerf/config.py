@@ -20,8 +20,14 @@ from warpnerf.checks import (
 from warpnerf.loss_config import OPACITY, USUAL_LOSSES, LossConfig
 from warpnerf.model.interface import Model
 from warpnerf.model.models import Deferred, model_of
-from warpnerf.model.sampler_kinds import MARCHED, SamplerKind, checked_sampler
-from warpnerf.model.spaces import SPACES
+from warpnerf.model.sampler_kinds import (
+    AUTO_SAMPLER,
+    MARCHED,
+    Resampled,
+    SamplerKind,
+    checked_sampler,
+)
+from warpnerf.model.spaces import SPACES, SpaceKind
 from warpnerf.model.storage_kinds import DENSE, StorageKind, storage_of
 from warpnerf.optim_config import OPTIM_RATES, OPTIM_VARIATION, OptimConfig, SceneKind, model_rates
 
@@ -288,10 +294,10 @@ class TrainConfig:
     """What the model's raw values are stored in: dense (at each node of the grid), vm (TensoRF's
     planes and lines of vectors, and a matrix that decodes their products) or hash (Instant-NGP's
     tables of entries, by level). A name stands for what it is by default."""
-    sampler: SamplerKind = MARCHED
-    """Where rays are sampled: march (regular steps) or resampled (intervals drawn for each ray from
-    a small grid of densities that is trained along). A name stands for the sampler with its
-    defaults."""
+    sampler: SamplerKind = AUTO_SAMPLER
+    """Where rays are sampled: march (regular steps), resampled (intervals drawn for each ray from a
+    small grid of densities that is trained along), or auto: resampled where space is contracted and
+    steps are not configured, else march. A name stands for the sampler with its defaults."""
 
     def losses_for(self, kind: SceneKind) -> LossConfig:
         """The loss weights: ``loss``, decided for a kind of scene.
@@ -306,6 +312,25 @@ class TrainConfig:
             return self.loss
         all_show_something = kind != "object" and self.background == "auto"
         return replace(self.loss, opacity=OPACITY if all_show_something else 0.0)
+
+    def sampler_in(self, space: SpaceKind) -> SamplerKind:
+        """The sampler: ``sampler``, decided for a kind of space.
+
+        Proposals are resampled where space is contracted, unless the model brings a sampler of its
+        own, or steps are configured.
+
+        Args:
+            space: That the grid fills.
+
+        Returns:
+            The same, or what auto stands for.
+        """
+        if self.sampler != AUTO_SAMPLER:
+            return self.sampler
+        march, usual = self.march, MarchConfig()
+        configured = (march.step_voxels, march.growth) != (usual.step_voxels, usual.growth)
+        own = type(self.model).march is not Model.march
+        return Resampled() if space.contracts and not configured and not own else MARCHED
 
     def _require_used(self) -> None:
         """Refuse what of the optimiser does nothing to what the field stores."""

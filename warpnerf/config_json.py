@@ -36,12 +36,18 @@ def config_from_json(tree: dict[str, Any]) -> dict[str, Any]:
     """What to decode as a TrainConfig: fields of later versions are as what was there before them.
 
     Where no model is named, there was only one, rgb, and all rays were drawn; where no losses are,
-    there was the squared error alone; where no box is, it was the scene's. Options that did nothing
+    there was the squared error alone; where no sampler is, rays were marched; where no box is, it
+    was the scene's. Options that did nothing
     beside the others are left out: they are refused now.
     """
     if isinstance(grid := tree.get("grid"), dict):
         tree = tree | {"grid": {"box": "scene"} | grid}
-    before = {"model": {"name": "rgb"}, "skip_empty_rays": False, "loss": {}}
+    before = {
+        "model": {"name": "rgb"},
+        "sampler": {"name": "march"},
+        "skip_empty_rays": False,
+        "loss": {},
+    }
     return _without_idle(before | tree)
 
 

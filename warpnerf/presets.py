@@ -85,13 +85,14 @@ from dataclasses import replace
 
 from warpnerf.config import GridConfig, LossConfig, MarchConfig, TrainConfig
 from warpnerf.model.models import PerSample
-from warpnerf.model.sampler_kinds import Resampled
+from warpnerf.model.sampler_kinds import MARCHED, Resampled
 from warpnerf.model.storage_kinds import Hash, Vm
 from warpnerf.optim_config import OptimConfig
 
 _FAST = TrainConfig()
 
 _DVGO = TrainConfig(
+    sampler=MARCHED,
     steps=20_000,
     rays_per_step=8192,
     coarse_steps=0,
@@ -203,6 +204,7 @@ PRESETS: dict[str, TrainConfig] = {
         loss=LossConfig(),
     ),
     "ngp": TrainConfig(
+        sampler=MARCHED,
         steps=35_000,
         background="random",
         coarse_steps=0,

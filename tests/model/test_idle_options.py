@@ -59,7 +59,10 @@ WITHOUT_TV = {"tv_density": 0.0, "tv_rgb": 0.0}
         ),
         (
             lambda: wn.TrainConfig(
-                field=wn.Hash(), model="rgb", optim=wn.OptimConfig(epsilon=1e-6)
+                field=wn.Hash(),
+                model="rgb",
+                sampler="march",
+                optim=wn.OptimConfig(epsilon=1e-6),
             ),
             r"optim.epsilon is 1e-06, but .* set field\.epsilon, and leave epsilon out",
         ),

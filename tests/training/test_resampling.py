@@ -17,6 +17,7 @@ from tests.model.test_config_options import words
 from tests.runs.test_checkpoint import rewrite
 from tests.scenes.test_frustum import facing
 from tests.support.small_model import SMALL, SQUARED
+from tests.seams.given_distances import AtDistances
 from tests.support.tiny_fields import assert_same_state
 from tests.support.tiny_trainings import (  # noqa: F401 (a fixture)
     NO_GROWTH,
@@ -33,7 +34,8 @@ from warpnerf.cli.configured import configured
 from warpnerf.config import MarchConfig, TrainConfig
 from warpnerf.config_json import config_from_json, config_to_json, decode
 from warpnerf.evaluation.evaluate import evaluate
-from warpnerf.model.sampler_kinds import MARCHED, Resampled
+from warpnerf.model.sampler_kinds import AUTO_SAMPLER, MARCHED, Resampled
+from warpnerf.model.spaces import SPACES
 from warpnerf.optim_config import OptimConfig
 from warpnerf.rendering import field as rendering
 from warpnerf.rendering.proposal import unit_of
@@ -181,13 +183,46 @@ def test_bins_are_equally_long_near_cameras_unless_there_is_a_near_plane() -> No
 
 def test_options_and_files_name_it() -> None:
     begin = TrainConfig()
-    assert begin.sampler == MARCHED
+    assert begin.sampler == AUTO_SAMPLER
     found = configured(begin, words(sampler="resampled", sampler__samples="48"))
     assert found.sampler == Resampled(samples=48)
     again = configured(found, words(sampler__bins="128"))
     assert again.sampler == Resampled(samples=48, bins=128)
     assert config_to_json(again)["sampler"]["name"] == "resampled"
     assert TrainConfig(sampler="resampled").sampler == Resampled()  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("config", "space", "drawn"),
+    [
+        (TrainConfig(), "linf", True),
+        (TrainConfig(), "l2", True),
+        (TrainConfig(), "none", False),
+        (TrainConfig(), "ndc", False),
+        (TrainConfig(march=MarchConfig(step_voxels=0.5)), "linf", False),
+        (TrainConfig(march=MarchConfig(growth=0.05)), "linf", False),
+        (TrainConfig(march=MarchConfig(near=0.5)), "linf", True),
+        (TrainConfig(sampler=MARCHED), "linf", False),
+        (TrainConfig(sampler=Resampled()), "none", True),
+    ],
+)
+def test_auto_resamples_where_space_is_contracted(
+    config: TrainConfig, space: str, drawn: bool
+) -> None:
+    found = config.sampler_in(SPACES[space])
+    assert found == (Resampled() if drawn else MARCHED)
+
+
+def test_a_models_own_sampler_is_not_replaced() -> None:
+    config = TrainConfig(model=AtDistances(edges=(0.5, 1.0, 2.0)))
+    assert config.sampler_in(SPACES["linf"]) == MARCHED
+
+
+def test_configurations_before_it_were_marched() -> None:
+    tree = json.loads(json.dumps(config_to_json(TrainConfig())))
+    del tree["sampler"]
+    config = msgspec.convert(config_from_json(tree), TrainConfig, dec_hook=decode)
+    assert config.sampler == MARCHED
 
 
 def test_numbers_of_other_types_are_kept_as_plain_ones() -> None:
@@ -203,8 +238,8 @@ def test_numbers_of_other_types_are_kept_as_plain_ones() -> None:
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        (words(sampler="stratified"), "sampler must be one of march, resampled, not 'stratified'."),
-        (words(sampler__samples="48"), "no option of the sampler march"),
+        (words(sampler="stratified"), "sampler must be one of auto, march, resampled, not 'stratified'."),
+        (words(sampler__samples="48"), "no option of the sampler auto"),
         (words(sampler="resampled", sampler__bins="40"), "must be a multiple of 16"),
         (words(sampler="resampled", sampler__samples="1"), "a whole number of at least 2"),
         (words(sampler="resampled", sampler__anneal_until="1"), "must lie in [0, 1)"),

@@ -72,7 +72,7 @@ def warmup_command(
         model: As training will be given: deferred, per_sample, sh, or rgb.
         model_options: As training will be given.
         field: As training will be given: dense, vm, or hash.
-        sampler: As training will be given: march, or resampled.
+        sampler: As training will be given: auto, march, or resampled.
     """
     from warpnerf.training.warmup import warm_up
 

@@ -278,7 +278,7 @@ def _cost(scene: Scene, config: TrainConfig, threads: int) -> Cost:
     nodes = voxels * 0.5 ** (share < plan.schedule.grow_at).sum(axis=1)
     steps_an_update = 2.0 ** (share >= plan.schedule.accumulate_at).sum(axis=1)
     step = config.rays_per_step * (
-        SECONDS_PER_RAY + config.sampler.samples_of(finer * samples) * SECONDS_PER_SAMPLE
+        SECONDS_PER_RAY + plan.sampler.samples_of(finer * samples) * SECONDS_PER_SAMPLE
     )
     step += float((nodes / steps_an_update).mean()) * occupied * SECONDS_PER_NODE
     step *= config.model.relative_time * config.field.relative_time

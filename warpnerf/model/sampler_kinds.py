@@ -70,6 +70,17 @@ class Marched(SamplerKind):
         return None
 
 
+@dataclass(frozen=True, kw_only=True)
+class AutoSampler(SamplerKind):
+    """Proposal sampling or ray marching, as suits the scene: ``TrainConfig.sampler_in``."""
+
+    name: ClassVar[str] = "auto"
+
+    def part(self, load: Load) -> Any:
+        """None: it has to be decided first."""
+        raise TypeError("a sampler that is auto has no kernels; see TrainConfig.sampler_in")
+
+
 @checked("sampler")
 @dataclass(frozen=True, kw_only=True)
 class Resampled(SamplerKind):
@@ -189,8 +200,10 @@ class ProposedDensity(Model):
 
 
 MARCHED = Marched()
+AUTO_SAMPLER = AutoSampler()
 
 SAMPLER_KINDS: dict[str, type[SamplerKind]] = {
+    AutoSampler.name: AutoSampler,
     Marched.name: Marched,
     Resampled.name: Resampled,
 }

@@ -24,7 +24,7 @@ from warpnerf.training.plan import TrainingPlan, bytes_of_rays
 def require_room(plan: TrainingPlan, device: wp.Device) -> None:
     """Raise InputError if training the final field of a plan does not fit the device's memory."""
     config = plan.config
-    of_rays = bytes_of_rays(config, plan.schedule)
+    of_rays = bytes_of_rays(config, plan.schedule, plan.sampler)
     require_memory(config.field, _model(config), plan.stages[-1].size, device, of_rays)
 
 

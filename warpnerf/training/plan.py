@@ -14,7 +14,7 @@ import numpy as np
 from warpnerf.checks import InputError, require_one_of, require_positive
 from warpnerf.config import MIN_COARSE_STEPS, LossConfig, TrainConfig
 from warpnerf.model.interface import Model
-from warpnerf.model.sampler_kinds import MARCHED
+from warpnerf.model.sampler_kinds import MARCHED, SamplerKind
 from warpnerf.model.spaces import SPACES, SpaceKind
 from warpnerf.optim_config import SceneKind
 from warpnerf.rendering.steps import Steps
@@ -103,6 +103,11 @@ class TrainingPlan:
             )
         if isinstance(self.losses.opacity, str):
             raise InputError(f"plan.losses.opacity must be a number, not {self.losses.opacity!r}.")
+
+    @property
+    def sampler(self) -> SamplerKind:
+        """Where rays are sampled; not auto."""
+        return self.config.sampler_in(self.space.kind)
 
     def require_fits(self, scene: Scene) -> None:
         """Raise InputError unless a training of a scene can go by this."""
@@ -204,7 +209,7 @@ def planned(
         steps = march_steps(config.march, space, size, reach)
         stages.append(Stage(begins=begins, nodes=nodes, size=size, steps=steps))
     of_field = config.field.training_bytes(config.model, stages[-1].size)
-    of_rays = bytes_of_rays(config, schedule)
+    of_rays = bytes_of_rays(config, schedule, config.sampler_in(space.kind))
     return TrainingPlan(
         config=config,
         kind=kind,
@@ -223,12 +228,13 @@ def planned(
     )
 
 
-def bytes_of_rays(config: TrainConfig, schedule: Schedule) -> int:
+def bytes_of_rays(config: TrainConfig, schedule: Schedule, sampler: SamplerKind) -> int:
     """Memory in bytes of the rays of an update, and of what the sampler keeps.
 
     Args:
         config: Of the training.
         schedule: How many steps an update has.
+        sampler: Where rays are sampled.
 
     Raises:
         InputError: There are more rays than kernels can count.
@@ -240,7 +246,7 @@ def bytes_of_rays(config: TrainConfig, schedule: Schedule) -> int:
             f"rays_per_step is {config.rays_per_step}, and an update has up to {steps} steps "
             "(optim.accumulate_at); use fewer, together below 2^31."
         )
-    return n_rays * RAY_BYTES + config.sampler.training_bytes(n_rays)
+    return n_rays * RAY_BYTES + sampler.training_bytes(n_rays)
 
 
 def needs_search(scene: Scene, config: TrainConfig, space: SpaceKind) -> bool:
@@ -278,9 +284,9 @@ def _require_useful(scene: Scene, plan: TrainingPlan) -> None:
             f"loss.opacity is above 0, but photographs of {scene.name} have alpha, and where "
             "they show nothing, nothing should be; set it to 0 or auto."
         )
-    if plan.space.frustum is not None and config.sampler != MARCHED:
+    if plan.space.frustum is not None and plan.sampler != MARCHED:
         raise InputError(
-            f"sampler {config.sampler.name} draws distances in the scene, but the grid of "
+            f"sampler {plan.sampler.name} draws distances in the scene, but the grid of "
             f"{scene.name} lies in normalised device coordinates; set grid.contraction to linf, or "
             "sampler to march."
         )

@@ -27,7 +27,7 @@ def first_proposal(plan: TrainingPlan, device: wp.Device) -> Proposal | None:
         plan: Of the training.
         device: Where it lies.
     """
-    kind = plan.config.sampler
+    kind = plan.sampler
     if not isinstance(kind, Resampled):
         return None
     unit = unit_of(plan.config.march.near, plan.content_distance)

@@ -369,7 +369,7 @@ class Trainer:
             self.workers.device,
             self.plan.losses,
             self.config.field,
-            self.config.sampler,
+            self.plan.sampler,
         )
 
     def _grow(self, fraction: float) -> None:

@@ -141,8 +141,9 @@ def warm_up(
         # What is compiled for the first model as well needs no name of its own.
         of_model = "" if first is None or model == first.model else f", {_options_of(model)}"
         for contraction in _contractions(config):
+            sampler = config.sampler_in(SPACES[contraction])
             for kernel in rendering_kernels(
-                model, contraction, workers.device, config.field, config.sampler
+                model, contraction, workers.device, config.field, sampler
             ):
                 words = _words(kernel, contraction) + of_model
                 wanted.setdefault(kernel.module, (words, kernel))
@@ -155,7 +156,7 @@ def warm_up(
                     workers.device,
                     losses,
                     config.field,
-                    config.sampler,
+                    sampler,
                 ):
                     words = _words(kernel, contraction, scaling, losses) + of_model
                     wanted.setdefault(kernel.module, (words, kernel))
@@ -178,7 +179,8 @@ def _contractions(config: TrainConfig) -> tuple[Contraction, ...]:
     chosen = config.grid.contraction
     if chosen != "auto":
         return (chosen,)
-    return ("none", "linf", "ndc") if config.sampler == MARCHED else ("none", "linf")
+    marches = config.sampler_in(SPACES["ndc"]) == MARCHED
+    return ("none", "linf", "ndc") if marches else ("none", "linf")
 
 
 def _losses(config: TrainConfig, contraction: Contraction) -> list[LossConfig]:
