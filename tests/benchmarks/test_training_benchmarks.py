@@ -4,11 +4,17 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+import warpnerf as wn
 from tests.support.benchmark_scripts import ROOT, is_interval, run
+
+sys.path.insert(0, str(ROOT / "benchmarks"))
+
+import calibration
 
 
 @pytest.mark.slow
@@ -155,3 +161,26 @@ def test_scaling_fields_goes_on_where_it_was(tmp_path):
         assert row["psnr"] > 5 and row["near_mass"] >= 0 and row["depth_error"] > 0
     gains = [line for line in said.splitlines() if "clamped" in line and "+-" in line]
     assert len(gains) == 2
+
+
+@pytest.mark.slow
+def test_calibration(tmp_path):
+    options = ("builtin:room-sparse", "--steps", "30", "--voxels", "20000", "--test-views", "2")
+    record, printed = run("calibration.py", tmp_path / "record.json", *options)
+    assert len(record["rows"]) == 2
+    for row in record["rows"]:
+        assert row["coloured"] >= row["psnr"] - 1e-3  # the affine map may be none
+        assert row["view"] in printed
+    assert "mean gain: poses" in printed
+
+
+@pytest.mark.slow
+def test_a_camera_that_was_moved_is_found_again():
+    scene = wn.load_scene("builtin:room", downscale=2)
+    config = replace(wn.PRESETS["fast"], steps=600, coarse_steps=0)
+    field = wn.train(scene, config, progress=False).field
+    camera = scene.views[scene.splits["train"][0]].camera
+    truth = field.render(camera).rgb
+    away = calibration.moved(camera.c2w, np.array([0.004, -0.003, 0.002, 0.01, 0.02, -0.01]))
+    found = calibration.fitted_pose(field, replace(camera, c2w=away), truth, 3.0)
+    assert np.abs(found - camera.c2w).max() < 0.1 * np.abs(away - camera.c2w).max()

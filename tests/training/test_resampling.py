@@ -16,8 +16,8 @@ import warp as wp
 from tests.model.test_config_options import words
 from tests.runs.test_checkpoint import rewrite
 from tests.scenes.test_frustum import facing
-from tests.support.small_model import SMALL, SQUARED
 from tests.seams.given_distances import AtDistances
+from tests.support.small_model import SMALL, SQUARED
 from tests.support.tiny_fields import assert_same_state
 from tests.support.tiny_trainings import (  # noqa: F401 (a fixture)
     NO_GROWTH,
@@ -238,7 +238,10 @@ def test_numbers_of_other_types_are_kept_as_plain_ones() -> None:
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        (words(sampler="stratified"), "sampler must be one of auto, march, resampled, not 'stratified'."),
+        (
+            words(sampler="stratified"),
+            "sampler must be one of auto, march, resampled, not 'stratified'.",
+        ),
         (words(sampler__samples="48"), "no option of the sampler auto"),
         (words(sampler="resampled", sampler__bins="40"), "must be a multiple of 16"),
         (words(sampler="resampled", sampler__samples="1"), "a whole number of at least 2"),
