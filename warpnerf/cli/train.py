@@ -6,19 +6,16 @@ import dataclasses
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import tyro
-
-from warpnerf.checks import InputError, require_whole
-from warpnerf.cli.arguments import Settings, Usual
+from warpnerf.checks import InputError
 from warpnerf.cli.configured import begun_with, configured
 from warpnerf.cli.given import NOTHING, Given
 from warpnerf.cli.machine import FAILED
 from warpnerf.cli.pose import with_poses
-from warpnerf.cli.view import PageOptions, training_page
+from warpnerf.cli.train_options import USUAL, TrainOptions
+from warpnerf.cli.view import training_page
 from warpnerf.config import TrainConfig
 from warpnerf.presets import PRESETS
 from warpnerf.runs import lock
@@ -33,97 +30,6 @@ if TYPE_CHECKING:
     from warpnerf.training.state import Progress
     from warpnerf.training.trainer import Trainer
     from warpnerf.viewer.session import Session
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrainOptions:
-    """What `warpnerf train` is given besides a configuration."""
-
-    scene: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[SCENE]")] = None
-    """Folder of a scene (transforms.json, Blender, COLMAP, LLFF), an .npz file, builtin:room or
-    builtin:room-sparse; or photographs without poses or a video, whose poses are then estimated
-    first, as by `warpnerf pose`."""
-    output: Path | None = None
-    """Folder for configuration, field, log, figures and pictures; by default runs/SCENE-TIME."""
-    preset: (
-        Literal[
-            "fast", "quality", "dvgo", "dvgo-unbounded", "dvgo-llff", "tensorf", "ngp", "mip360"
-        ]
-        | None
-    ) = None
-    """Starting point, by default fast, which takes a minute or three on two cores; quality takes a
-    quarter of an hour; dvgo, dvgo-unbounded and dvgo-llff are the published hyperparameters of
-    DirectVoxGO, tensorf those of TensoRF, ngp those of Instant-NGP, and take hours; mip360 samples
-    and contracts as Mip-NeRF 360 does. Other options replace its values."""
-    config: Path | None = None
-    """Starting point instead of a preset: the config.json of a run, which is repeated, with its
-    scene, downscale and masks, but for what other options replace."""
-    resume: Path | None = None
-    """Resume the run in this folder, as it was begun; scene only if it has moved."""
-    overwrite: bool = False
-    """Replace the run that the output folder holds."""
-    downscale: int | None = None
-    """Average blocks of so many pixels squared; by default 1, as they are."""
-    masks: Path | None = None
-    """Folder of images named after the photographs, white where pixels count and black where they
-    are ignored; with --resume only if it has moved."""
-    images: Literal["auto", "memory", "disk"] = "auto"
-    """Where the photographs' pixels are during the training: memory, disk (decoded once, into a
-    file without a name in the output folder, gone at the end), or by what is free."""
-    eval_views: Literal["all", "none"] | int = "all"
-    """Test views that are rendered and measured at the end: all, none, or so many, spread.
-    warpnerf eval does it at any time."""
-    view: bool = False
-    """Serve a page to look at the training in a browser."""
-    host: str | None = None
-    """Where, by name or address of this machine; by default 127.0.0.1."""
-    port: int | None = None
-    """Where; 0: any that is free. By default 8080, or the next that is free."""
-    model_options: Settings = ()
-    """Of the model, such as specular=8 width=64: the same as --model.specular 8
-    --model.width 64."""
-    loss: Settings = ()
-    """What is minimised besides, such as distortion=0.01 entropy=0.001: the same as
-    --loss.distortion 0.01 --loss.entropy 0.001."""
-
-    @property
-    def page(self) -> PageOptions | None:
-        """Where the page of the training is served; None: nowhere."""
-        return PageOptions.chosen(self.view, self.host, self.port)
-
-    def require_usable(self) -> None:
-        """Raise InputError where an option cannot be followed, before anything is read."""
-        PageOptions.chosen(self.view, self.host, self.port)
-        if isinstance(self.eval_views, int):
-            require_whole("--eval-views", self.eval_views, 1)
-
-
-USUAL = Usual(
-    (
-        "output",
-        "preset",
-        "steps",
-        "time_limit",
-        "grid.voxels",
-        "downscale",
-        "masks",
-        "model",
-        "resume",
-        "config",
-        "overwrite",
-        "view",
-        "scaling",
-        "content_distance",
-        "box",
-        "grid.border",
-        "grid.contraction",
-        "march.near",
-        "device",
-        "threads",
-        "seed",
-        "checkpoint_every",
-    )
-)
 
 
 def train_command(options: TrainOptions, given: Annotated[Given, USUAL] = NOTHING) -> int:
@@ -244,8 +150,9 @@ def _begin_alone(source: str, output: Path, options: TrainOptions, config: Train
     with training_page(options.page, trained, trainer) as session:
         folder = None if masks is None else str(masks.resolve())
         found = trainer.observed is not None
-        run.create(trained, _absolute(source), downscale, distance, config, folder, found)
-        return _train(run, trained, trainer, session, options.eval_views)
+        keep = options.keep or "field"
+        run.create(trained, _absolute(source), downscale, distance, config, folder, found, keep)
+        return _train(run, trained, trainer, session, options)
 
 
 def _resume(
@@ -261,11 +168,22 @@ def _resume(
 
 def _go_on(run: Run, options: TrainOptions, changed: Callable[[TrainConfig], TrainConfig]) -> int:
     from warpnerf.runs.scene import masks_of, path_of
+    from warpnerf.training.state import MAY_GROW, require_same_config
     from warpnerf.training.trainer import Trainer
 
     begun, moved = run.read_config(), options.scene
+    if run.is_unlooked_at and options.eval_views != "none":  # stopped while it was
+        config = changed(begun.train)
+        require_same_config(begun.train, config)
+        _require_machine(config)
+        masks = options.masks or masks_of(begun, moved)
+        source = path_of(begun, moved)
+        scene = _read(source, begun.downscale, masks, run.folder, options, config.threads)
+        return _evaluate(run, begun.as_trained(scene), options, config.device, config.threads)
     state, notes = run.load_state()
-    config = changed(state.config)
+    config = changed(
+        dataclasses.replace(state.config, **{n: getattr(begun.train, n) for n in MAY_GROW})
+    )
     state.require_same_config(config)
     _require_machine(config)
     masks = options.masks or masks_of(begun, moved)
@@ -280,11 +198,20 @@ def _go_on(run: Run, options: TrainOptions, changed: Callable[[TrainConfig], Tra
         old, new = getattr(state.config, name), getattr(config, name)
         if new != old:
             print(f"  note: {name} {new} instead of {old}: sums are rounded in another order")
+    for name in MAY_GROW:
+        old, new = getattr(begun.train, name), getattr(config, name)
+        if new != old:
+            print(
+                f"  note: {name} {new} instead of {old}: learning rates rise to those of the "
+                "longer training; one that is as long from the start ends otherwise"
+            )
     print(f"  resuming after step {trainer.steps_done}")
     with training_page(options.page, scene, trainer) as session:
+        if any(getattr(begun.train, name) != getattr(config, name) for name in MAY_GROW):
+            run.extend(config)
         run.rewind_log(trainer.steps_done)
         del state  # the trainer has copies
-        return _train(run, scene, trainer, session, options.eval_views)
+        return _train(run, scene, trainer, session, options)
 
 
 def _require_machine(config: TrainConfig) -> None:
@@ -346,11 +273,12 @@ def _train(
     scene: Scene,
     trainer: Trainer,
     session: Session | None,
-    eval_views: Literal["all", "none"] | int,
+    options: TrainOptions,
 ) -> int:
     """Train to the end, or until asked to stop; look at the test views."""
     from warpnerf.reports.limits import voxel_pixels, what_limits
 
+    keep = options.keep or run.read_config().keep
     between = None if session is None else session.after_update
     reports: list[Progress] = []
     with StopRequest() as stop:
@@ -362,7 +290,13 @@ def _train(
                     reports.append(progress)
                     bar.report(progress.fraction, str(progress))
 
-                trainer.run(on_progress, run.save_checkpoint, lambda: stop.asked, between)
+                trainer.run(
+                    on_progress,
+                    run.save_checkpoint,
+                    lambda: stop.asked,
+                    between,
+                    checkpoint_when_done=keep == "checkpoint",
+                )
         except FloatingPointError as error:
             kept = "Nothing was saved before."
             if run.last_step is not None:
@@ -373,7 +307,7 @@ def _train(
             print(f"stopped; {run.way_on()}", flush=True)
             return stopped.exit_code
         if trainer.fraction >= 1.0:
-            run.save_field(trainer.field())
+            run.save_field(trainer.field(), keep == "checkpoint")
     if session is not None:
         session.notify("The training has ended", f"warpnerf view {run.folder} shows what it left.")
     if stop.exit_code is not None:
@@ -381,21 +315,48 @@ def _train(
         saved = f"stopped and saved after step {step}; continue with: {run.resume_command}"
         print(saved if run.last_step == step else f"stopped; {run.way_on()}", flush=True)
         return stop.exit_code
-    if eval_views == "none":
+    if options.eval_views == "none":
         print(f"wrote {run.folder}: field.safetensors, log.jsonl and config.json")
         return 0
+    device, threads, pixels = trainer.config.device, trainer.config.threads, voxel_pixels(trainer)
+    del trainer  # its grid, and what its optimiser keeps
+
+    def limits(psnr: float | None) -> None:
+        limit = what_limits(reports, pixels, psnr)
+        if limit is not None:
+            print(limit)
+
+    return _evaluate(run, scene, options, device, threads, limits)
+
+
+def _evaluate(
+    run: Run,
+    scene: Scene,
+    options: TrainOptions,
+    device: str,
+    threads: int | None,
+    limits: Callable[[float | None], None] = lambda psnr: None,
+) -> int:
+    """Look at the test views of a finished run, by the field that it keeps.
+
+    Args:
+        run: Whose field is saved.
+        scene: Its photographs.
+        options: How many of them.
+        device: Where to render.
+        threads: CPU threads.
+        limits: Called with the PSNR of the test views; None: of training views there is no use.
+    """
     split = _split_to_look_at(scene)
-    scene = _some_views(scene, split, eval_views)
+    assert options.eval_views != "none"
+    scene = _some_views(scene, split, options.eval_views)
     print(f"rendering the {'test' if split == 'test' else 'training'} views", flush=True)
     try:
         with ProgressBar("first view") as bar:
-            result = run.evaluate(trainer.field(), scene, split, bar.report)
+            field, _ = run.load_field(device, threads)
+            result = run.evaluate(field, scene, split, bar.report)
         print(result)
-        limit = what_limits(
-            reports, voxel_pixels(trainer), result.mean["psnr"] if split == "test" else None
-        )
-        if limit is not None:
-            print(limit)
+        limits(result.mean["psnr"] if split == "test" else None)
     except Stopped as stopped:
         print(f"stopped; the field is saved. Continue with: {run.resume_command}", flush=True)
         return stopped.exit_code

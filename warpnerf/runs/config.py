@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -14,6 +14,8 @@ from warpnerf.config_json import config_from_json, config_to_json, decode
 from warpnerf.media.pictures import picture_files
 from warpnerf.scenes.files import read_json
 from warpnerf.scenes.scene import Scene
+
+Keep = Literal["field", "checkpoint"]
 
 
 class FoundExtent(msgspec.Struct, frozen=True):
@@ -41,6 +43,8 @@ class RunConfig(msgspec.Struct, frozen=True):
     """File names of the pictures in test/; None in runs of the version before, which wrote all."""
     found: FoundExtent | None = None
     """In place of the scene's own extent, where the cameras did not tell."""
+    keep: Keep = "field"
+    """What is kept of the training once it has finished: its field alone, or checkpoints too."""
 
     def as_trained(self, scene: Scene) -> Scene:
         """A scene, as it was read, with the extent that the run has found for it."""
@@ -68,6 +72,7 @@ def describe(
     config: TrainConfig,
     masks: str | None,
     found: bool,
+    keep: Keep = "field",
 ) -> dict[str, Any]:
     """What config.json says of a run that begins; some of it only for those who open it.
 
@@ -79,6 +84,7 @@ def describe(
         config: What was requested.
         masks: See ``RunConfig``.
         found: Whether short trainings found the scene's extent.
+        keep: See ``RunConfig``.
     """
     extent = {"box_min": scene.box_min.tolist(), "box_max": scene.box_max.tolist()}
     content = {
@@ -88,6 +94,7 @@ def describe(
         "content_distance": content_distance,
         **extent,
         "notes": [*scene.warnings, *scene.notes],
+        "keep": keep,
         "pictures": pictures_of(scene),
         "train": config_to_json(config),
     }
