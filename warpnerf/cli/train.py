@@ -5,9 +5,9 @@ from __future__ import annotations
 import dataclasses
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from warpnerf.checks import InputError
 from warpnerf.cli.configured import begun_with, configured
@@ -22,6 +22,7 @@ from warpnerf.runs import lock
 from warpnerf.runtime.memory import require_threads
 from warpnerf.runtime.progress import ProgressBar
 from warpnerf.runtime.signals import Stopped, StopRequest
+from warpnerf.scenes.split import Split, read_split
 
 if TYPE_CHECKING:
     from warpnerf.runs.run import Run
@@ -45,7 +46,7 @@ def train_command(options: TrainOptions, given: Annotated[Given, USUAL] = NOTHIN
         return configured(config, given, options.model_options, options.loss)
 
     if options.resume is not None:
-        for name in ("output", "preset", "config", "downscale", "overwrite"):
+        for name in ("output", "preset", "config", "downscale", "split", "overwrite"):
             if getattr(options, name) is not None and getattr(options, name) is not False:
                 raise InputError(
                     f"--{name} does not go with --resume: the run in {options.resume} continues as "
@@ -88,7 +89,8 @@ def _starting_point(options: TrainOptions) -> tuple[TrainConfig, TrainOptions]:
         options = dataclasses.replace(options, downscale=run.downscale)
     if options.scene is None:  # and not another one, for which masks would be others
         masks = options.masks or masks_of(run)
-        options = dataclasses.replace(options, scene=path_of(run), masks=masks)
+        split: Any = run.split if options.split is None else options.split
+        options = dataclasses.replace(options, scene=path_of(run), masks=masks, split=split)
     return run.train, options
 
 
@@ -115,12 +117,13 @@ def _require_free(output: Path, overwrite: bool) -> None:
 def _begin_alone(source: str, output: Path, options: TrainOptions, config: TrainConfig) -> int:
     """Train from the first step on, as the only one that writes to the folder."""
     _require_machine(config)
+    split = None if options.split is None else read_split(options.split)
     photographs, masks = source, options.masks
     downscale = 1 if options.downscale is None else options.downscale
     source = with_poses(photographs, output, masks, config.threads)
     if source != photographs:
         masks = None  # the posed scene brings them
-    scene = _read(source, downscale, masks, output, options, config.threads)
+    scene = _read(source, downscale, masks, output, options, config.threads, split)
 
     # Not before: these load Warp, and bad input is refused at once.
     from warpnerf.inspection.diagnostics import diagnostics
@@ -151,7 +154,8 @@ def _begin_alone(source: str, output: Path, options: TrainOptions, config: Train
         folder = None if masks is None else str(masks.resolve())
         found = trainer.observed is not None
         keep = options.keep or "field"
-        run.create(trained, _absolute(source), downscale, distance, config, folder, found, keep)
+        of_scene = (_absolute(source), downscale, distance)
+        run.create(trained, *of_scene, config, folder, found, keep, split)
         return _train(run, trained, trainer, session, options)
 
 
@@ -178,7 +182,9 @@ def _go_on(run: Run, options: TrainOptions, changed: Callable[[TrainConfig], Tra
         _require_machine(config)
         masks = options.masks or masks_of(begun, moved)
         source = path_of(begun, moved)
-        scene = _read(source, begun.downscale, masks, run.folder, options, config.threads)
+        scene = _read(
+            source, begun.downscale, masks, run.folder, options, config.threads, begun.split
+        )
         return _evaluate(run, begun.as_trained(scene), options, config.device, config.threads)
     state, notes = run.load_state()
     config = changed(
@@ -188,7 +194,7 @@ def _go_on(run: Run, options: TrainOptions, changed: Callable[[TrainConfig], Tra
     _require_machine(config)
     masks = options.masks or masks_of(begun, moved)
     source = path_of(begun, moved)
-    scene = _read(source, begun.downscale, masks, run.folder, options, config.threads)
+    scene = _read(source, begun.downscale, masks, run.folder, options, config.threads, begun.split)
     trainer = Trainer(scene, config, state)
     scene = begun.as_trained(scene)
     _describe(scene, trainer)
@@ -235,6 +241,7 @@ def _read(
     output: Path,
     options: TrainOptions,
     threads: int | None,
+    split: Split | Sequence[str] | None,
 ) -> Scene:
     """The scene, whose photographs are kept where the run will be if they are kept on disk."""
     from warpnerf.evaluation.evaluate import require_measurable
@@ -249,6 +256,7 @@ def _read(
         images=options.images,
         image_folder=there,
         threads=threads,
+        split=split,
     )
     if options.eval_views != "none":
         require_measurable(scene, _split_to_look_at(scene))

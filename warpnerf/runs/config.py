@@ -14,6 +14,7 @@ from warpnerf.config_json import config_from_json, config_to_json, decode
 from warpnerf.media.pictures import picture_files
 from warpnerf.scenes.files import read_json
 from warpnerf.scenes.scene import Scene
+from warpnerf.scenes.split import Split
 
 Keep = Literal["field", "checkpoint"]
 
@@ -45,6 +46,8 @@ class RunConfig(msgspec.Struct, frozen=True):
     """In place of the scene's own extent, where the cameras did not tell."""
     keep: Keep = "field"
     """What is kept of the training once it has finished: its field alone, or checkpoints too."""
+    split: Literal["all", "sector"] | int | list[str] | None = None
+    """What is withheld for testing, see ``load_scene``; None: what the scene says."""
 
     def as_trained(self, scene: Scene) -> Scene:
         """A scene, as it was read, with the extent that the run has found for it."""
@@ -73,6 +76,7 @@ def describe(
     masks: str | None,
     found: bool,
     keep: Keep = "field",
+    split: Split | None = None,
 ) -> dict[str, Any]:
     """What config.json says of a run that begins; some of it only for those who open it.
 
@@ -85,6 +89,7 @@ def describe(
         masks: See ``RunConfig``.
         found: Whether short trainings found the scene's extent.
         keep: See ``RunConfig``.
+        split: See ``RunConfig``.
     """
     extent = {"box_min": scene.box_min.tolist(), "box_max": scene.box_max.tolist()}
     content = {
@@ -95,6 +100,7 @@ def describe(
         **extent,
         "notes": [*scene.warnings, *scene.notes],
         "keep": keep,
+        "split": split,
         "pictures": pictures_of(scene),
         "train": config_to_json(config),
     }

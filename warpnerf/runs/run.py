@@ -41,6 +41,7 @@ from warpnerf.runs.config import Keep, RunConfig, describe
 from warpnerf.runs.pictures import evaluate_into
 from warpnerf.runs.tensor_file import DamagedFileError
 from warpnerf.scenes.scene import Scene
+from warpnerf.scenes.split import Split
 from warpnerf.training.state import MAY_GROW, Progress, TrainingState, differences
 from warpnerf.writing import write_atomically
 
@@ -131,6 +132,7 @@ class Run:
         masks: str | None = None,
         found: bool = False,
         keep: Keep = "field",
+        split: Split | None = None,
     ) -> None:
         """Make the folder and write its configuration; an older run's files go to previous/.
 
@@ -140,7 +142,8 @@ class Run:
             InputError: The folder cannot be made or written to.
         """
         stored = run_files.stored_place(self.folder, source)
-        content = describe(scene, stored, downscale, content_distance, config, masks, found, keep)
+        how = (downscale, content_distance, config, masks, found, keep, split)
+        content = describe(scene, stored, *how)
         try:
             (self.folder / "test").mkdir(parents=True, exist_ok=True)
             run_files.set_aside(self.folder, in_use=Path(source))
