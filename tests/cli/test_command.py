@@ -83,6 +83,7 @@ def test_training_leaves_a_whole_run(trained: tuple[Path, str]) -> None:
     assert {path.name for path in folder.iterdir()} == {
         "config.json",
         "log.jsonl",
+        "curves.png",
         "checkpoint-00000030.safetensors",
         "field.safetensors",
         "metrics.json",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -260,6 +260,10 @@ def _read(
     )
     if options.eval_views != "none":
         require_measurable(scene, _split_to_look_at(scene))
+    if options.eval_every is not None:
+        from warpnerf.training.held_out import require_eval  # loads Warp
+
+        require_eval(scene, options.eval_every)
     return scene
 
 
@@ -285,18 +289,33 @@ def _train(
 ) -> int:
     """Train to the end, or until asked to stop; look at the test views."""
     from warpnerf.reports.limits import voxel_pixels, what_limits
+    from warpnerf.training.held_out import HeldOut
 
     keep = options.keep or run.read_config().keep
-    between = None if session is None else session.after_update
+    held_out = None if options.eval_every is None else HeldOut(trainer, options.eval_every)
+    log = None if options.log is None else run.open_log(options.log)
     reports: list[Progress] = []
+
+    def between() -> None:
+        if session is not None:
+            session.after_update()
+        if held_out is not None:
+            held_out.after_update()
+
     with StopRequest() as stop:
         try:
             with ProgressBar("first step") as bar:
 
                 def on_progress(progress: Progress) -> None:
+                    shown = progress
+                    if held_out is not None:
+                        progress = held_out.added_to(progress)
+                        shown = dataclasses.replace(progress, test_psnr=held_out.psnr)
                     run.log(progress)
+                    if log is not None:
+                        run.write_to(log, progress)
                     reports.append(progress)
-                    bar.report(progress.fraction, str(progress))
+                    bar.report(progress.fraction, str(shown))
 
                 trainer.run(
                     on_progress,
@@ -316,8 +335,11 @@ def _train(
             return stopped.exit_code
         if trainer.fraction >= 1.0:
             run.save_field(trainer.field(), keep == "checkpoint")
+            run.draw_curves(scene.name)
     if session is not None:
         session.notify("The training has ended", f"warpnerf view {run.folder} shows what it left.")
+    if log is not None and (stop.exit_code is not None or options.eval_views == "none"):
+        log.close({})
     if stop.exit_code is not None:
         step = trainer.steps_done
         saved = f"stopped and saved after step {step}; continue with: {run.resume_command}"
@@ -329,12 +351,14 @@ def _train(
     device, threads, pixels = trainer.config.device, trainer.config.threads, voxel_pixels(trainer)
     del trainer  # its grid, and what its optimiser keeps
 
-    def limits(psnr: float | None) -> None:
-        limit = what_limits(reports, pixels, psnr)
+    def at_end(metrics: Mapping[str, float], split: str) -> None:
+        limit = what_limits(reports, pixels, metrics["psnr"] if split == "test" else None)
         if limit is not None:
             print(limit)
+        if log is not None:
+            log.close(metrics)
 
-    return _evaluate(run, scene, options, device, threads, limits)
+    return _evaluate(run, scene, options, device, threads, at_end)
 
 
 def _evaluate(
@@ -343,7 +367,7 @@ def _evaluate(
     options: TrainOptions,
     device: str,
     threads: int | None,
-    limits: Callable[[float | None], None] = lambda psnr: None,
+    at_end: Callable[[Mapping[str, float], str], None] = lambda metrics, split: None,
 ) -> int:
     """Look at the test views of a finished run, by the field that it keeps.
 
@@ -353,7 +377,7 @@ def _evaluate(
         options: How many of them.
         device: Where to render.
         threads: CPU threads.
-        limits: Called with the PSNR of the test views; None: of training views there is no use.
+        at_end: Called with the mean metrics, and the split that they are of.
     """
     split = _split_to_look_at(scene)
     assert options.eval_views != "none"
@@ -364,7 +388,7 @@ def _evaluate(
             field, _ = run.load_field(device, threads)
             result = run.evaluate(field, scene, split, bar.report)
         print(result)
-        limits(result.mean["psnr"] if split == "test" else None)
+        at_end(result.mean, split)
     except Stopped as stopped:
         print(f"stopped; the field is saved. Continue with: {run.resume_command}", flush=True)
         return stopped.exit_code

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from warpnerf.checks import require_whole
+from warpnerf.checks import require_extra, require_whole
 from warpnerf.cli.arguments import Settings, Usual
 from warpnerf.cli.view import PageOptions
 
@@ -55,6 +55,12 @@ class TrainOptions:
     eval_views: Literal["all", "none"] | int = "all"
     """Test views that are rendered and measured at the end: all, none, or so many, spread.
     warpnerf eval does it at any time."""
+    eval_every: int | None = None
+    """Steps from one look at a few test views during the training to the next; their PSNR is shown
+    and logged. Its time counts for no --time-limit."""
+    log: Literal["csv", "tensorboard", "wandb"] | None = None
+    """Log loss and PSNR besides log.jsonl: csv (log.csv), tensorboard or wandb (Weights & Biases),
+    which need pip install "warpnerf[tensorboard]" or "warpnerf[wandb]"."""
     keep: Literal["field", "checkpoint"] | None = None
     """What a finished run keeps: its field alone, or its last checkpoints too, to train for longer
     by --resume with more --steps or a longer --time-limit. By default field, or as it was begun."""
@@ -81,6 +87,11 @@ class TrainOptions:
         PageOptions.chosen(self.view, self.host, self.port)
         if isinstance(self.eval_views, int):
             require_whole("--eval-views", self.eval_views, 1)
+        if self.eval_every is not None:
+            require_whole("--eval-every", self.eval_every, 1)
+        if self.log is not None and self.log != "csv":
+            what = f"--log {self.log}"
+            require_extra({"tensorboard": "tensorboardX"}.get(self.log, self.log), self.log, what)
 
 
 USUAL = Usual(

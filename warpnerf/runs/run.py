@@ -2,6 +2,8 @@
 
 config.json                  scene, downscale, masks, content distance used, training configuration
 log.jsonl                    a line for each progress report
+log.csv, tensorboard/        the same, where --log asks for it
+curves.png                   loss and PSNR over steps and seconds, once it is finished
 checkpoint-*.safetensors     the training after so many steps; the last two, until it is finished
 field.safetensors            the trained field, in half precision
 metrics.json                 figures of the test views
@@ -16,6 +18,7 @@ previous/                    a run that was replaced, until this one has saved s
 from __future__ import annotations
 
 import json
+import math
 import shlex
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -28,6 +31,8 @@ import msgspec
 from warpnerf.checks import InputError, cannot_write
 from warpnerf.config import TrainConfig
 from warpnerf.evaluation.evaluate import Evaluation
+from warpnerf.media.curves import CurvePoint, curves
+from warpnerf.media.pictures import write_png
 from warpnerf.rendering.field import Field
 from warpnerf.runs import files as run_files
 from warpnerf.runs import lock
@@ -38,6 +43,7 @@ from warpnerf.runs.checkpoint import (
     save_field,
 )
 from warpnerf.runs.config import Keep, RunConfig, describe
+from warpnerf.runs.logs import Log, LogKind, open_log, read_reports
 from warpnerf.runs.pictures import evaluate_into
 from warpnerf.runs.tensor_file import DamagedFileError
 from warpnerf.scenes.scene import Scene
@@ -237,6 +243,53 @@ class Run:
             content["train"] |= {name: getattr(config, name) for name in MAY_GROW}
             write_atomically(path, (json.dumps(content, indent=2) + "\n").encode())
             (self.folder / "field.safetensors").unlink(missing_ok=True)
+
+    def open_log(self, kind: LogKind) -> Log:
+        """Begin a log besides log.jsonl, or continue one.
+
+        Args:
+            kind: csv, tensorboard or wandb.
+
+        Raises:
+            InputError: It cannot be written, or its package is not installed.
+        """
+        with self._writing():
+            reports = read_reports(self.folder / "log.jsonl")
+            config = json.loads((self.folder / "config.json").read_bytes())
+            return open_log(kind, self.folder, reports, config)
+
+    def write_to(self, log: Log, progress: Progress) -> None:
+        """Append a report to a log besides log.jsonl.
+
+        Raises:
+            InputError: It cannot be written.
+        """
+        with self._writing():
+            log.write(progress)
+
+    def draw_curves(self, name: str) -> None:
+        """Draw curves.png, of all that log.jsonl has.
+
+        Args:
+            name: Of the scene.
+
+        Raises:
+            InputError: It cannot be written.
+        """
+        points = [
+            CurvePoint(
+                step=report["step"],
+                seconds=report["seconds"],
+                loss=report["loss"],
+                psnr=report["psnr"] - 10.0 * math.log10(report["seen"]),
+                test_psnr=report["test_psnr"],
+            )
+            for report in read_reports(self.folder / "log.jsonl")
+        ]
+        if points:
+            title = f"{name}: {points[-1].step} steps in {points[-1].seconds:.0f} s"
+            with self._writing():
+                write_png(self.folder / run_files.CURVES, curves(points, title))
 
     def rewind_log(self, step: int) -> None:
         """Drop reports of steps that will be done again, and a line that a crash cut off.

@@ -53,6 +53,10 @@ class Progress:
     """Share of the pixels, as blocks of them tell, that rays are drawn from, (0, 1]; those of all
     others meet nothing, and ``loss``, ``psnr`` and ``samples_per_ray`` do not count them."""
 
+    test_psnr: float | None = None
+    """Mean over a few test views, dB, where they were rendered since the last report
+    (``held_out.HeldOut``)."""
+
     @property
     def picture_psnr(self) -> float:
         """PSNR over whole pictures, dB: pixels that rays are not drawn from count as exact."""
@@ -63,9 +67,10 @@ class Progress:
         speed = self.step / max(self.seconds, 1e-6)
         size = " x ".join(str(n) for n in self.size)
         drawn = f" ({self.psnr:.2f} over {self.seen:.0%} of pixels)"
+        test = "" if self.test_psnr is None else f"test PSNR {self.test_psnr:.2f}  "
         return (
             f"step {self.step}  loss {self.loss:.5f}  "
-            f"PSNR {self.picture_psnr:.2f}{drawn if self.seen < 1.0 else ''}  "
+            f"PSNR {self.picture_psnr:.2f}{drawn if self.seen < 1.0 else ''}  {test}"
             f"grid {size}  {speed:.1f} steps/s"
         )
 
