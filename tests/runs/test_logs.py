@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import imageio.v3 as iio
+import numpy as np
 import pytest
 
 from tests.runs.test_run import new_run, run_with, state_of
@@ -20,6 +21,7 @@ from warpnerf.runs.logs import read_reports
 from warpnerf.runs.run import Run
 from warpnerf.training.state import Progress
 
+PICTURE = np.zeros((4, 4, 3), np.uint8)
 FEW = ("--steps", "30", "--threads", "1", "--voxels", "512")
 
 
@@ -134,6 +136,16 @@ def test_reports_that_are_none(tmp_path: Path) -> None:
     assert found["seen"] == 1.0 and found["test_psnr"] is None
     Run(tmp_path).draw_curves("room")
     assert iio.imread(tmp_path / "curves.png").std() > 10
+
+
+def test_curves_are_of_whole_pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run, drawn = new_run(tmp_path), []
+    run.log(report(25, loss=0.4, psnr=20.0, seen=0.1))
+    monkeypatch.setattr("warpnerf.runs.run.curves", lambda *given: drawn.append(given) or PICTURE)
+    run.draw_curves("room")
+    ((points, title),) = drawn
+    assert title == "room: 25 steps in 2 s"
+    assert points[0].loss == pytest.approx(0.04) and points[0].psnr == pytest.approx(30.0)
 
 
 def test_the_command_logs_and_draws(tmp_path: Path) -> None:

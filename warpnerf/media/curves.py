@@ -30,7 +30,7 @@ class CurvePoint:
     seconds: float
     """Of training."""
     loss: float
-    """Of the last update."""
+    """Of the last update, over whole pictures."""
     psnr: float
     """Of the training rays, over whole pictures, dB."""
     test_psnr: float | None = None

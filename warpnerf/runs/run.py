@@ -280,7 +280,7 @@ class Run:
             CurvePoint(
                 step=report["step"],
                 seconds=report["seconds"],
-                loss=report["loss"],
+                loss=report["loss"] * report["seen"],  # rays that are not drawn have none
                 psnr=report["psnr"] - 10.0 * math.log10(report["seen"]),
                 test_psnr=report["test_psnr"],
             )
