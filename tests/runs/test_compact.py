@@ -109,6 +109,8 @@ def test_what_half_precision_cannot_hold_stays_whole(tmp_path: Path) -> None:
     )
     path = tmp_path / "field.safetensors"
     save_field(path, replace(field, storage=storage), "float16")
+    stored = load_file(path)
+    assert stored["values.density"].dtype == stored["values.features"].dtype == np.float32
     back = load_field(path, threads=1).storage.tensors()["values"]
     np.testing.assert_array_equal(back[:3], values[:3])
 

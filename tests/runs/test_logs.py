@@ -72,7 +72,7 @@ def test_a_log_is_replaced_with_its_run(tmp_path: Path) -> None:
     new_run(tmp_path)
     older = tmp_path / "previous"
     names = ("tensorboard/" + events.name, "log.csv", "curves.png")
-    assert [(older / name).read_text() for name in names] == ["older"] * 3
+    assert all((older / name).is_file() for name in names)
     run.save_checkpoint(state_of(2))
     assert not older.exists() and mine.read_text() == "older"
     assert not events.exists() and not (tmp_path / "log.csv").exists()

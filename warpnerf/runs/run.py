@@ -2,7 +2,7 @@
 
 config.json                  scene, downscale, masks, content distance used, training configuration
 log.jsonl                    a line for each progress report
-log.csv, tensorboard/        the same, where --log asks for it
+log.csv, tensorboard/        the same, by --log
 curves.png                   loss and PSNR over steps and seconds, once it is finished
 checkpoint-*.safetensors     the training after so many steps; the last two, until it is finished
 field.safetensors            the trained field, in half precision
