@@ -48,7 +48,7 @@ def run(*arguments: str | Path) -> tuple[int, str, str]:
 def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """A tiny run, and what it printed."""
     folder = tmp_path_factory.mktemp("runs") / "room"
-    process = start("train", *TINY, "--steps=3e1", "--output", folder)
+    process = start("train", *TINY, "--steps=3e1", "--keep=checkpoint", "--output", folder)
     out, err = process.communicate(timeout=240)
     assert process.returncode == 0, err
     assert "CUDA" not in err
@@ -83,6 +83,7 @@ def test_training_leaves_a_whole_run(trained: tuple[Path, str]) -> None:
     assert {path.name for path in folder.iterdir()} == {
         "config.json",
         "log.jsonl",
+        "curves.png",
         "checkpoint-00000030.safetensors",
         "field.safetensors",
         "metrics.json",
@@ -251,7 +252,7 @@ def test_eval_of_a_bad_run(trained: tuple[Path, str], tmp_path: Path, damage: st
     assert "Traceback" not in err
 
 
-GROWING = (*TINY, "--steps", "210", "--voxels", "20000")
+GROWING = (*TINY, "--steps", "210", "--voxels", "20000", "--keep", "checkpoint")
 """Grows before the first update after step 200, and trains on for a few steps."""
 
 
@@ -347,6 +348,45 @@ def test_a_finished_run_is_resumed_to_its_figures(
     assert (folder / "checkpoint-00000030.safetensors").stat().st_mtime_ns == before
 
 
+def test_a_finished_run_keeps_its_field_alone(trained: tuple[Path, str], tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    code, _, err = run("train", *TINY, "--steps", "30", "--output", folder)
+    assert code == 0, err
+    assert not list(folder.glob("checkpoint-*"))
+    for name in ("field.safetensors", "metrics.json"):
+        assert (folder / name).read_bytes() == (trained[0] / name).read_bytes()
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    for more in ((), ("--steps", "60")):
+        code, _, err = run("train", "--resume", folder, *more)
+        assert code == 2
+        assert err.startswith(f"warpnerf: error: {folder} has finished and keeps its field alone")
+        assert "--keep checkpoint" in err and len(err.splitlines()) == 1
+    assert before == {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    (folder / "metrics.json").unlink()  # stopped before its views were looked at
+    code, _, err = run("train", "--resume", folder)
+    assert code == 0, err
+    assert (folder / "metrics.json").read_bytes() == (trained[0] / "metrics.json").read_bytes()
+
+
+def test_a_finished_run_is_trained_for_longer(trained: tuple[Path, str], tmp_path: Path) -> None:
+    folder = shutil.copytree(trained[0], tmp_path / "run")
+    code, out, err = run("train", "--resume", folder, "--steps", "40")
+    assert code == 0, err
+    assert "steps 40 instead of 30: learning rates rise" in out
+    config = json.loads((folder / "config.json").read_text())
+    assert config["train"]["steps"] == 40
+    assert [path.name for path in Run(folder).checkpoints] == [
+        "checkpoint-00000040.safetensors",
+        "checkpoint-00000030.safetensors",
+    ]
+    Run(folder).checkpoints[0].unlink()  # interrupted after config.json had been written
+    whole = (folder / "field.safetensors").read_bytes()
+    code, out, err = run("train", "--resume", folder)
+    assert code == 0, err
+    assert "resuming after step 30" in out
+    assert (folder / "field.safetensors").read_bytes() == whole
+
+
 def test_other_threads_are_allowed_and_noted(trained: tuple[Path, str]) -> None:
     code, out, err = run("train", "--resume", trained[0], "--threads", "2")
     assert code == 0, err
@@ -356,7 +396,7 @@ def test_other_threads_are_allowed_and_noted(trained: tuple[Path, str]) -> None:
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (("--steps", "31"), "steps is 31"),
+        (("--steps", "29"), "steps is 29"),
         (("--time-limit", "5"), "time_limit is 5.0"),
         (("--near", "0.1"), "march.near is 0.1"),
         (("--seed", "1"), "seed is 1"),

@@ -56,9 +56,11 @@ def test_the_python_of_the_page_about_it_runs(small: None, tmp_path: Path) -> No
     pytest.importorskip("av")
     pytest.importorskip("torch")
     names: dict[str, Any] = {}
-    first, after, exported, scaled, rendered, with_head = examples("docs/python.md")
-    for block in (first, after):
+    first, called, after, exported, scaled, rendered, with_head = examples("docs/python.md")
+    for block in (first, called, after):
         run("docs/python.md", block, names)
+    step, seconds, *figures = names["rows"][-1]
+    assert step == STEPS and seconds > 0.0 and None not in figures
     assert (tmp_path / "orbit.mp4").stat().st_size > 0
     assert names["result"].progress.step == STEPS
 

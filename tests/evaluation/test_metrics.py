@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import sys
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +13,9 @@ from flip_evaluator import evaluate
 from skimage.metrics import structural_similarity
 
 from warpnerf.checks import InputError
+from warpnerf.evaluation import metrics
 from warpnerf.evaluation.metrics import flip, has_flip, psnr, ssim
+from warpnerf.runtime.memory import usable_cores
 
 
 def images(seed: int, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
@@ -155,3 +160,22 @@ def test_where_a_mask_leaves_no_window_there_is_no_ssim() -> None:
     rgb, truth, mask = masked_images(0)
     mask[5:25, 5:35] = False
     assert mask.any() and ssim(rgb, truth, mask) is None
+
+
+def test_threads_of_flip_do_not_spin_and_the_environment_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "flip_evaluator.py").write_text("import os\nevaluate = dict(os.environ)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "flip_evaluator")
+    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    before = dict(os.environ)
+    loaded: Any = metrics._flip_evaluator.__wrapped__()
+    assert loaded["OMP_WAIT_POLICY"] == "passive" and loaded["OMP_NUM_THREADS"] == "3"
+    assert dict(os.environ) == before
+    monkeypatch.delitem(sys.modules, "flip_evaluator")
+    monkeypatch.delenv("OMP_NUM_THREADS")
+    loaded = metrics._flip_evaluator.__wrapped__()
+    assert loaded["OMP_NUM_THREADS"] == str(usable_cores())
+    assert "OMP_NUM_THREADS" not in os.environ

@@ -28,6 +28,7 @@ import hashed
 import heads
 import host_command
 import host_output
+import host_runs
 import host_scenes
 import host_training
 import losses
@@ -58,6 +59,7 @@ MUTANTS = (
     *host_training.MUTANTS,
     *host_scenes.MUTANTS,
     *host_output.MUTANTS,
+    *host_runs.MUTANTS,
     *host_command.MUTANTS,
 )
 

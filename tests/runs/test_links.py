@@ -14,6 +14,7 @@ from warpnerf.sfm.scene_files import Record, remove_written
 
 FILES = (".lock", "config.json", "log.jsonl", "metrics.json", "test.png", "field.safetensors")
 LATER = ("checkpoint-00000010.safetensors", "test/view.png", "previous/config.json")
+MORE = ("log.csv", "curves.png")
 FOLDERS = ("test", "previous", "previous/test", "scene", "next", "next/scene", "scene/images")
 
 
@@ -24,7 +25,7 @@ def begun(folder: Path) -> Path:
     return folder / "run"
 
 
-@pytest.mark.parametrize("name", [*FILES, *LATER])
+@pytest.mark.parametrize("name", [*FILES, *LATER, *MORE])
 @pytest.mark.parametrize("dangling", [False, True])
 def test_a_link_in_place_of_a_file_is_refused(tmp_path: Path, name: str, dangling: bool) -> None:
     run, target = begun(tmp_path), tmp_path / "elsewhere" / "file"
@@ -36,7 +37,7 @@ def test_a_link_in_place_of_a_file_is_refused(tmp_path: Path, name: str, danglin
     assert target.read_text() == "precious" if not dangling else not target.exists()
 
 
-@pytest.mark.parametrize("name", FOLDERS)
+@pytest.mark.parametrize("name", [*FOLDERS, "tensorboard"])
 def test_a_link_in_place_of_a_folder_is_refused(tmp_path: Path, name: str) -> None:
     run = begun(tmp_path)
     (run / name).parent.mkdir(exist_ok=True)
@@ -60,7 +61,7 @@ def test_a_name_that_is_too_long(tmp_path: Path) -> None:
         pass
 
 
-@pytest.mark.parametrize("name", [*FILES, *LATER])
+@pytest.mark.parametrize("name", [*FILES, *LATER, *MORE])
 def test_a_pipe_is_not_waited_for(tmp_path: Path, name: str) -> None:
     run = begun(tmp_path)
     os.mkfifo(run / name)

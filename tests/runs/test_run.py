@@ -11,6 +11,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.support.tiny_fields import assert_same_state, tiny_state
@@ -18,6 +19,7 @@ from tests.training.test_determinism import small_scene
 from warpnerf import writing
 from warpnerf.checks import InputError
 from warpnerf.config import TrainConfig
+from warpnerf.runs.checkpoint import load_field
 from warpnerf.runs.run import Run
 from warpnerf.training.state import Progress, TrainingState
 
@@ -177,6 +179,35 @@ def test_killed_at_any_call_an_old_or_the_new_checkpoint_is_whole(tmp_path: Path
     assert set(outcomes) == {False, True}
 
 
+def test_killed_while_it_finishes_the_last_checkpoint_or_the_field_is_whole(tmp_path: Path) -> None:
+    state = state_of(2)
+    values = state.field.storage.values.numpy()
+    counted = run_with(tmp_path / "counted", 1, 2)
+    n_calls = len(calls_of(lambda: counted.save_field(state.field, keep_checkpoints=False)))
+    assert n_calls > 8 and [path.name for path in counted.results] == ["field.safetensors"]
+    outcomes = set()
+    for at in range(1, n_calls + 1):
+        run = run_with(tmp_path / f"run{at}", 1, 2)
+
+        def save(run: Run = run, at: int = at) -> None:
+            with pytest.MonkeyPatch.context() as patch:
+                Faults(patch, killed).at = at
+                run.save_field(state.field, keep_checkpoints=False)
+
+        assert in_child(save) == KILLED
+        field, notes = run.load_field("cpu", 1)
+        assert not notes
+        np.testing.assert_allclose(field.storage.values.numpy(), values, rtol=1e-3, atol=1e-6)
+        if (run.folder / "field.safetensors").exists():
+            load_field(run.folder / "field.safetensors", threads=1)
+        else:
+            require_old_or_new(run.folder, 1, 2)
+        outcomes.add(len(run.checkpoints))
+        run.save_field(state.field, keep_checkpoints=False)
+        assert temporary(run.folder) == [] and run.checkpoints == []
+    assert outcomes == {2, 1}
+
+
 def test_killed_over_and_over_leaves_one_temporary_file(tmp_path: Path) -> None:
     run = run_with(tmp_path, 1, 2)
 
@@ -218,7 +249,9 @@ def whole_steps(folder: Path) -> set[int]:
             assert notes == []
             values = field.storage.values.numpy()
             same = [
-                n for n in (1, 8, 9) if (values == state_of(n).field.storage.values.numpy()).all()
+                n
+                for n in (1, 8, 9)
+                if np.allclose(values, state_of(n).field.storage.values.numpy(), 1e-3, 1e-6)
             ]
             steps.update(same)
     return steps

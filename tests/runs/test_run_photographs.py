@@ -51,7 +51,7 @@ def others(tmp_path: Path) -> Path:
 
 def train(source: Path | str, output: Path, **options: Any) -> None:
     tiny = {"steps": ("2",), "threads": ("1",), "grid.voxels": ("512",)}
-    chosen = command.TrainOptions(scene=str(source), output=output, **options)
+    chosen = command.TrainOptions(scene=str(source), output=output, keep="checkpoint", **options)
     assert command.train_command(chosen, tiny) == 0
 
 

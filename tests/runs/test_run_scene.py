@@ -73,7 +73,8 @@ def test_a_training_of_a_scene_that_moved_goes_on_with_its_masks(tmp_path: Path)
         Image.new("L", (16, 12), 255).save(masks / f"{number:03d}.png")
     run = tmp_path / "run"
     tiny = {"steps": ("2",), "threads": ("1",), "grid.voxels": ("512",)}
-    options = TrainOptions(scene=str(tmp_path / "scene"), output=run, masks=masks)
+    kept = {"masks": masks, "keep": "checkpoint"}
+    options = TrainOptions(scene=str(tmp_path / "scene"), output=run, **kept)
     assert train_command(options, tiny) == 0
     (tmp_path / "scene").rename(tmp_path / "elsewhere")
     options = TrainOptions(scene=str(tmp_path / "elsewhere"), resume=run)

@@ -53,7 +53,7 @@ def test_photographs_are_read_by_as_many(place: str, pools: list[int], tmp_path:
 def test_the_command_passes_it_on(pools: list[int], tmp_path: Path) -> None:
     write_transforms(tmp_path / "scene", scale=2)
     run = str(tmp_path / "run")
-    tiny = ("--steps", "2", "--voxels", "512", "--model", "rgb")
+    tiny = ("--steps", "2", "--voxels", "512", "--model", "rgb", "--keep", "checkpoint")
     assert main(["train", str(tmp_path / "scene"), "--output", run, *tiny, "--threads", "3"]) == 0
     assert len(pools) >= 3 and set(pools) == {3}
     pools.clear()

@@ -179,9 +179,12 @@ def test_a_resumed_training_goes_by_the_plan_that_it_began_with(
     monkeypatch.setitem(configuration.GROW_AT, "object", (0.9,))
     monkeypatch.setitem(optim_config.ACCUMULATE_AT, "object", ())
     monkeypatch.setitem(planning._COLOURS, "white", (0.5, 0.5, 0.5))
+    assert isinstance(whole.plan, TrainingPlan)
+    goes_by = Trainer(ball(), config, begun).plan
+    assert plan_to_json(goes_by) == plan_to_json(whole.plan)
     resumed = stopped_at(STEPS, tmp_path / "resumed", config, ball(), begun)
     assert_same_state(without_seconds(resumed), without_seconds(whole))
-    assert isinstance(resumed.plan, TrainingPlan) and isinstance(whole.plan, TrainingPlan)
+    assert isinstance(resumed.plan, TrainingPlan)
     assert plan_to_json(resumed.plan) == plan_to_json(whole.plan)
     again = stopped_at(STEPS, tmp_path / "again", config, ball())
     assert again.field.lattice.size != whole.field.lattice.size

@@ -293,7 +293,7 @@ def test_checkpoints_come_when_due_and_at_the_end() -> None:
 @pytest.mark.parametrize(
     ("changes", "name"),
     [
-        ({"steps": STEPS + 1}, "steps"),
+        ({"steps": STEPS - 1}, "steps"),
         ({"time_limit": 60.0}, "time_limit"),
         ({"seed": 1}, "seed"),
         ({"scaling": "none"}, "scaling"),
@@ -310,6 +310,30 @@ def test_another_configuration_is_refused_by_name(
     state = stopped_at(1, tmp_path / "state", tiny_config(), ball())
     with pytest.raises(InputError, match=rf"^{name} is "):
         train(ball(), tiny_config(**changes), resume=state)
+
+
+def test_a_longer_training_follows_its_own_schedule_from_there_on(tmp_path: Path) -> None:
+    state = stopped_at(STEPS, tmp_path / "state", tiny_config(), ball())
+    assert state.grown == 2
+    longer = tiny_config(steps=5 * STEPS)
+    trainer = Trainer(ball(), longer, state)
+    trainer.run(stop=lambda: trainer.steps_done == STEPS + 10)
+    assert trainer.fraction == 0.3 and trainer.schedule.growths(trainer.fraction) == 0
+    assert trainer.lattice.size == state.field.lattice.size
+    assert trainer.schedule.rate(trainer.fraction, 0, 1) > longer.optim.decay**0.5
+    trainer.run()
+    assert trainer.steps_done == 5 * STEPS
+    assert trainer.lattice.size == state.field.lattice.size
+
+
+def test_a_training_that_is_done_needs_no_checkpoint() -> None:
+    for when_done in (True, False):
+        trainer, saved = Trainer(ball(), tiny_config()), []
+        how = {"checkpoint_when_done": when_done}
+        trainer.run(None, saved.append, lambda trainer=trainer: trainer.steps_done >= 5, **how)
+        assert [state.progress.step for state in saved] == [5]  # stopped
+        trainer.run(None, saved.append, **how)
+        assert len(saved) == (2 if when_done else 1)
 
 
 def test_what_does_not_decide_the_result_may_change(tmp_path: Path) -> None:

@@ -58,6 +58,7 @@ def eval_command(
         masks=folder_of_masks,
         images="files",
         threads=threads,
+        split=config.split if scene is None else None,
     )
     views = config.as_trained(views)
     require_measurable(views, split)

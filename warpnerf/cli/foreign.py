@@ -32,6 +32,13 @@ _MEANT = {
     "--box": ("--aabb",),
     "--near": ("--near-plane", "--min-near"),
     "--optim.learning-rate-density": ("--lr", "--learning-rate", "--lr-init", "--lrate"),
+    "--split": (
+        "--eval-mode",
+        "--train-on",
+        "--train-split-fraction",
+        "--test-every",
+        "--llffhold",
+    ),
     "--voxels": ("--num-voxels", "--n-voxels"),
 }
 

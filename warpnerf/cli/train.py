@@ -5,26 +5,24 @@ from __future__ import annotations
 import dataclasses
 import sys
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import tyro
-
-from warpnerf.checks import InputError, require_whole
-from warpnerf.cli.arguments import Settings, Usual
+from warpnerf.checks import InputError
 from warpnerf.cli.configured import begun_with, configured
 from warpnerf.cli.given import NOTHING, Given
 from warpnerf.cli.machine import FAILED
 from warpnerf.cli.pose import with_poses
-from warpnerf.cli.view import PageOptions, training_page
+from warpnerf.cli.train_options import USUAL, TrainOptions
+from warpnerf.cli.view import training_page
 from warpnerf.config import TrainConfig
 from warpnerf.presets import PRESETS
 from warpnerf.runs import lock
 from warpnerf.runtime.memory import require_threads
 from warpnerf.runtime.progress import ProgressBar
 from warpnerf.runtime.signals import Stopped, StopRequest
+from warpnerf.scenes.split import Split, read_split
 
 if TYPE_CHECKING:
     from warpnerf.runs.run import Run
@@ -33,97 +31,6 @@ if TYPE_CHECKING:
     from warpnerf.training.state import Progress
     from warpnerf.training.trainer import Trainer
     from warpnerf.viewer.session import Session
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrainOptions:
-    """What `warpnerf train` is given besides a configuration."""
-
-    scene: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[SCENE]")] = None
-    """Folder of a scene (transforms.json, Blender, COLMAP, LLFF), an .npz file, builtin:room or
-    builtin:room-sparse; or photographs without poses or a video, whose poses are then estimated
-    first, as by `warpnerf pose`."""
-    output: Path | None = None
-    """Folder for configuration, field, log, figures and pictures; by default runs/SCENE-TIME."""
-    preset: (
-        Literal[
-            "fast", "quality", "dvgo", "dvgo-unbounded", "dvgo-llff", "tensorf", "ngp", "mip360"
-        ]
-        | None
-    ) = None
-    """Starting point, by default fast, which takes a minute or three on two cores; quality takes a
-    quarter of an hour; dvgo, dvgo-unbounded and dvgo-llff are the published hyperparameters of
-    DirectVoxGO, tensorf those of TensoRF, ngp those of Instant-NGP, and take hours; mip360 samples
-    and contracts as Mip-NeRF 360 does. Other options replace its values."""
-    config: Path | None = None
-    """Starting point instead of a preset: the config.json of a run, which is repeated, with its
-    scene, downscale and masks, but for what other options replace."""
-    resume: Path | None = None
-    """Resume the run in this folder, as it was begun; scene only if it has moved."""
-    overwrite: bool = False
-    """Replace the run that the output folder holds."""
-    downscale: int | None = None
-    """Average blocks of so many pixels squared; by default 1, as they are."""
-    masks: Path | None = None
-    """Folder of images named after the photographs, white where pixels count and black where they
-    are ignored; with --resume only if it has moved."""
-    images: Literal["auto", "memory", "disk"] = "auto"
-    """Where the photographs' pixels are during the training: memory, disk (decoded once, into a
-    file without a name in the output folder, gone at the end), or by what is free."""
-    eval_views: Literal["all", "none"] | int = "all"
-    """Test views that are rendered and measured at the end: all, none, or so many, spread.
-    warpnerf eval does it at any time."""
-    view: bool = False
-    """Serve a page to look at the training in a browser."""
-    host: str | None = None
-    """Where, by name or address of this machine; by default 127.0.0.1."""
-    port: int | None = None
-    """Where; 0: any that is free. By default 8080, or the next that is free."""
-    model_options: Settings = ()
-    """Of the model, such as specular=8 width=64: the same as --model.specular 8
-    --model.width 64."""
-    loss: Settings = ()
-    """What is minimised besides, such as distortion=0.01 entropy=0.001: the same as
-    --loss.distortion 0.01 --loss.entropy 0.001."""
-
-    @property
-    def page(self) -> PageOptions | None:
-        """Where the page of the training is served; None: nowhere."""
-        return PageOptions.chosen(self.view, self.host, self.port)
-
-    def require_usable(self) -> None:
-        """Raise InputError where an option cannot be followed, before anything is read."""
-        PageOptions.chosen(self.view, self.host, self.port)
-        if isinstance(self.eval_views, int):
-            require_whole("--eval-views", self.eval_views, 1)
-
-
-USUAL = Usual(
-    (
-        "output",
-        "preset",
-        "steps",
-        "time_limit",
-        "grid.voxels",
-        "downscale",
-        "masks",
-        "model",
-        "resume",
-        "config",
-        "overwrite",
-        "view",
-        "scaling",
-        "content_distance",
-        "box",
-        "grid.border",
-        "grid.contraction",
-        "march.near",
-        "device",
-        "threads",
-        "seed",
-        "checkpoint_every",
-    )
-)
 
 
 def train_command(options: TrainOptions, given: Annotated[Given, USUAL] = NOTHING) -> int:
@@ -139,7 +46,7 @@ def train_command(options: TrainOptions, given: Annotated[Given, USUAL] = NOTHIN
         return configured(config, given, options.model_options, options.loss)
 
     if options.resume is not None:
-        for name in ("output", "preset", "config", "downscale", "overwrite"):
+        for name in ("output", "preset", "config", "downscale", "split", "overwrite"):
             if getattr(options, name) is not None and getattr(options, name) is not False:
                 raise InputError(
                     f"--{name} does not go with --resume: the run in {options.resume} continues as "
@@ -182,7 +89,8 @@ def _starting_point(options: TrainOptions) -> tuple[TrainConfig, TrainOptions]:
         options = dataclasses.replace(options, downscale=run.downscale)
     if options.scene is None:  # and not another one, for which masks would be others
         masks = options.masks or masks_of(run)
-        options = dataclasses.replace(options, scene=path_of(run), masks=masks)
+        split: Any = run.split if options.split is None else options.split
+        options = dataclasses.replace(options, scene=path_of(run), masks=masks, split=split)
     return run.train, options
 
 
@@ -209,12 +117,13 @@ def _require_free(output: Path, overwrite: bool) -> None:
 def _begin_alone(source: str, output: Path, options: TrainOptions, config: TrainConfig) -> int:
     """Train from the first step on, as the only one that writes to the folder."""
     _require_machine(config)
+    split = None if options.split is None else read_split(options.split)
     photographs, masks = source, options.masks
     downscale = 1 if options.downscale is None else options.downscale
     source = with_poses(photographs, output, masks, config.threads)
     if source != photographs:
         masks = None  # the posed scene brings them
-    scene = _read(source, downscale, masks, output, options, config.threads)
+    scene = _read(source, downscale, masks, output, options, config.threads, split)
 
     # Not before: these load Warp, and bad input is refused at once.
     from warpnerf.inspection.diagnostics import diagnostics
@@ -244,8 +153,10 @@ def _begin_alone(source: str, output: Path, options: TrainOptions, config: Train
     with training_page(options.page, trained, trainer) as session:
         folder = None if masks is None else str(masks.resolve())
         found = trainer.observed is not None
-        run.create(trained, _absolute(source), downscale, distance, config, folder, found)
-        return _train(run, trained, trainer, session, options.eval_views)
+        keep = options.keep or "field"
+        of_scene = (_absolute(source), downscale, distance)
+        run.create(trained, *of_scene, config, folder, found, keep, split)
+        return _train(run, trained, trainer, session, options)
 
 
 def _resume(
@@ -261,16 +172,29 @@ def _resume(
 
 def _go_on(run: Run, options: TrainOptions, changed: Callable[[TrainConfig], TrainConfig]) -> int:
     from warpnerf.runs.scene import masks_of, path_of
+    from warpnerf.training.state import MAY_GROW, require_same_config
     from warpnerf.training.trainer import Trainer
 
     begun, moved = run.read_config(), options.scene
+    if run.is_unlooked_at and options.eval_views != "none":  # stopped while it was
+        config = changed(begun.train)
+        require_same_config(begun.train, config)
+        _require_machine(config)
+        masks = options.masks or masks_of(begun, moved)
+        source = path_of(begun, moved)
+        scene = _read(
+            source, begun.downscale, masks, run.folder, options, config.threads, begun.split
+        )
+        return _evaluate(run, begun.as_trained(scene), options, config.device, config.threads)
     state, notes = run.load_state()
-    config = changed(state.config)
+    config = changed(
+        dataclasses.replace(state.config, **{n: getattr(begun.train, n) for n in MAY_GROW})
+    )
     state.require_same_config(config)
     _require_machine(config)
     masks = options.masks or masks_of(begun, moved)
     source = path_of(begun, moved)
-    scene = _read(source, begun.downscale, masks, run.folder, options, config.threads)
+    scene = _read(source, begun.downscale, masks, run.folder, options, config.threads, begun.split)
     trainer = Trainer(scene, config, state)
     scene = begun.as_trained(scene)
     _describe(scene, trainer)
@@ -280,11 +204,20 @@ def _go_on(run: Run, options: TrainOptions, changed: Callable[[TrainConfig], Tra
         old, new = getattr(state.config, name), getattr(config, name)
         if new != old:
             print(f"  note: {name} {new} instead of {old}: sums are rounded in another order")
+    for name in MAY_GROW:
+        old, new = getattr(begun.train, name), getattr(config, name)
+        if new != old:
+            print(
+                f"  note: {name} {new} instead of {old}: learning rates rise to those of the "
+                "longer training; one that is as long from the start ends otherwise"
+            )
     print(f"  resuming after step {trainer.steps_done}")
     with training_page(options.page, scene, trainer) as session:
+        if any(getattr(begun.train, name) != getattr(config, name) for name in MAY_GROW):
+            run.extend(config)
         run.rewind_log(trainer.steps_done)
         del state  # the trainer has copies
-        return _train(run, scene, trainer, session, options.eval_views)
+        return _train(run, scene, trainer, session, options)
 
 
 def _require_machine(config: TrainConfig) -> None:
@@ -308,6 +241,7 @@ def _read(
     output: Path,
     options: TrainOptions,
     threads: int | None,
+    split: Split | Sequence[str] | None,
 ) -> Scene:
     """The scene, whose photographs are kept where the run will be if they are kept on disk."""
     from warpnerf.evaluation.evaluate import require_measurable
@@ -322,9 +256,14 @@ def _read(
         images=options.images,
         image_folder=there,
         threads=threads,
+        split=split,
     )
     if options.eval_views != "none":
         require_measurable(scene, _split_to_look_at(scene))
+    if options.eval_every is not None:
+        from warpnerf.training.held_out import require_eval  # loads Warp
+
+        require_eval(scene, options.eval_every)
     return scene
 
 
@@ -346,23 +285,45 @@ def _train(
     scene: Scene,
     trainer: Trainer,
     session: Session | None,
-    eval_views: Literal["all", "none"] | int,
+    options: TrainOptions,
 ) -> int:
     """Train to the end, or until asked to stop; look at the test views."""
     from warpnerf.reports.limits import voxel_pixels, what_limits
+    from warpnerf.training.held_out import HeldOut
 
-    between = None if session is None else session.after_update
+    keep = options.keep or run.read_config().keep
+    held_out = None if options.eval_every is None else HeldOut(trainer, options.eval_every)
+    log = None if options.log is None else run.open_log(options.log)
     reports: list[Progress] = []
+
+    def between() -> None:
+        if session is not None:
+            session.after_update()
+        if held_out is not None:
+            held_out.after_update()
+
     with StopRequest() as stop:
         try:
             with ProgressBar("first step") as bar:
 
                 def on_progress(progress: Progress) -> None:
+                    shown = progress
+                    if held_out is not None:
+                        progress = held_out.added_to(progress)
+                        shown = dataclasses.replace(progress, test_psnr=held_out.psnr)
                     run.log(progress)
+                    if log is not None:
+                        run.write_to(log, progress)
                     reports.append(progress)
-                    bar.report(progress.fraction, str(progress))
+                    bar.report(progress.fraction, str(shown))
 
-                trainer.run(on_progress, run.save_checkpoint, lambda: stop.asked, between)
+                trainer.run(
+                    on_progress,
+                    run.save_checkpoint,
+                    lambda: stop.asked,
+                    between,
+                    checkpoint_when_done=keep == "checkpoint",
+                )
         except FloatingPointError as error:
             kept = "Nothing was saved before."
             if run.last_step is not None:
@@ -373,29 +334,61 @@ def _train(
             print(f"stopped; {run.way_on()}", flush=True)
             return stopped.exit_code
         if trainer.fraction >= 1.0:
-            run.save_field(trainer.field())
+            run.save_field(trainer.field(), keep == "checkpoint")
+            run.draw_curves(scene.name)
     if session is not None:
         session.notify("The training has ended", f"warpnerf view {run.folder} shows what it left.")
+    if log is not None and (stop.exit_code is not None or options.eval_views == "none"):
+        log.close({})
     if stop.exit_code is not None:
         step = trainer.steps_done
         saved = f"stopped and saved after step {step}; continue with: {run.resume_command}"
         print(saved if run.last_step == step else f"stopped; {run.way_on()}", flush=True)
         return stop.exit_code
-    if eval_views == "none":
+    if options.eval_views == "none":
         print(f"wrote {run.folder}: field.safetensors, log.jsonl and config.json")
         return 0
+    device, threads, pixels = trainer.config.device, trainer.config.threads, voxel_pixels(trainer)
+    del trainer  # its grid, and what its optimiser keeps
+
+    def at_end(metrics: Mapping[str, float], split: str) -> None:
+        limit = what_limits(reports, pixels, metrics["psnr"] if split == "test" else None)
+        if limit is not None:
+            print(limit)
+        if log is not None:
+            log.close(metrics)
+
+    return _evaluate(run, scene, options, device, threads, at_end)
+
+
+def _evaluate(
+    run: Run,
+    scene: Scene,
+    options: TrainOptions,
+    device: str,
+    threads: int | None,
+    at_end: Callable[[Mapping[str, float], str], None] = lambda metrics, split: None,
+) -> int:
+    """Look at the test views of a finished run, by the field that it keeps.
+
+    Args:
+        run: Whose field is saved.
+        scene: Its photographs.
+        options: How many of them.
+        device: Where to render.
+        threads: CPU threads.
+        at_end: Called with the mean metrics, and the split that they are of.
+    """
     split = _split_to_look_at(scene)
-    scene = _some_views(scene, split, eval_views)
+    assert options.eval_views != "none"
+    scene = _some_views(scene, split, options.eval_views)
     print(f"rendering the {'test' if split == 'test' else 'training'} views", flush=True)
     try:
         with ProgressBar("first view") as bar:
-            result = run.evaluate(trainer.field(), scene, split, bar.report)
+            field, _ = run.load_field(device, threads)
+            result = run.evaluate(field, scene, split, bar.report)
         print(result)
-        limit = what_limits(
-            reports, voxel_pixels(trainer), result.mean["psnr"] if split == "test" else None
-        )
-        if limit is not None:
-            print(limit)
+        at_end(result.mean, split)
     except Stopped as stopped:
         print(f"stopped; the field is saved. Continue with: {run.resume_command}", flush=True)
         return stopped.exit_code

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import importlib.util
 import math
+import os
+from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 
 from warpnerf.checks import InputError, require_extra
+from warpnerf.runtime.memory import usable_cores
 
 SSIM_WINDOW = 11
 """Pixels along the edge of SSIM's window."""
@@ -102,12 +106,27 @@ def flip(rgb: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None) ->
     """
     a, b = _checked(rgb, target)
     require_extra("flip_evaluator", "metrics", "FLIP")
-    from flip_evaluator import evaluate
-
+    evaluate = _flip_evaluator()
     a = alike_where_masked(a, b, mask)
     reference, test = (np.ascontiguousarray(image, np.float32) for image in (b, a))
     errors, mean, _ = evaluate(reference, test, "LDR", applyMagma=False)
     return float(mean if mask is None else np.asarray(errors).reshape(mask.shape)[mask].mean())
+
+
+@cache
+def _flip_evaluator() -> Callable[..., tuple[np.ndarray, float, object]]:
+    """The package's function, whose threads wait without spinning and are no more than there are
+    cores: it brings an OpenMP of its own, which reads the environment when it is loaded.
+    """
+    settings = {"OMP_WAIT_POLICY": "passive", "OMP_NUM_THREADS": str(usable_cores())}
+    added = {name: value for name, value in settings.items() if name not in os.environ}
+    os.environ.update(added)
+    try:
+        from flip_evaluator import evaluate
+    finally:
+        for name in added:
+            del os.environ[name]
+    return evaluate
 
 
 def alike_where_masked(rgb: np.ndarray, target: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
@@ -131,7 +150,10 @@ def _blur(image: np.ndarray) -> np.ndarray:
     x = np.arange(-_RADIUS, _RADIUS + 1)
     weights = np.exp(-0.5 * (x / _SIGMA) ** 2)
     weights /= weights.sum()
-    for axis in (0, 1):
-        n = image.shape[axis] - 2 * _RADIUS
-        image = sum(w * np.take(image, range(k, k + n), axis=axis) for k, w in enumerate(weights))
+    for _ in range(2):  # rows, then columns; views, as copies would take twice as long
+        n = len(image) - 2 * _RADIUS
+        blurred = weights[0] * image[:n]
+        for k in range(1, SSIM_WINDOW):
+            blurred += weights[k] * image[k : k + n]
+        image = blurred.swapaxes(0, 1)
     return image

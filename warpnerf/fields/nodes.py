@@ -67,6 +67,26 @@ def cells_within(lattice: Lattice, low: np.ndarray, high: np.ndarray) -> np.ndar
     return np.asarray(inside)
 
 
+def nodes_of_cells(lattice: Lattice, cells: np.ndarray) -> np.ndarray:
+    """Which nodes samples in cells of free space read: those in the cells and on their faces.
+
+    Args:
+        lattice: That they belong to.
+        cells: [MX, MY, MZ] bool, of any size: a single one is all of the lattice.
+
+    Returns:
+        [X, Y, Z] bool.
+    """
+    nodes = np.asarray(cells, bool)
+    for axis, n in enumerate(lattice.size):
+        last, m, before = n - 1, nodes.shape[axis], np.moveaxis(nodes, axis, 0)
+        after = np.zeros((n, *before.shape[1:]), bool)
+        for i in range(m):
+            after[i * last // m : -(-(i + 1) * last // m) + 1] |= before[i]
+        nodes = np.moveaxis(after, 0, axis)
+    return nodes
+
+
 def voxel_edges(lattice: Lattice, points: np.ndarray) -> np.ndarray:
     """How long a voxel's edge is at points, about: in warped space it grows with the distance.
 

@@ -9,13 +9,13 @@ from __future__ import annotations
 import math
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import msgspec
 import numpy as np
 import warp as wp
 
-from warpnerf.checks import InputError
+from warpnerf.checks import InputError, require_one_of
 from warpnerf.config import GROW_AT, Contraction, TrainConfig
 from warpnerf.config_json import config_to_json
 from warpnerf.fields.lattice import Lattice
@@ -31,6 +31,7 @@ from warpnerf.model.storage_kinds import DENSE, STORAGE_KINDS, StorageKind
 from warpnerf.rendering.field import Field
 from warpnerf.rendering.proposal import PARAMETER
 from warpnerf.rendering.steps import Steps
+from warpnerf.runs.compact import COMPACT, Precision, compact, expanded
 from warpnerf.runs.stored_proposal import StoredProposal, proposal_header
 from warpnerf.runs.tensor_file import read_tensors, refuse, write_tensors
 from warpnerf.runtime.parallel import Workers
@@ -57,22 +58,27 @@ WITHOUT_PLAN = "warpnerf-training-7"
 """What is written of a training that was read from such a file, and has not gone on."""
 
 
-def save_field(path: str | Path, field: Field) -> None:
+def save_field(path: str | Path, field: Field, precision: Precision = "float32") -> None:
     """Save a radiance field as a safetensors file, replacing an older one in a single step.
 
     Args:
         path: Of the file; its folder exists.
         field: What to write.
+        precision: float16 leaves out features of free space, too, see ``runs.compact``.
 
     Raises:
+        InputError: There is no such precision.
         OSError: The file cannot be written; an older one is then left as it was.
     """
-    write_tensors(path, {"format": FIELD} | _field_header(field), _field_tensors(field))
+    require_one_of("precision", precision, get_args(Precision))
+    kind, tensors = FIELD, _field_tensors(field)
+    if precision == "float16":
+        kind, tensors = COMPACT, compact(field, tensors)
+    write_tensors(path, {"format": kind} | _field_header(field), tensors)
 
 
 def save_checkpoint(path: str | Path, state: TrainingState) -> None:
-    """Save a checkpoint: all that a training needs to resume, replacing an older one in a single
-    step.
+    """Save a checkpoint: all that a training needs to resume, replacing an older one at once.
 
     Args:
         path: Of the file; its folder exists.
@@ -117,7 +123,7 @@ def load_field(path: str | Path, device: str = "cpu", threads: int | None = None
 
 
 def load_checkpoint(path: str | Path) -> TrainingState:
-    """Load a checkpoint: a training that ``save_checkpoint`` wrote, into the memory of the CPU.
+    """Load a checkpoint, a training that ``save_checkpoint`` wrote, into memory.
 
     Args:
         path: Of the file.
@@ -393,7 +399,7 @@ def _frustum_fits(header: _Header) -> bool:
 
 def _read(path: Path) -> tuple[_Header, dict[str, np.ndarray]]:
     """Header and tensors of a field or a training; what is not ours is refused."""
-    tree, tensors = read_tensors(path, (FIELD, TRAINING, *OLDER))
+    tree, tensors = read_tensors(path, (FIELD, COMPACT, TRAINING, *OLDER))
     kind = tree["format"]
     known = MODELS | FORMER_NAMES
     if isinstance(model := tree.get("model"), dict) and model.get("name") not in known:
@@ -418,7 +424,9 @@ def _read(path: Path) -> tuple[_Header, dict[str, np.ndarray]]:
         header = msgspec.convert(tree, _Header, dec_hook=decode)
     except (msgspec.ValidationError, TypeError) as error:
         refuse(path, f"its header does not fit: {error}")
-    if kind in OLDER:
+    if kind == COMPACT:
+        kind, tensors = FIELD, expanded(path, tensors, header.size)
+    elif kind in OLDER:
         kind = OLDER[kind]
         if "moments" in tensors and "values.moments" not in tensors:
             tensors["values.moments"] = tensors.pop("moments")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -14,6 +14,9 @@ from warpnerf.config_json import config_from_json, config_to_json, decode
 from warpnerf.media.pictures import picture_files
 from warpnerf.scenes.files import read_json
 from warpnerf.scenes.scene import Scene
+from warpnerf.scenes.split import Split
+
+Keep = Literal["field", "checkpoint"]
 
 
 class FoundExtent(msgspec.Struct, frozen=True):
@@ -41,6 +44,10 @@ class RunConfig(msgspec.Struct, frozen=True):
     """File names of the pictures in test/; None in runs of the version before, which wrote all."""
     found: FoundExtent | None = None
     """In place of the scene's own extent, where the cameras did not tell."""
+    keep: Keep = "field"
+    """What is kept of the training once it has finished: its field alone, or checkpoints too."""
+    split: Literal["all", "sector"] | int | list[str] | None = None
+    """What is withheld for testing, see ``load_scene``; None: what the scene says."""
 
     def as_trained(self, scene: Scene) -> Scene:
         """A scene, as it was read, with the extent that the run has found for it."""
@@ -68,6 +75,8 @@ def describe(
     config: TrainConfig,
     masks: str | None,
     found: bool,
+    keep: Keep = "field",
+    split: Split | None = None,
 ) -> dict[str, Any]:
     """What config.json says of a run that begins; some of it only for those who open it.
 
@@ -79,6 +88,8 @@ def describe(
         config: What was requested.
         masks: See ``RunConfig``.
         found: Whether short trainings found the scene's extent.
+        keep: See ``RunConfig``.
+        split: See ``RunConfig``.
     """
     extent = {"box_min": scene.box_min.tolist(), "box_max": scene.box_max.tolist()}
     content = {
@@ -88,6 +99,8 @@ def describe(
         "content_distance": content_distance,
         **extent,
         "notes": [*scene.warnings, *scene.notes],
+        "keep": keep,
+        "split": split,
         "pictures": pictures_of(scene),
         "train": config_to_json(config),
     }

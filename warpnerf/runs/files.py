@@ -14,6 +14,7 @@ import msgspec
 from warpnerf.checks import InputError
 from warpnerf.runs import lock
 from warpnerf.runs.config import RunConfig, read_run_config
+from warpnerf.runs.logs import CSV, EVENTS, TENSORBOARD
 from warpnerf.sfm.scene_files import (
     IN_RUN,
     NEXT_IN_RUN,
@@ -26,6 +27,8 @@ from warpnerf.writing import write_atomically
 
 SHEET = "test.png"
 """The picture of a few test views."""
+CURVES = "curves.png"
+"""The picture of the training's loss and PSNR."""
 PREVIOUS = "previous"
 """Folder for the files of an older run."""
 
@@ -133,7 +136,9 @@ def set_aside(folder: Path, in_use: Path) -> None:
         if scene is not None and record is not None:
             copy_written(scene, record, older / IN_RUN)
         for path in [*results(folder), *_by_products(folder)]:
-            path.replace(older / path.relative_to(folder))
+            place = older / path.relative_to(folder)
+            place.parent.mkdir(exist_ok=True)
+            path.replace(place)
     else:
         for path in _by_products(folder):
             path.unlink()
@@ -152,7 +157,7 @@ def discard_previous(folder: Path) -> None:
         if scene is not None:
             remove_posed(scene)
         (older / "config.json").unlink(missing_ok=True)
-        for emptied in (older / "test", older):
+        for emptied in (older / "test", older / TENSORBOARD, older):
             with suppress(OSError):  # not empty
                 emptied.rmdir()
 
@@ -169,7 +174,8 @@ def take_scene(folder: Path, source: str) -> None:
 
 def _by_products(folder: Path) -> list[Path]:
     """What else a run writes, but its configuration."""
-    files = [folder / "log.jsonl", folder / "metrics.json", folder / SHEET]
+    names = ("log.jsonl", CSV, CURVES, "metrics.json", SHEET)
+    files = [*(folder / name for name in names), *(folder / TENSORBOARD).glob(EVENTS)]
     files += [folder / "test" / name for name in _pictures(folder)]
     return [path for path in files if path.exists()]
 

@@ -18,7 +18,8 @@ NAME = ".lock"
 """Of the file that is locked; it holds the process's number."""
 WRITTEN = (
     *("config.json", "log.jsonl", "metrics.json", "test.png", "field.safetensors", "test", "scene"),
-    *("checkpoint-*.safetensors", "test/*.png"),
+    *("checkpoint-*.safetensors", "test/*.png", "log.csv", "curves.png", "tensorboard"),
+    "tensorboard/*",
 )
 """What a run writes or removes in its folder and in previous/, as patterns of names; folders before
 what lies in them."""

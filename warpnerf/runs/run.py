@@ -2,8 +2,10 @@
 
 config.json                  scene, downscale, masks, content distance used, training configuration
 log.jsonl                    a line for each progress report
-checkpoint-*.safetensors     the training after so many steps; the last two are kept
-field.safetensors            the trained field
+log.csv, tensorboard/        the same, by --log
+curves.png                   loss and PSNR over steps and seconds, once it is finished
+checkpoint-*.safetensors     the training after so many steps; the last two, until it is finished
+field.safetensors            the trained field, in half precision
 metrics.json                 figures of the test views
 test.png                     a few test views, to look at first: truth, rendering, depth, PSNR
 test/                        truth, rendering and depth of each test view, side by side
@@ -16,6 +18,7 @@ previous/                    a run that was replaced, until this one has saved s
 from __future__ import annotations
 
 import json
+import math
 import shlex
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -28,6 +31,8 @@ import msgspec
 from warpnerf.checks import InputError, cannot_write
 from warpnerf.config import TrainConfig
 from warpnerf.evaluation.evaluate import Evaluation
+from warpnerf.media.curves import CurvePoint, curves
+from warpnerf.media.pictures import write_png
 from warpnerf.rendering.field import Field
 from warpnerf.runs import files as run_files
 from warpnerf.runs import lock
@@ -37,11 +42,13 @@ from warpnerf.runs.checkpoint import (
     save_checkpoint,
     save_field,
 )
-from warpnerf.runs.config import RunConfig, describe
+from warpnerf.runs.config import Keep, RunConfig, describe
+from warpnerf.runs.logs import Log, LogKind, open_log, read_reports
 from warpnerf.runs.pictures import evaluate_into
 from warpnerf.runs.tensor_file import DamagedFileError
 from warpnerf.scenes.scene import Scene
-from warpnerf.training.state import Progress, TrainingState, differences
+from warpnerf.scenes.split import Split
+from warpnerf.training.state import MAY_GROW, Progress, TrainingState, differences
 from warpnerf.writing import write_atomically
 
 KEPT = 2
@@ -81,6 +88,12 @@ class Run:
     def last_step(self) -> int | None:
         """The step of the newest checkpoint; None where there is none."""
         return run_files.step_of(self.checkpoints[0]) if self.checkpoints else None
+
+    @property
+    def is_unlooked_at(self) -> bool:
+        """Whether it has finished and keeps its field alone, but its views were not looked at."""
+        measured = (self.folder / "metrics.json").exists()
+        return bool(self.results) and not self.checkpoints and not measured
 
     @staticmethod
     def require_free(folder: str | Path, overwrite: bool) -> None:
@@ -124,6 +137,8 @@ class Run:
         config: TrainConfig,
         masks: str | None = None,
         found: bool = False,
+        keep: Keep = "field",
+        split: Split | None = None,
     ) -> None:
         """Make the folder and write its configuration; an older run's files go to previous/.
 
@@ -133,7 +148,8 @@ class Run:
             InputError: The folder cannot be made or written to.
         """
         stored = run_files.stored_place(self.folder, source)
-        content = describe(scene, stored, downscale, content_distance, config, masks, found)
+        how = (downscale, content_distance, config, masks, found, keep, split)
+        content = describe(scene, stored, *how)
         try:
             (self.folder / "test").mkdir(parents=True, exist_ok=True)
             run_files.set_aside(self.folder, in_use=Path(source))
@@ -188,6 +204,12 @@ class Run:
             InputError: There is none, or it is not of this run's configuration.
         """
         config = self.read_config().train
+        if not self.checkpoints and self.results:
+            raise InputError(
+                f"{self.folder} has finished and keeps its field alone, from which no training "
+                "resumes; look at it by view, render, eval or export, or, to train it for longer, "
+                f"train again with --keep checkpoint --output {self.folder} --overwrite."
+            )
         if not self.checkpoints:
             raise InputError(
                 f"{self.folder} holds no checkpoint to resume from{self._aside()}; train again "
@@ -196,11 +218,78 @@ class Run:
             )
         path, state, notes = _first_whole(self.checkpoints, load_checkpoint)
         for name, here, there in differences(config, state.config):
+            if name in MAY_GROW:
+                continue  # it was saved before they were raised
             raise InputError(
                 f"{self.folder / 'config.json'}: train.{name} is {here}, but {path.name} was saved "
                 f"with {there}; correct it there, or train again."
             )
         return state, notes
+
+    def extend(self, config: TrainConfig) -> None:
+        """Let config.json say for how long a run is trained that is resumed for longer.
+
+        Its field is removed: the checkpoint that it is resumed from holds it.
+
+        Args:
+            config: With which it is resumed.
+
+        Raises:
+            InputError: It cannot be written.
+        """
+        path = self.folder / "config.json"
+        with self._writing():
+            content = json.loads(path.read_bytes())
+            content["train"] |= {name: getattr(config, name) for name in MAY_GROW}
+            write_atomically(path, (json.dumps(content, indent=2) + "\n").encode())
+            (self.folder / "field.safetensors").unlink(missing_ok=True)
+
+    def open_log(self, kind: LogKind) -> Log:
+        """Begin a log besides log.jsonl, or continue one.
+
+        Args:
+            kind: csv, tensorboard or wandb.
+
+        Raises:
+            InputError: It cannot be written, or its package is not installed.
+        """
+        with self._writing():
+            reports = read_reports(self.folder / "log.jsonl")
+            config = json.loads((self.folder / "config.json").read_bytes())
+            return open_log(kind, self.folder, reports, config)
+
+    def write_to(self, log: Log, progress: Progress) -> None:
+        """Append a report to a log besides log.jsonl.
+
+        Raises:
+            InputError: It cannot be written.
+        """
+        with self._writing():
+            log.write(progress)
+
+    def draw_curves(self, name: str) -> None:
+        """Draw curves.png, of all that log.jsonl has.
+
+        Args:
+            name: Of the scene.
+
+        Raises:
+            InputError: It cannot be written.
+        """
+        points = [
+            CurvePoint(
+                step=report["step"],
+                seconds=report["seconds"],
+                loss=report["loss"] * report["seen"],  # rays that are not drawn have none
+                psnr=report["psnr"] - 10.0 * math.log10(report["seen"]),
+                test_psnr=report["test_psnr"],
+            )
+            for report in read_reports(self.folder / "log.jsonl")
+        ]
+        if points:
+            title = f"{name}: {points[-1].step} steps in {points[-1].seconds:.0f} s"
+            with self._writing():
+                write_png(self.folder / run_files.CURVES, curves(points, title))
 
     def rewind_log(self, step: int) -> None:
         """Drop reports of steps that will be done again, and a line that a crash cut off.
@@ -215,16 +304,22 @@ class Run:
             if kept != lines:
                 write_atomically(path, b"".join(kept))
 
-    def save_field(self, field: Field) -> None:
-        """Write the field.
+    def save_field(self, field: Field, keep_checkpoints: bool = True) -> None:
+        """Write the field, in half precision.
+
+        Args:
+            field: The trained one.
+            keep_checkpoints: Else they are removed once the field is written whole.
 
         Raises:
-            InputError: It cannot be written.
+            InputError: It cannot be written; checkpoints are then left as they were.
         """
         with self._writing():
             run_files.sweep(self.folder)
-            save_field(self.folder / "field.safetensors", field)
+            save_field(self.folder / "field.safetensors", field, "float16")
             run_files.discard_previous(self.folder)
+            for path in [] if keep_checkpoints else self.checkpoints:
+                path.unlink()
 
     def load_field(self, device: str, threads: int | None) -> tuple[Field, list[str]]:
         """Read the field, or that of the newest checkpoint if training is not done.

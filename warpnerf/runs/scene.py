@@ -28,7 +28,12 @@ def load_run_scene(
     """
     path, masks = path_of(config, moved), masks_of(config, moved)
     scene = load_scene(
-        path, downscale=config.downscale, masks=masks, images="files", threads=threads
+        path,
+        downscale=config.downscale,
+        masks=masks,
+        images="files",
+        threads=threads,
+        split=config.split,
     )
     pictures = pictures_of(scene)
     if moved is not None and config.pictures is not None and pictures != config.pictures:

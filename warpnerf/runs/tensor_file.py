@@ -28,7 +28,7 @@ def write_tensors(path: str | Path, header: dict[str, Any], tensors: dict[str, n
     Args:
         path: Of the file; its folder exists.
         header: In JSON, with its format's name as "format".
-        tensors: Of float32, uint32 or uint8.
+        tensors: Of float32, float16, uint32 or uint8.
 
     Raises:
         OSError: The file cannot be written; an older one is then left as it was.
@@ -46,7 +46,8 @@ def _safetensors(
     Format: https://github.com/huggingface/safetensors#format. Wide types come first, so that all
     tensors are aligned.
     """
-    dtypes = {np.dtype(np.float32): "F32", np.dtype(np.uint32): "U32", np.dtype(np.uint8): "U8"}
+    names = {np.float32: "F32", np.float16: "F16", np.uint32: "U32", np.uint8: "U8"}
+    dtypes = {np.dtype(kind): name for kind, name in names.items()}
     table: dict[str, Any] = {"__metadata__": metadata}
     pieces, end = [], 0
     for name, tensor in sorted(tensors.items(), key=lambda item: (-item[1].itemsize, item[0])):

@@ -64,4 +64,4 @@ class Schedule:
             n_steps: Steps of the update.
         """
         begin = self.grow_at[grown - 1] if grown and self.restart_at_growth else 0.0
-        return float(self.decay ** (fraction - begin) * n_steps**0.25)
+        return float(self.decay ** max(0.0, fraction - begin) * n_steps**0.25)

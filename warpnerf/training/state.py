@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
 
@@ -24,6 +24,9 @@ from warpnerf.training.plan import OlderPlan, TrainingPlan
 MAY_CHANGE = ("device", "threads", "checkpoint_every")
 """Fields of TrainConfig that a resumed training may change: what is computed stays the same. The
 first two change how sums are rounded, and so the last bits."""
+
+MAY_GROW = ("steps", "time_limit")
+"""Fields that it may raise. Learning rates and growth then follow the longer schedule."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +53,10 @@ class Progress:
     """Share of the pixels, as blocks of them tell, that rays are drawn from, (0, 1]; those of all
     others meet nothing, and ``loss``, ``psnr`` and ``samples_per_ray`` do not count them."""
 
+    test_psnr: float | None = None
+    """Mean over a few test views, dB, where they were rendered since the last report
+    (``held_out.HeldOut``)."""
+
     @property
     def picture_psnr(self) -> float:
         """PSNR over whole pictures, dB: pixels that rays are not drawn from count as exact."""
@@ -60,9 +67,10 @@ class Progress:
         speed = self.step / max(self.seconds, 1e-6)
         size = " x ".join(str(n) for n in self.size)
         drawn = f" ({self.psnr:.2f} over {self.seen:.0%} of pixels)"
+        test = "" if self.test_psnr is None else f"test PSNR {self.test_psnr:.2f}  "
         return (
             f"step {self.step}  loss {self.loss:.5f}  "
-            f"PSNR {self.picture_psnr:.2f}{drawn if self.seen < 1.0 else ''}  "
+            f"PSNR {self.picture_psnr:.2f}{drawn if self.seen < 1.0 else ''}  {test}"
             f"grid {size}  {speed:.1f} steps/s"
         )
 
@@ -150,11 +158,26 @@ class TrainingState:
         Raises:
             InputError: A field that decides the result differs.
         """
-        for name, asked, begun in differences(config, self.config):
-            raise InputError(
-                f"{name} is {asked}, but the training to be resumed has {begun}, and the result "
-                f"would be that of neither; leave {name} as it was, or start a new training."
-            )
+        require_same_config(self.config, config)
+
+
+def require_same_config(begun: TrainConfig, asked: TrainConfig) -> None:
+    """Raise InputError unless a configuration would continue what another has begun.
+
+    Args:
+        begun: Of the training to be resumed.
+        asked: How to resume it; may differ in MAY_CHANGE, and raise MAY_GROW.
+
+    Raises:
+        InputError: A field that decides the result differs.
+    """
+    for name, new, old in differences(asked, begun):
+        if name in MAY_GROW and None not in (new, old) and new > old:
+            continue
+        raise InputError(
+            f"{name} is {new}, but the training to be resumed has {old}, and the result "
+            f"would be that of neither; leave {name} as it was, or start a new training."
+        )
 
 
 def differences(ours: TrainConfig, theirs: TrainConfig) -> Iterator[tuple[str, Any, Any]]:
@@ -188,6 +211,21 @@ def not_finite(what: str, plan: TrainingPlan, step: int) -> FloatingPointError:
         f"{what} not finite after step {step}; choose a content distance that fits "
         f"the scene, the clamped scaling, {smaller}or lower learning rates."
     )
+
+
+def require_finite(
+    values: Iterable[tuple[str, float | np.ndarray]], plan: TrainingPlan, step: int
+) -> None:
+    """Raise FloatingPointError where numbers of a training are not finite.
+
+    Args:
+        values: What they are, "... is" or "... are", and the numbers.
+        plan: Of the training.
+        step: After which they are looked at.
+    """
+    for what, numbers in values:
+        if not np.isfinite(numbers).all():
+            raise not_finite(what, plan, step)
 
 
 def scene_digest(scene: Scene) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from warpnerf.checks import require_kind
 from warpnerf.config import TrainConfig
@@ -13,6 +13,7 @@ from warpnerf.rendering.field import Field
 from warpnerf.runtime.progress import ProgressBar, has_bar
 from warpnerf.scenes.scene import Scene
 from warpnerf.training.coarse import prepare_trainer
+from warpnerf.training.held_out import HeldOut, require_eval
 from warpnerf.training.state import Progress, TrainingState
 
 
@@ -38,6 +39,7 @@ def train(
     on_checkpoint: Callable[[TrainingState], None] | None = None,
     resume: TrainingState | None = None,
     progress: bool | None = None,
+    eval_every: int | None = None,
 ) -> TrainResult:
     """Train a voxel grid on a scene's training views.
 
@@ -48,13 +50,16 @@ def train(
     Args:
         scene: From ``load_scene``.
         config: How to train; None: as the training to be resumed, or else the preset "fast".
-        on_progress: Called every ``trainer.REPORT_EVERY`` steps and at the end.
+        on_progress: Called every ``trainer.REPORT_EVERY`` steps and at the end with a ``Progress``.
         on_checkpoint: Called every ``config.checkpoint_every`` seconds and at the end with what
             ``save_checkpoint`` takes, whose arrays the next update changes.
         resume: Where to resume, from ``load_checkpoint``. On the CPU and with the same number of
             threads, the result is that of a training that was never interrupted, bit for bit.
         progress: Whether to show a progress bar; None: in a terminal or a notebook, where
             ``on_progress`` is not given.
+        eval_every: Steps from one look at a few test views to the next; reports then have their
+            mean PSNR as ``test_psnr``. It takes no time of a time limit, and changes no bit of the
+            result. None: they are not looked at.
 
     Returns:
         The field, and how training ended.
@@ -71,21 +76,29 @@ def train(
         require_kind(config, TrainConfig, "train wants a configuration", way_out)
     if config is None:
         config = PRESETS["fast"] if resume is None else resume.config
+    if eval_every is not None:
+        require_eval(scene, eval_every)
     if progress is None:
         progress = on_progress is None and has_bar()
+    last: Progress | None = None
     with ProgressBar("first step") if progress else nullcontext() as bar:
 
         def report(found: Progress) -> None:
+            nonlocal last
+            last = found if held_out is None else held_out.added_to(found)
             if bar is not None:
-                bar.report(found.fraction, str(found))
+                latest = None if held_out is None else held_out.psnr
+                bar.report(found.fraction, str(replace(last, test_psnr=latest)))
             if on_progress is not None:
-                on_progress(found)
+                on_progress(last)
 
         trainer = prepare_trainer(scene, config, resume)
-        last = trainer.run(report, on_checkpoint)
+        held_out = None if eval_every is None else HeldOut(trainer, eval_every)
+        between = None if held_out is None else held_out.after_update
+        end = trainer.run(report, on_checkpoint, between=between)
     return TrainResult(
         field=trainer.field(),
         content_distance=trainer.plan.content_distance,
-        progress=last,
+        progress=last or end,
         scene=trainer.scene,
     )

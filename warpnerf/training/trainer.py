@@ -39,7 +39,7 @@ from warpnerf.training.growth import (
 from warpnerf.training.optim import adam_step, first_states
 from warpnerf.training.plan import TrainingPlan, resolve
 from warpnerf.training.resampling import first_proposal, grown_proposal, resampling_of
-from warpnerf.training.state import Progress, TrainingState, not_finite, scene_digest
+from warpnerf.training.state import Progress, TrainingState, require_finite, scene_digest
 from warpnerf.training.warmup import training_kernels
 
 REPORT_EVERY = 25
@@ -51,8 +51,8 @@ so densities must have had time to show."""
 
 
 Reduce = Callable[[Gradients], None]
-"""Changes the gradients of an update in place, before they are regularised; flags are then those of
-all tiles that hold any."""
+"""Changes an update's gradients before they are regularised; flags are then those of all tiles that
+hold any."""
 
 
 def no_reduction(gradients: Gradients) -> None:
@@ -156,10 +156,13 @@ class Trainer:
         on_checkpoint: Callable[[TrainingState], None] | None = None,
         stop: Callable[[], bool] = lambda: False,
         between: Callable[[], None] | None = None,
+        *,
+        checkpoint_when_done: bool = True,
     ) -> Progress:
         """Update until the training is done, or ``stop`` says so; callbacks are those of ``train``.
 
-        ``between`` is called after each update, and its time is not counted as training.
+        ``between`` is called after each update, and its time is not counted as training. Without
+        ``checkpoint_when_done``, ``on_checkpoint`` is called at the end only where it was stopped.
 
         Raises:
             FloatingPointError: The loss, or a value in the grid, is no longer a finite number.
@@ -179,8 +182,11 @@ class Trainer:
             if on_checkpoint is not None and late:
                 on_checkpoint(self.state())
                 saved_step, saved_at = self.steps_done, time.monotonic()
-        if on_checkpoint is not None and self.steps_done > saved_step:
+        unsaved = self.steps_done > saved_step
+        if on_checkpoint is not None and unsaved and (checkpoint_when_done or self.fraction < 1.0):
             on_checkpoint(self.state())
+        else:
+            self._require_finite()
         return self.report()
 
     @property
@@ -248,18 +254,13 @@ class Trainer:
             self._resampling.step(self.optimiser, *how)
 
     def report(self) -> Progress:
-        """Where training stands.
-
-        Raises:
-            FloatingPointError: The loss is not finite.
-        """
+        """Where training stands; FloatingPointError where the loss is not finite."""
         if self._progress is not None and self._progress.step == self.steps_done:
             return self._progress
         n_rays = self._pass.n_rays
         error = float(self._pass.error.numpy()[:n_rays].mean())
         loss = float(self._pass.loss.numpy()[:n_rays].mean())
-        if not math.isfinite(loss):
-            raise not_finite("the loss is", self.plan, self.steps_done)
+        require_finite([("the loss is", loss)], self.plan, self.steps_done)
         self._progress = Progress(
             step=self.steps_done,
             fraction=self.fraction,
@@ -281,10 +282,7 @@ class Trainer:
                 from.
         """
         progress = self.report()
-        for parameter in self.parameters():
-            if not np.isfinite(parameter.values.numpy()).all():
-                what = f"{parameter.name} of the model are"
-                raise not_finite(what, self.plan, self.steps_done)
+        self._require_finite()
         if self._scene_digest is None:  # not before: it takes as long as reading all photographs
             self._scene_digest = scene_digest(self._given)
         threads = self.config.threads if self.workers.device.is_cuda else self.workers.count
@@ -298,6 +296,10 @@ class Trainer:
             field=self.field(),
             optimiser=self.optimiser,
         )
+
+    def _require_finite(self) -> None:
+        values = ((f"{p.name} of the model are", p.values.numpy()) for p in self.parameters())
+        require_finite(values, self.plan, self.steps_done)
 
     def _restore(self, state: TrainingState) -> None:
         """Take over copies of a state's arrays, and where it stands."""
@@ -375,7 +377,7 @@ class Trainer:
     def _grow(self, fraction: float) -> None:
         """Carry field and optimiser over to more voxels, once the schedule says so."""
         grown = self.schedule.growths(fraction)
-        if grown == self._grown or self.steps_done < FIRST_LOOK:
+        if grown <= self._grown or self.steps_done < FIRST_LOOK:
             return
         config, box, nodes = self.config, self._tight_box(), self.plan.stages[grown].nodes
         # What holds the old arrays gives their memory back before more is requested.

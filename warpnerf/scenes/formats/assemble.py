@@ -30,6 +30,7 @@ from warpnerf.scenes.images.masks import (
 from warpnerf.scenes.images.photographs import Keeping, Photograph, keep
 from warpnerf.scenes.images.transparency import show_an_object, shows_nothing
 from warpnerf.scenes.scene import Scene, View
+from warpnerf.scenes.split import Split, withheld
 
 LITTLE = 0.1
 """Share of the pixels that masks leave, below which they are likely to be inverted."""
@@ -78,6 +79,7 @@ def assemble(
     masks: Path | None,
     keeping: Keeping,
     points: Points | None = None,
+    withhold: Split | None = None,
 ) -> Scene:
     """Read the images and make the scene.
 
@@ -92,12 +94,18 @@ def assemble(
         masks: Folder of masks, which take the place of those that frames have.
         keeping: Where the images' pixels are kept, and how many threads read them.
         points: Of the scene's surfaces, where there are some; tracks go by names of frames.
+        withhold: What for testing, in place of ``splits``.
 
     Raises:
         InputError: An image, a mask, the split or the placement of the cameras is of no use.
     """
     frames = sorted(frames, key=lambda frame: frame.name)
-    complete, notes = complete_splits(file, [frame.name for frame in frames], splits)
+    names = [frame.name for frame in frames]
+    if withhold is None:
+        complete, notes = complete_splits(file, names, splits)
+    else:
+        test, note = withheld(withhold, names, [frame.c2w for frame in frames])
+        complete, notes = {"train": set(names) - test, "test": test}, [note]
     used = set().union(*complete.values())
     frames = [frame for frame in frames if frame.name in used]
     if masks is not None:

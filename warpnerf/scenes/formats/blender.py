@@ -14,6 +14,7 @@ from warpnerf.scenes.formats.assemble import Frame, assemble
 from warpnerf.scenes.formats.transforms import read_frames
 from warpnerf.scenes.images.photographs import KEEPING, Keeping
 from warpnerf.scenes.scene import Scene
+from warpnerf.scenes.split import Split
 
 SPLITS = ("train", "val", "test")
 
@@ -29,6 +30,7 @@ def load_blender(
     downscale: int = 1,
     masks: Path | None = None,
     keeping: Keeping = KEEPING,
+    withhold: Split | None = None,
 ) -> Scene:
     """Load a scene from transforms_train.json and its siblings.
 
@@ -39,6 +41,7 @@ def load_blender(
         downscale: Edge of the blocks of pixels that become one.
         masks: Folder of masks for all photographs.
         keeping: Where the images' pixels are kept.
+        withhold: What for testing; None: as the capture says.
 
     Raises:
         InputError: Something in the files or the images is wrong; the message names it.
@@ -65,4 +68,5 @@ def load_blender(
         downscale=downscale,
         masks=masks,
         keeping=keeping,
+        withhold=withhold,
     )

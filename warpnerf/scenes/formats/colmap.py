@@ -45,6 +45,7 @@ from warpnerf.scenes.images.images import image_size
 from warpnerf.scenes.images.masks import mask_in, without_masks
 from warpnerf.scenes.images.photographs import KEEPING, Keeping
 from warpnerf.scenes.scene import Scene
+from warpnerf.scenes.split import Split
 
 MODEL_FOLDERS = ("sparse", "colmap/sparse", ".")
 """Where models are looked for in a scene's folder, in this order: in 0, 1, ... there, and there."""
@@ -170,6 +171,7 @@ def load_colmap(
     downscale: int = 1,
     masks: Path | None = None,
     keeping: Keeping = KEEPING,
+    withhold: Split | None = None,
 ) -> Scene:
     """Load a scene from a sparse model.
 
@@ -181,6 +183,7 @@ def load_colmap(
         downscale: Edge of the blocks of pixels that become one.
         masks: Folder of masks for all photographs.
         keeping: Where the images' pixels are kept.
+        withhold: What for testing; None: as the capture says.
 
     Returns:
         The scene; distances are the model's.
@@ -257,6 +260,7 @@ def load_colmap(
         downscale=downscale,
         masks=masks,
         keeping=keeping,
+        withhold=withhold,
         points=read_points(model, {image.number: image.name for image in images}, folder),
     )
     return replace(scene, notes=(*notes, *scene.notes))

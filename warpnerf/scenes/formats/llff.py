@@ -20,6 +20,7 @@ from warpnerf.scenes.formats.assemble import Frame, assemble
 from warpnerf.scenes.images.arrays import read_npy
 from warpnerf.scenes.images.photographs import KEEPING, Keeping
 from warpnerf.scenes.scene import Scene
+from warpnerf.scenes.split import Split
 
 FILE = "poses_bounds.npy"
 ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".ppm")
@@ -31,6 +32,7 @@ def load_llff(
     downscale: int = 1,
     masks: Path | None = None,
     keeping: Keeping = KEEPING,
+    withhold: Split | None = None,
 ) -> Scene:
     """Load a scene from poses_bounds.npy. Every 8th photograph is for testing.
 
@@ -39,6 +41,7 @@ def load_llff(
         downscale: Edge of the blocks of pixels that become one.
         masks: Folder of masks for all photographs.
         keeping: Where the images' pixels are kept.
+        withhold: What for testing; None: as the capture says.
 
     Returns:
         The scene; distances are the file's.
@@ -94,4 +97,5 @@ def load_llff(
         downscale=downscale,
         masks=masks,
         keeping=keeping,
+        withhold=withhold,
     )

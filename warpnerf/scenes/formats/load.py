@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import re
 import shlex
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 from warpnerf.checks import InputError, require_one_of
 from warpnerf.runtime.memory import require_threads
@@ -18,6 +20,7 @@ from warpnerf.scenes.formats.npz import load_npz, single_npz
 from warpnerf.scenes.formats.transforms import load_transforms
 from warpnerf.scenes.images.photographs import Keeping, Place
 from warpnerf.scenes.scene import Scene
+from warpnerf.scenes.split import Split, checked_split, withheld
 
 __all__ = ["load_scene"]
 
@@ -33,6 +36,7 @@ def load_scene(
     images: Place = "auto",
     image_folder: Path | None = None,
     threads: int | None = None,
+    split: Split | Sequence[str] | None = None,
 ) -> Scene:
     """Load a scene: photographs, cameras, split, and the extent estimated from the cameras.
 
@@ -51,6 +55,9 @@ def load_scene(
         image_folder: For the file on disk; None: a folder for large temporary files.
         threads: That read photographs; None: one per usable core. Built-in scenes are drawn by all
             cores.
+        split: What is withheld for testing: "all": nothing, all photographs are trained on; a
+            number: every so-manieth, by name from the first; "sector": an eighth, of cameras side
+            by side; names of photographs: these. None: as the scene says, else every 8th.
 
     Returns:
         The scene; distances are the file's own.
@@ -64,10 +71,11 @@ def load_scene(
     require_one_of("images", images, get_args(Place))
     if threads is not None:
         require_threads(threads)
+    split = None if split is None else checked_split(split)
     if isinstance(path, str) and path.startswith(BUILTIN):
         if masks is not None:
             raise InputError(f"--masks {masks}: {path} takes no masks; leave them out.")
-        return _load_builtin(path.removeprefix(BUILTIN), downscale)
+        return _with_split(_load_builtin(path.removeprefix(BUILTIN), downscale), split)
     keeping = Keeping(place=images, folder=image_folder, threads=threads)
     path = Path(path)
     masks = None if masks is None else Path(masks)
@@ -76,37 +84,53 @@ def load_scene(
         raise InputError(
             f"{path}: does not exist; give a scene's folder, or a built-in scene ({known})."
         )
+    how: dict[str, Any] = {
+        "downscale": downscale,
+        "masks": masks,
+        "keeping": keeping,
+        "withhold": split,
+    }
     if path.is_dir():
-        return _load_folder(path, downscale, masks, keeping)
+        return _load_folder(path, how)
     if path.name in [split_file(split) for split in SPLITS]:
-        return load_blender(path.parent, downscale=downscale, masks=masks, keeping=keeping)
+        return load_blender(path.parent, **how)
     if re.fullmatch(r"transforms.*\.json", path.name):
-        return load_transforms(path, downscale=downscale, masks=masks, keeping=keeping)
+        return load_transforms(path, **how)
     if path.name == llff.FILE:
-        return llff.load_llff(path.parent, downscale=downscale, masks=masks, keeping=keeping)
+        return llff.load_llff(path.parent, **how)
     if path.suffix == ".npz":
-        return load_npz(path, downscale=downscale, masks=masks, keeping=keeping)
+        return load_npz(path, **how)
     if path.suffix.lower() in VIDEOS:
         command = pose_command(shlex.quote(str(path)))
         raise InputError(f"{path}: is a video, not a scene; make one of it by {command}.")
     raise InputError(f"{path}: is not a scene; give its folder or a transforms*.json in it.")
 
 
-def _load_folder(folder: Path, downscale: int, masks: Path | None, keeping: Keeping) -> Scene:
+def _with_split(scene: Scene, split: Split | None) -> Scene:
+    """A scene of which other views are withheld for testing."""
+    if split is None:
+        return scene
+    names = [view.name for view in scene.views]
+    test, note = withheld(split, names, [view.camera.c2w for view in scene.views])
+    splits: dict[str, tuple[int, ...]] = {"train": (), "test": ()}
+    for index, name in enumerate(names):
+        splits["test" if name in test else "train"] += (index,)
+    return replace(scene, splits=splits, notes=(note, *scene.notes))
+
+
+def _load_folder(folder: Path, how: dict[str, Any]) -> Scene:
     if exists(folder / split_file("train")):
-        return load_blender(folder, downscale=downscale, masks=masks, keeping=keeping)
+        return load_blender(folder, **how)
     if exists(folder / "transforms.json"):
-        return load_transforms(
-            folder / "transforms.json", downscale=downscale, masks=masks, keeping=keeping
-        )
+        return load_transforms(folder / "transforms.json", **how)
     model = find_model(folder)
     if model is not None:
-        return load_colmap(model, downscale=downscale, masks=masks, keeping=keeping)
+        return load_colmap(model, **how)
     if exists(folder / llff.FILE):
-        return llff.load_llff(folder, downscale=downscale, masks=masks, keeping=keeping)
+        return llff.load_llff(folder, **how)
     archive = single_npz(folder)
     if archive is not None and not is_unposed(folder):
-        return load_npz(archive, downscale=downscale, masks=masks, keeping=keeping)
+        return load_npz(archive, **how)
     raise InputError(
         f"{folder}: no scene found: {what_is_there(folder)}. A scene has {split_file('train')} "
         "(Blender), transforms.json (instant-ngp, nerfstudio), sparse/0 (COLMAP), "

@@ -26,6 +26,7 @@ from warpnerf.scenes.images.arrays import Header, read_header, read_numbers
 from warpnerf.scenes.images.images import MAX_PIXELS
 from warpnerf.scenes.images.photographs import KEEPING, Keeping
 from warpnerf.scenes.scene import Scene
+from warpnerf.scenes.split import Split
 
 ROUNDING = 1e-3
 """How far images may be out of [0, 1]."""
@@ -45,6 +46,7 @@ def load_npz(
     downscale: int = 1,
     masks: Path | None = None,
     keeping: Keeping = KEEPING,
+    withhold: Split | None = None,
 ) -> Scene:
     """Load a scene from an .npz file. Every 8th image is for testing.
 
@@ -53,6 +55,7 @@ def load_npz(
         downscale: Edge of the blocks of pixels that become one.
         masks: Folder of masks for all photographs, which are called 000, 001, ...
         keeping: Where the images' pixels are kept.
+        withhold: What for testing; None: as the capture says.
 
     Returns:
         The scene; distances are those of the poses.
@@ -92,6 +95,7 @@ def load_npz(
         downscale=downscale,
         masks=masks,
         keeping=keeping,
+        withhold=withhold,
     )
 
 

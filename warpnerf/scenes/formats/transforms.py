@@ -25,6 +25,7 @@ from warpnerf.scenes.images.depths import DEFAULT_UNIT, DepthFile
 from warpnerf.scenes.images.masks import Mask
 from warpnerf.scenes.images.photographs import KEEPING, Keeping
 from warpnerf.scenes.scene import Scene
+from warpnerf.scenes.split import Split
 
 IGNORED = {
     "white_transparent": "white stays opaque",
@@ -72,6 +73,7 @@ def load_transforms(
     downscale: int = 1,
     masks: Path | None = None,
     keeping: Keeping = KEEPING,
+    withhold: Split | None = None,
 ) -> Scene:
     """Load a scene from a transforms.json.
 
@@ -84,6 +86,7 @@ def load_transforms(
         downscale: Edge of the blocks of pixels that become one.
         masks: Folder of masks for all photographs.
         keeping: Where the images' pixels are kept.
+        withhold: What for testing; None: as the capture says.
 
     Raises:
         InputError: Something in the file or its images is wrong; the message names it.
@@ -124,6 +127,7 @@ def load_transforms(
         downscale=downscale,
         masks=masks,
         keeping=keeping,
+        withhold=withhold,
         points=points,
     )
 

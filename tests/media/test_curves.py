@@ -1,0 +1,42 @@
+"""The picture of a training's curves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from warpnerf.media.curves import _TEST, SIZE, CurvePoint, _round_numbers, _running_mean, curves
+
+
+def point(step: int, test: float | None = None) -> CurvePoint:
+    return CurvePoint(step=step, seconds=0.5 * step, loss=1.0 / step, psnr=20.0, test_psnr=test)
+
+
+def red(picture: np.ndarray) -> int:
+    return int((picture == _TEST).all(axis=-1).sum())
+
+
+def test_test_views_are_there_where_they_were_measured() -> None:
+    points = [point(step) for step in range(1, 100)]
+    plain = curves(points, "room")
+    tested = curves([*points, point(100, 18.0)], "room")
+    assert plain.shape == tested.shape == (SIZE[1], SIZE[0], 3) and plain.dtype == np.uint8
+    assert red(plain) == 0 and red(tested) > 40
+
+
+def test_a_single_report_is_drawn() -> None:
+    assert curves([CurvePoint(step=0, seconds=0.0, loss=0.0, psnr=0.0)], "room").std() > 5
+
+
+def test_the_mean_runs_through_the_middle() -> None:
+    line = np.linspace(0.0, 1.0, 200)
+    noise = 0.1 * (-1.0) ** np.arange(200)
+    np.testing.assert_allclose(_running_mean(line), line, atol=1e-12)
+    assert np.abs(_running_mean(line + noise) - line)[10:-10].max() < 0.02
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.0, 4000.0), (17.3, 31.2), (-3.0, -2.9), (0.0, 1e-9)])
+def test_round_numbers(low: float, high: float) -> None:
+    numbers = _round_numbers(low, high)
+    assert 2 <= len(numbers) <= 8
+    assert min(numbers) >= low - 1e-9 and max(numbers) <= high + 1e-9
