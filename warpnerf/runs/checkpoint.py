@@ -164,8 +164,7 @@ def load_checkpoint(path: str | Path) -> TrainingState:
         refuse(path, "its configuration names another model than its field")
     if plan.config.field != field.storage.kind:
         refuse(path, "its configuration names another storage than its field")
-    sampler = plan.config.sampler if isinstance(plan, OlderPlan) else plan.sampler
-    if sampler != (MARCHED if field.proposal is None else field.proposal.kind):
+    if plan.sampler != (MARCHED if field.proposal is None else field.proposal.kind):
         refuse(path, "its configuration names another sampler than its field")
     grown = training.grown
     if header.format == "warpnerf-training-6":

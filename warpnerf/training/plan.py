@@ -309,6 +309,11 @@ class OlderPlan:
     """None: they are all that one."""
     reach: float
 
+    @property
+    def sampler(self) -> SamplerKind:
+        """Where rays are sampled: nothing was auto."""
+        return self.config.sampler
+
     def completed(self, scene: Scene, space: Space) -> TrainingPlan:
         """The plan that it was part of, as far as it still matters.
 
