@@ -32,9 +32,9 @@ PARAMETERS = {
     "SIMPLE_DIVISION": (-0.15,),
     "DIVISION": (0.05,),
     "EUCM": (0.6, 1.1),
-    "BROWN": (-0.05, 0.02, -0.01, 0.003, 1e-3, -5e-4),
-    "BROWN_FISHEYE": (-0.05, 0.02, -0.01, 0.003, 1e-3, -5e-4),
-    "BROWN_EQUISOLID": (-0.05, 0.02, -0.01, 0.003, 1e-3, -5e-4),
+    "BROWN": (-0.05, 0.02, -0.01, 0.003, 1e-3, -5e-4, 0.1, 0.2),
+    "BROWN_FISHEYE": (-0.05, 0.02, -0.01, 0.003, 1e-3, -5e-4, 0.1, 0.2),
+    "BROWN_EQUISOLID": (-0.05, 0.02, -0.01, 0.003, 1e-3, -5e-4, 0.1, 0.2),
 }
 
 # img_from_cam of pycolmap 4.2.1 for (0.3, -0.2, 1) and (-0.5, 0.7, 1), focal length 1 at (0, 0).
@@ -57,12 +57,13 @@ def test_positions_are_those_of_colmap(model: str) -> None:
 
 def test_positions_are_those_of_metashape() -> None:
     """By hand from the equations of its manual: p1 is with r^2 + 2 x^2, and of p2 the other way."""
-    k1, k2, k3, k4, p1, p2 = PARAMETERS["BROWN"]
+    k1, k2, k3, k4, p1, p2, p3, p4 = PARAMETERS["BROWN"]
     x, y = 0.4, -0.3
     r2 = x * x + y * y
     radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3 + k4 * r2**4
-    u = x * radial + p1 * (r2 + 2 * x * x) + 2 * p2 * x * y
-    v = y * radial + p2 * (r2 + 2 * y * y) + 2 * p1 * x * y
+    more = 1 + p3 * r2 + p4 * r2**2
+    u = x * radial + (p1 * (r2 + 2 * x * x) + 2 * p2 * x * y) * more
+    v = y * radial + (p2 * (r2 + 2 * y * y) + 2 * p1 * x * y) * more
     found = ForeignLens("BROWN", PARAMETERS["BROWN"], skew=0.01).project(np.array([[x, y, 1.0]]))
     np.testing.assert_allclose(found, [[u + 0.01 * v, v]], atol=1e-15)
     r = np.hypot(x, y)
@@ -88,9 +89,9 @@ def test_lenses_without_distortion_are_a_pinhole_or_a_fisheye() -> None:
 
 def test_a_fisheye_sees_behind_itself_and_a_plane_does_not() -> None:
     behind = np.array([[1.0, 0.0, -1.0]])
-    found = ForeignLens("BROWN_FISHEYE", (0.0,) * 6).project(behind)
+    found = ForeignLens("BROWN_FISHEYE", (0.0,) * 8).project(behind)
     np.testing.assert_allclose(found, [[0.75 * np.pi, 0.0]])
-    assert np.isnan(ForeignLens("BROWN", (0.0,) * 6).project(behind)).all()
+    assert np.isnan(ForeignLens("BROWN", (0.0,) * 8).project(behind)).all()
 
 
 @pytest.mark.parametrize("model", PARAMETERS)
@@ -184,7 +185,7 @@ def test_masks_and_alpha_and_reduction_follow(tmp_path: Path) -> None:
     assert np.abs(small.image - blocks).mean() < 1.0  # reduced first, then moved
     assert small.mask is not None
     whole = view.mask.reshape(36, 2, 48, 2).all(axis=(1, 3))
-    assert np.mean(small.mask != whole) < 0.02
+    assert np.mean(small.mask != whole) < 0.04
     kept = load_scene(folder, images="files").views[1]
     assert np.array_equal(kept.image, view.image)
 

@@ -168,12 +168,13 @@ def _eucm(x: Any, y: Any, p: tuple[float, ...]) -> tuple[Any, Any]:
 
 def _brown(x: Any, y: Any, p: tuple[float, ...]) -> tuple[Any, Any]:
     """Brown's polynomial up to r^8, with the tangential terms of Metashape and RealityCapture."""
-    k1, k2, k3, k4, p1, p2 = p
+    k1, k2, k3, k4, p1, p2, p3, p4 = p
     r2 = x * x + y * y
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
+    grown = 1.0 + r2 * (p3 + r2 * p4)
     return (
-        x * radial + p1 * (r2 + 2.0 * x * x) + 2.0 * p2 * x * y,
-        y * radial + p2 * (r2 + 2.0 * y * y) + 2.0 * p1 * x * y,
+        x * radial + grown * (p1 * (r2 + 2.0 * x * x) + 2.0 * p2 * x * y),
+        y * radial + grown * (p2 * (r2 + 2.0 * y * y) + 2.0 * p1 * x * y),
     )
 
 
@@ -191,9 +192,9 @@ MODELS = {
     "SIMPLE_DIVISION": Model(_division, 1),
     "DIVISION": Model(_division, 1),
     "EUCM": Model(_eucm, 2),
-    "BROWN": Model(_brown, 6, tangential=lambda p: (p[5], p[4])),
-    "BROWN_FISHEYE": Model(_brown, 6, fisheye=True),
-    "BROWN_EQUISOLID": Model(_equisolid, 6, fisheye=True),
+    "BROWN": Model(_brown, 8, tangential=lambda p: (p[5], p[4])),
+    "BROWN_FISHEYE": Model(_brown, 8, fisheye=True),
+    "BROWN_EQUISOLID": Model(_equisolid, 8, fisheye=True),
 }
 
 

@@ -1,0 +1,437 @@
+"""Exports of Polycam, Record3D, Metashape and RealityCapture: what is read is what was meant."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.scenes.test_colmap import assert_same
+from tests.support.program_exports import (
+    HEADER,
+    SENSOR,
+    write_metashape,
+    write_pictures,
+    write_polycam,
+    write_reality,
+    write_record3d,
+)
+from tests.support.tiny_scenes import picture, ring, write_transforms
+from warpnerf.checks import InputError
+from warpnerf.scenes.formats.load import load_scene
+from warpnerf.scenes.formats.reality import _pose
+from warpnerf.scenes.formats.survey import survey
+from warpnerf.scenes.scene import Scene
+
+WRITERS: dict[str, Callable[[Path], Path]] = {
+    "Polycam": write_polycam,
+    "Record3D": write_record3d,
+    "Metashape": write_metashape,
+    "RealityCapture": write_reality,
+}
+
+
+def expected(folder: Path, **changes: float) -> Scene:
+    write_transforms(folder)
+    file = folder / "transforms.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | changes))
+    return load_scene(folder)
+
+
+@pytest.mark.parametrize("program", WRITERS)
+def test_the_scene_is_that_of_transforms_json(tmp_path: Path, program: str) -> None:
+    there = WRITERS[program](tmp_path / "b")
+    scene = load_scene(tmp_path / "b")
+    other = {"fl_y": 10.0} if program == "RealityCapture" else {}  # it has one focal length
+    assert_same(scene, expected(tmp_path / "a", **other))
+    name = there.relative_to(tmp_path / "b").as_posix()
+    assert survey(tmp_path / "b").format == f"{program} ({name})"
+    if there.is_file():
+        assert_same(load_scene(there), scene)
+        assert survey(there).format == f"{program} ({name})"
+
+
+@pytest.mark.parametrize("program", WRITERS)
+def test_another_form_is_read_first_and_this_one_mentioned(tmp_path: Path, program: str) -> None:
+    WRITERS[program](tmp_path / "b")
+    (tmp_path / "b/images").mkdir(exist_ok=True)
+    write_pictures(tmp_path / "b/images", [f"{k:03d}.png" for k in range(4)])
+    write_transforms(tmp_path / "a")
+    (tmp_path / "a/transforms.json").rename(tmp_path / "b/transforms.json")
+    scene = load_scene(tmp_path / "b")
+    assert any(
+        note.startswith(f"also in the folder, and not read: {program} (") for note in scene.notes
+    )
+    assert survey(tmp_path / "b").format == "instant-ngp / nerfstudio (transforms.json)"
+
+
+@pytest.mark.parametrize("program", WRITERS)
+def test_photographs_without_cameras_and_cameras_without_photographs(
+    tmp_path: Path, program: str
+) -> None:
+    there = WRITERS[program](tmp_path)
+    first = sorted(path for path in tmp_path.rglob("*.png") if "depth" not in path.parts)[-1]
+    first.rename(first.with_name("unknown.png"))
+    scene = load_scene(tmp_path)
+    assert len(scene.views) == 3
+    said = "\n".join(scene.warnings)
+    assert f"{there.name}: left out 1 of 4 cameras for want of a photograph (first: " in said
+    assert f"1 of 4 photographs have no camera in {there.name} (first: " in said
+    for path in tmp_path.rglob("*.png"):
+        path.unlink()
+    with pytest.raises(InputError, match=r"none of its 4 photographs is in .*; put them there"):
+        load_scene(tmp_path)
+
+
+# --- Polycam ------------------------------------------------------------------------------------
+
+
+def test_polycam_depth_is_in_millimetres(tmp_path: Path) -> None:
+    write_polycam(tmp_path)
+    view = load_scene(tmp_path).views[2]
+    assert view.depth is not None
+    along = np.asarray(view.depth)[3, 4]
+    assert along == pytest.approx(1.002, rel=0.01)  # the pixel beside the principal point
+    assert np.asarray(view.depth).shape == (6, 8)
+
+
+def test_polycam_depth_of_another_shape_is_left_out(tmp_path: Path) -> None:
+    write_polycam(tmp_path)
+    Image.fromarray(np.ones((9, 4), np.uint16)).save(tmp_path / "keyframes/depth/102.png")
+    scene = load_scene(tmp_path)
+    assert [view.depth is None for view in scene.views] == [False, False, True, False]
+    assert any("left out 1 depth maps of another shape" in warning for warning in scene.warnings)
+
+
+def test_polycam_corrected_cameras_come_first(tmp_path: Path) -> None:
+    write_polycam(tmp_path, corrected=False)
+    plain = load_scene(tmp_path)
+    assert plain.views[0].name == "keyframes/images/100.png"
+    write_polycam(tmp_path / "b")
+    (tmp_path / "b/keyframes/corrected_cameras").rename(tmp_path / "keyframes/corrected_cameras")
+    assert load_scene(tmp_path).views[0].name == "keyframes/images/100.png"
+    assert survey(tmp_path).format == "Polycam (keyframes/corrected_cameras)"
+    assert survey(tmp_path / "keyframes").format == "Polycam (corrected_cameras)"
+    assert_same(load_scene(tmp_path / "keyframes"), plain)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"fx": 0}, r"101.json: \$.fx: 0 is no focal length in pixels; export"),
+        ({"width": 8.5}, r"101.json: \$.width: 8.5 is no size in pixels; export"),
+        ({"t_00": 7.0}, r"101.json: t_00 to t_23: "),
+        ({"fy": "wide"}, r"101.json: expected `float`, got `str`, at `\$.fy`; correct"),
+        ({"width": 12, "height": 6}, "is for images of 12x6 pixels, but .*101.png has 8x6"),
+    ],
+)
+def test_polycam_damage_is_named(tmp_path: Path, change: dict[str, Any], says: str) -> None:
+    file = write_polycam(tmp_path) / "101.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | change))
+    with pytest.raises(InputError, match=says):
+        load_scene(tmp_path)
+
+
+# --- Record3D -----------------------------------------------------------------------------------
+
+
+def test_record3d_lens_is_scaled_to_its_photographs(tmp_path: Path) -> None:
+    write_record3d(tmp_path, scale=3)
+    scene = load_scene(tmp_path)
+    camera = scene.views[0].camera
+    assert (camera.width, camera.height) == (24, 18)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (30.0, 33.0, 12.75, 8.25)
+    assert any("4 of 4 photographs are of another size" in note for note in scene.notes)
+
+
+def test_record3d_lens_of_each_frame_and_by_rows(tmp_path: Path) -> None:
+    each = [[10.0 + k, 11.0, 4.0, 3.0] for k in range(4)]
+    write_record3d(tmp_path / "a", perFrameIntrinsicCoeffs=each)
+    scene = load_scene(tmp_path / "a")
+    assert [view.camera.fx for view in scene.views] == [10.0, 11.0, 12.0, 13.0]
+    rows = [10.0, 0.0, 4.25, 0.0, 11.0, 2.75, 0.0, 0.0, 1.0]
+    write_record3d(tmp_path / "b", K=rows)
+    camera = load_scene(tmp_path / "b").views[0].camera
+    assert (camera.cx, camera.cy) == (4.25, 2.75)
+
+
+def test_record3d_unpacked_and_its_depth_mentioned(tmp_path: Path) -> None:
+    file = write_record3d(tmp_path)
+    file.rename(tmp_path / "metadata")
+    (tmp_path / "rgbd/0.depth").write_bytes(b"lzfse")
+    scene = load_scene(tmp_path)
+    assert len(scene.views) == 4
+    assert any("1 depth files in rgbd are not read" in note for note in scene.notes)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"K": [1.0] * 8}, r"\$.K: holds 8 numbers, not 9; export"),
+        ({"K": [0.0] * 9}, r"\$.K: its focal lengths must be above 0; export"),
+        ({"w": 0}, r"\$.w: 0 is no size in pixels; export"),
+        ({"w": 12}, r"\$.w: the file is for images of 12x6 pixels"),
+        ({"poses": []}, r"\$.poses: is empty; export"),
+        ({"poses": [[0.0] * 7] * 4}, r"\$.poses\[0\]: its quaternion .* is none; export"),
+        ({"poses": [[1.0] * 6] * 4}, r"\$.poses\[0\]: holds 6 numbers, not a quaternion"),
+        ({"perFrameIntrinsicCoeffs": [[1.0] * 4] * 3}, r"is for 3 frames, but there are 4 poses"),
+        ({"perFrameIntrinsicCoeffs": [[1.0] * 3] * 4}, r"\[0\]: holds 3 numbers, not fx, fy, cx"),
+    ],
+)
+def test_record3d_damage_is_named(tmp_path: Path, change: dict[str, Any], says: str) -> None:
+    write_record3d(tmp_path, **change)
+    with pytest.raises(InputError, match=says):
+        load_scene(tmp_path)
+
+
+# --- Metashape ----------------------------------------------------------------------------------
+
+
+def with_lens(lens: str, kind: str = "frame") -> str:
+    return SENSOR.replace("<b1>-1</b1>", f"<b1>-1</b1>{lens}").replace(
+        'type="frame" class="adj', f'type="{kind}" class="adj'
+    )
+
+
+def test_metashape_tangential_is_the_other_way_round(tmp_path: Path) -> None:
+    lens = "<k1>-0.05</k1><k2>0.02</k2><k3>-0.01</k3><p1>0.001</p1><p2>-0.002</p2>"
+    write_metashape(tmp_path, sensor=with_lens(lens))
+    camera = load_scene(tmp_path).views[0].camera
+    assert (camera.k1, camera.k2, camera.k3) == (-0.05, 0.02, -0.01)
+    assert (camera.p1, camera.p2) == (-0.002, 0.001)
+    assert (camera.fx, camera.fy) == (10.0, 11.0)
+    assert not camera.fisheye
+    assert not camera.rational
+
+
+@pytest.mark.parametrize("kind", ["fisheye", "equidistant_fisheye"])
+def test_metashape_fisheye(tmp_path: Path, kind: str) -> None:
+    write_metashape(tmp_path, sensor=with_lens("<k1>-0.05</k1><k4>0.001</k4>", kind))
+    camera = load_scene(tmp_path).views[0].camera
+    assert camera.fisheye
+    assert camera.radial == (-0.05, 0.0, 0.0, 0.001)
+
+
+@pytest.mark.parametrize(
+    ("lens", "kind", "said"),
+    [
+        ("<k1>-0.05</k1><k4>0.03</k4>", "frame", "BROWN lens; .* is used in its place"),
+        ("<b2>3</b2>", "frame", "BROWN lens; .* so they are undistorted"),
+        ("<k1>0.02</k1>", "equisolid_fisheye", "BROWN_EQUISOLID lens; .* in its place"),
+    ],
+)
+def test_metashape_other_lenses(tmp_path: Path, lens: str, kind: str, said: str) -> None:
+    write_metashape(tmp_path, sensor=with_lens(lens, kind))
+    scene = load_scene(tmp_path)
+    assert any(re.search(said, note) for note in scene.notes)
+
+
+def test_metashape_before_1_2_has_the_principal_point_from_the_edges(tmp_path: Path) -> None:
+    old = "<fx>10</fx><fy>11</fy><cx>4.25</cx><cy>2.75</cy><p1>0.001</p1>"
+    sensor = SENSOR.replace("<f>11</f><cx>0.25</cx><cy>-0.25</cy><b1>-1</b1>", old)
+    write_metashape(tmp_path, sensor=sensor)
+    camera = load_scene(tmp_path).views[0].camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (10.0, 11.0, 4.25, 2.75)
+    assert (camera.p1, camera.p2) == (0.001, 0.0)
+
+
+TURN = "<rotation>0 -1 0 1 0 0 0 0 1</rotation><translation>5 6 7</translation><scale>2</scale>"
+
+
+@pytest.mark.parametrize("where", ["chunk", "component"])
+def test_metashape_transforms_lead_to_the_projects_coordinates(tmp_path: Path, where: str) -> None:
+    rest = f"<transform>{TURN}</transform>"
+    if where == "component":
+        rest = f'<components><component id="9">{rest}</component></components>'
+    write_metashape(tmp_path, rest=rest, component='component_id="9"')
+    found = load_scene(tmp_path)
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    for view, pose in zip(found.views, ring(4), strict=True):
+        np.testing.assert_allclose(view.camera.c2w[:, :3], turn @ pose[:3, :3], atol=1e-9)
+        there = 2.0 * turn @ pose[:3, 3] + [5.0, 6.0, 7.0]
+        np.testing.assert_allclose(view.camera.position, there, atol=1e-9)
+
+
+def test_metashape_geocentric_coordinates_are_turned_up(tmp_path: Path) -> None:
+    """At 48 N, 11 E: cameras of the ring in east, north and up, from that place on the earth."""
+    phi, lam = np.radians([48.0, 11.0])
+    up = np.array([np.cos(phi) * np.cos(lam), np.cos(phi) * np.sin(lam), np.sin(phi)])
+    east = np.array([-np.sin(lam), np.cos(lam), 0.0])
+    axes = np.stack([east, np.cross(up, east), up], axis=1)
+    e2 = 1.0 - (6356752.314245 / 6378137.0) ** 2
+    normal = 6378137.0 / np.sqrt(1.0 - e2 * np.sin(phi) ** 2)
+    origin = normal * up * [1.0, 1.0, 1.0 - e2]
+    numbers = [" ".join(map(repr, row.ravel().tolist())) for row in (axes, origin)]
+    rest = f"<transform><rotation>{numbers[0]}</rotation><translation>{numbers[1]}</translation>"
+    write_metashape(tmp_path, rest=f"{rest}</transform>")
+    scene = load_scene(tmp_path)
+    positions = np.array([view.camera.position for view in scene.views])
+    given = np.array([pose[:3, 3] for pose in ring(4)])
+    np.testing.assert_allclose(positions, given - np.median(given, axis=0), atol=1e-5)
+    np.testing.assert_allclose(scene.views[0].camera.c2w[:, :3], ring(4)[0][:3, :3], atol=1e-6)
+    assert any("turned to east, north and up" in note for note in scene.notes)
+
+
+def test_metashape_components_without_transforms_are_not_mixed(tmp_path: Path) -> None:
+    file = write_metashape(tmp_path, component='component_id="0"')
+    text = file.read_text()
+    last = 'component_id="0" label="003"'
+    assert last in text
+    file.write_text(text.replace(last, last.replace('"0"', '"1"', 1)))
+    scene = load_scene(tmp_path)
+    assert [view.name for view in scene.views] == [f"images/{k:03d}.png" for k in range(3)]
+    assert any("left out 1 cameras of 1 smaller components" in note for note in scene.notes)
+
+
+def test_metashape_labels_with_extensions_and_cameras_that_are_left_out(tmp_path: Path) -> None:
+    file = write_metashape(tmp_path)
+    text = file.read_text().replace('label="001"', 'label="001.JPG"')
+    text = text.replace('label="002"', 'label="002.png"')
+    file.write_text(text.replace('label="003"', 'enabled="false" label="003"'))
+    scene = load_scene(tmp_path)
+    assert [view.name for view in scene.views] == [f"images/{k:03d}.png" for k in range(3)]
+    said = "\n".join(scene.notes)
+    assert "left out 1 cameras that are switched off" in said
+    assert "left out 1 of 4 cameras that are not aligned (first: lost)" in said
+
+
+def test_metashape_two_photographs_of_a_name_are_refused(tmp_path: Path) -> None:
+    write_metashape(tmp_path)
+    write_pictures(tmp_path / "images/more", ["000.png"])
+    with pytest.raises(
+        InputError, match=r"'000' is the name of 2 photographs \(images/000.png, im"
+    ):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("<f>11</f>", "", "sensor 3: has no focal length f; export"),
+        ("<f>11</f>", "<f>-3</f>", "sensor 3: its focal length must be above 0"),
+        ("<f>11</f>", "<f>wide</f>", "sensor 3: f: holds something else than a finite number"),
+        ("<b1>-1</b1>", "<k2>nan</k2>", "sensor 3: k2: holds something else than a finite number"),
+        ('width="8" height="6"', 'width="8"', "sensor 3: has no resolution in pixels"),
+        ('width="8"', 'width="12"', "is for images of 12x6 pixels, but images/000.png has 8x6"),
+        ('type="frame" class="adj', 'type="spherical" class="adj', "lens 'spherical' is not mod"),
+        ('sensor_id="3"', 'sensor_id="4"', "camera '000': its sensor is not in the file"),
+        ("<transform>", "<transform>1 ", "camera '000': transform: holds something else than 16"),
+        ("<transform>", "<nothing>", "is no valid XML: mismatched tag"),
+        ("<document", '<!DOCTYPE a [<!ENTITY b "c">]><document', "declares entities or a document"),
+        ('label="001"', 'label="000"', "1 cameras are of a photograph that another one is of"),
+        ("<calibration", "<other", "is no valid XML"),
+    ],
+)
+def test_metashape_damage_is_named(tmp_path: Path, old: str, new: str, says: str) -> None:
+    file = write_metashape(tmp_path)
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, new))
+    with pytest.raises(InputError, match=says):
+        load_scene(tmp_path)
+
+
+def test_metashape_without_aligned_cameras_is_refused(tmp_path: Path) -> None:
+    write_metashape(tmp_path, poses=[])
+    text = (tmp_path / "cameras.xml").read_text()
+    assert "<transform>" not in text
+    with pytest.raises(InputError, match="none of its 1 cameras is aligned; align them"):
+        load_scene(tmp_path)
+
+
+def test_of_several_chunks_that_of_most_cameras_is_read(tmp_path: Path) -> None:
+    file = write_metashape(tmp_path)
+    file.write_text(
+        file.read_text().replace("<chunk", '<chunk label="empty"><cameras/></chunk><chunk', 1)
+    )
+    scene = load_scene(tmp_path)
+    assert len(scene.views) == 4
+    assert any("of 2 chunks 'Chunk 1' is read" in note for note in scene.notes)
+
+
+# --- RealityCapture -----------------------------------------------------------------------------
+
+
+def test_reality_angles_are_those_of_its_own_matrix() -> None:
+    """One camera exported both ways, from Epic's forum, topic 710449: world to camera by rows."""
+    row = {"heading": 163.736597399311, "pitch": 83.4154313461628, "roll": 174.386496244756}
+    pose = _pose({**row, "x": 1.0, "y": 2.0, "alt": 3.0})
+    matrix = [
+        [0.982594073038806, 0.185426733553445, -0.0112166890261935],
+        [-0.032113633044729, 0.11008102707942, -0.993403685341366],
+        [-0.18296885582437, 0.976472781986697, 0.114],
+    ]
+    np.testing.assert_allclose((pose[:, :3] * [1.0, -1.0, -1.0]).T, matrix, atol=2e-4)
+    assert pose[:, 3].tolist() == [1.0, 2.0, 3.0]
+
+
+def test_reality_lens(tmp_path: Path) -> None:
+    write_reality(tmp_path / "a", lens="-0.05,0.02,-0.01,0,0.001,-0.002")
+    camera = load_scene(tmp_path / "a").views[0].camera
+    assert (camera.k1, camera.k2, camera.k3) == (-0.05, 0.02, -0.01)
+    assert (camera.p1, camera.p2) == (-0.002, 0.001)
+    write_reality(tmp_path / "b", lens="-0.05,0.02,-0.01,0.005,0,0")
+    assert any("BROWN lens" in note for note in load_scene(tmp_path / "b").notes)
+
+
+def test_reality_focal_length_is_by_the_longer_side(tmp_path: Path) -> None:
+    file = write_reality(tmp_path)
+    for k in range(4):
+        upright = picture(k, width=6, height=8)
+        Image.fromarray(upright).save(tmp_path / f"images/{k:03d}.png")
+    camera = load_scene(file).views[0].camera
+    assert (camera.width, camera.height, camera.fx) == (6, 8, pytest.approx(10.0))
+    assert (camera.cx, camera.cy) == pytest.approx((3.25, 3.75))
+
+
+def test_reality_columns_of_a_template(tmp_path: Path) -> None:
+    file = write_reality(tmp_path)
+    rows = [line.split(",")[:8] for line in file.read_text().splitlines()]
+    rows[0] = ["#Name", "X", "Y", "Alt", "Heading", "Pitch", "Roll", "F"]
+    file.write_text("#cameras 4\n" + "\n".join(";".join(row) for row in rows) + "\n")
+    camera = load_scene(tmp_path).views[0].camera
+    assert (camera.fx, camera.cx, camera.cy) == (pytest.approx(10.0), 4.0, 3.0)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("001.png,", "001.png,wide,", "line 3: x: 'wide' is no finite number; export"),
+        ("001.png,", "001.png", "line 3: has 15 columns, but the header 16; export"),
+        (",45.0,", ",-1.0,", "line 2: f: -1 is no focal length; export"),
+        ("001.png", "000.png", "1 rows are of a photograph that another one is of; remove"),
+        ("001.png,", "001.png,1e300,", "line 3: x, y, alt: holds numbers beyond"),
+    ],
+)
+def test_reality_damage_is_named(tmp_path: Path, old: str, new: str, says: str) -> None:
+    file = write_reality(tmp_path)
+    text = file.read_text()
+    assert old in text
+    if new.count(",") > old.count(","):  # in place of a value
+        at = text.index(old) + len(old)
+        text = text[:at] + text[text.index(",", at) + 1 :]
+    file.write_text(text.replace(old, new))
+    with pytest.raises(InputError, match=says):
+        load_scene(tmp_path)
+
+
+def test_reality_without_rows_is_refused(tmp_path: Path) -> None:
+    write_reality(tmp_path).write_text(HEADER + "\n")
+    with pytest.raises(InputError, match="has no row below its header; export"):
+        load_scene(tmp_path)
+
+
+def test_other_files_of_the_same_endings_are_no_scenes(tmp_path: Path) -> None:
+    write_pictures(tmp_path / "images", ["a.png", "b.png"])
+    (tmp_path / "list.csv").write_text("name,x,y\na,1,2\n")
+    (tmp_path / "page.xml").write_text("<html/>")
+    (tmp_path / "metadata.json").write_text('{"poses": [], "K": []}')
+    assert survey(tmp_path).format == "none"
+    with pytest.raises(InputError, match="no scene found"):
+        load_scene(tmp_path)
