@@ -18,9 +18,9 @@ from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.cameras.fisheye import distorted_angle, largest_angle
 from warpnerf.scenes.cameras.undistort import has_invertible_distortion
 
-N_AZIMUTHS = 16
+N_AZIMUTHS = 12
 """Directions around the axis along which a lens is looked at."""
-N_ANGLES = 1024
+N_ANGLES = 512
 """Angles to the axis, along each of them."""
 PLANE_LIMIT = math.radians(89.0)
 """Largest angle to the axis of lenses that are defined on the plane Z = 1."""
@@ -214,7 +214,7 @@ class ImagePlane:
         return points * [self.fx, self.fy] + [self.cx, self.cy]
 
 
-@functools.lru_cache(maxsize=64)
+@functools.lru_cache(maxsize=4096)
 def fitted(lens: ForeignLens, plane: ImagePlane) -> tuple[Camera, float] | None:
     """The lens of OpenCV's that is nearest to another one, fitted by least squares.
 

@@ -17,6 +17,7 @@ from warpnerf.scenes.cameras.undistort import seen_pixels
 from warpnerf.scenes.extent.points import Points, extent_by_points
 from warpnerf.scenes.files import by_number, exists
 from warpnerf.scenes.formats.frame import Frame, lens_notes
+from warpnerf.scenes.formats.reduced import with_reduced
 from warpnerf.scenes.images.depths import Depth, read_depth
 from warpnerf.scenes.images.images import exif_orientation, image_shape, read_image
 from warpnerf.scenes.images.masks import (
@@ -78,6 +79,8 @@ def assemble(
     complete, notes = complete_splits(file, [frame.name for frame in frames], splits)
     used = set().union(*complete.values())
     frames = [frame for frame in frames if frame.name in used]
+    frames, reduced = with_reduced(frames, downscale)
+    notes += reduced
     if masks is not None:
         found = masks_of_folder(masks, [frame.name for frame in frames])
         frames = [replace(frame, mask=mask) for frame, mask in zip(frames, found, strict=True)]
@@ -408,9 +411,9 @@ def _read_frame(frame: Frame, downscale: int, is_object: bool) -> _Read | None:
     if mask is not None and mask.all():
         mask = None
     photograph = Photograph(
-        path=frame.path,
+        path=frame.reduced or frame.path,
         shape=(camera.height, camera.width, channels if is_object else 3),
-        downscale=downscale,
+        downscale=downscale if frame.reduced is None else 1,
         image=frame.image,
         drops_alpha=channels == 4 and not is_object,
         resampling=resampling,

@@ -33,6 +33,8 @@ class Frame:
     """True depth; None: not known."""
     image: np.ndarray | None = None
     """As a view has it, where it was read already; None: it is in ``path``."""
+    reduced: Path | None = None
+    """The same photograph, reduced as is requested; None: it is still to be reduced."""
     bounds: tuple[float, float] | None = None
     """Depth of the nearest and of the farthest content, scene units; None: not known."""
 
