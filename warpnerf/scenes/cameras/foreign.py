@@ -18,8 +18,8 @@ from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.cameras.fisheye import distorted_angle, largest_angle
 from warpnerf.scenes.cameras.undistort import has_invertible_distortion
 
-N_AZIMUTHS = 12
-"""Directions around the axis along which a lens is looked at."""
+N_AZIMUTHS = 8
+"""Directions around the axis along which a lens is looked at, besides those of the corners."""
 N_ANGLES = 512
 """Angles to the axis, along each of them."""
 PLANE_LIMIT = math.radians(89.0)
@@ -257,14 +257,24 @@ def _seen(
     """Directions [n, 3] that the image shows and where, pixels; and angles to the axis [m] with the
     mean distance from the principal point at each, focal lengths."""
     theta = np.linspace(0.0, lens.limit, N_ANGLES + 1)[1:]
+    # Over these, what tangential and prism terms and a skew add is 0 in the mean.
     phi = 2.0 * math.pi * (np.arange(N_AZIMUTHS) + 0.5) / N_AZIMUTHS
+    right, down = (
+        np.array([-middle, side - middle]) / focal
+        for side, focal, middle in (
+            (plane.width, plane.fx, plane.cx),
+            (plane.height, plane.fy, plane.cy),
+        )
+    )
+    corners = [math.atan2(y, x) for x in right for y in down]
+    phi = np.concatenate([phi, corners])
     across = np.stack([np.cos(phi), np.sin(phi)], axis=1)
     # Angles as dense near the axis for a long focal length: up to the corner, however far it is.
     for _ in range(6):
-        grid = np.empty((N_AZIMUTHS, len(theta), 3))
+        grid = np.empty((len(phi), len(theta), 3))
         grid[..., :2] = across[:, None] * np.sin(theta)[:, None]
         grid[..., 2] = np.cos(theta)
-        points = lens.project(grid.reshape(-1, 3)).reshape(N_AZIMUTHS, -1, 2)
+        points = lens.project(grid.reshape(-1, 3)).reshape(len(phi), -1, 2)
         out = (points * across[:, None]).sum(axis=2)
         step = np.diff(theta, prepend=0.0)
         rises = np.diff(out, axis=1, prepend=0.0) > MIN_RISE * step
@@ -284,7 +294,7 @@ def _seen(
     whole = np.logical_and.accumulate(rises, axis=1).all(axis=0) & kept.any(axis=0)
     if whole.sum() < MIN_POINTS:
         return None
-    return grid[kept], pixels[kept], theta[whole], out[:, whole].mean(axis=0)
+    return grid[kept], pixels[kept], theta[whole], out[:N_AZIMUTHS, whole].mean(axis=0)
 
 
 def _on_plane(
