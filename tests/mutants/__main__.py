@@ -27,6 +27,7 @@ import factors
 import hashed
 import heads
 import host_command
+import host_formats
 import host_output
 import host_scenes
 import host_training
@@ -57,6 +58,7 @@ MUTANTS = (
     *resampled.MUTANTS,
     *host_training.MUTANTS,
     *host_scenes.MUTANTS,
+    *host_formats.MUTANTS,
     *host_output.MUTANTS,
     *host_command.MUTANTS,
 )
