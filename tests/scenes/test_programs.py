@@ -24,6 +24,7 @@ from tests.support.program_exports import (
 )
 from tests.support.tiny_scenes import picture, ring, write_transforms
 from warpnerf.checks import InputError
+from warpnerf.scenes.formats.contents import is_unposed
 from warpnerf.scenes.formats.load import load_scene
 from warpnerf.scenes.formats.reality import _pose
 from warpnerf.scenes.formats.survey import survey
@@ -299,6 +300,10 @@ def test_metashape_labels_with_extensions_and_cameras_that_are_left_out(tmp_path
     said = "\n".join(scene.notes)
     assert "left out 1 cameras that are switched off" in said
     assert "left out 1 of 4 cameras that are not aligned (first: lost)" in said
+    lost = 'sensor_id="3" label="lost"'
+    file.write_text(file.read_text().replace(lost, f'master_id="0" {lost}'))
+    rig = "(first: lost), 1 of them of a rig, which are placed by another camera"
+    assert any(rig in note for note in load_scene(tmp_path).notes)
 
 
 def test_metashape_two_photographs_of_a_name_are_refused(tmp_path: Path) -> None:
@@ -427,10 +432,34 @@ def test_reality_without_rows_is_refused(tmp_path: Path) -> None:
         load_scene(tmp_path)
 
 
+@pytest.mark.parametrize("write", [write_metashape, write_reality])
+def test_files_among_the_photographs_are_found(
+    tmp_path: Path, write: Callable[[Path], Path]
+) -> None:
+    file = write(tmp_path)
+    plain = load_scene(tmp_path)
+    file.rename(tmp_path / "images" / file.name)
+    assert f"(images/{file.name})" in survey(tmp_path).format
+    assert_same(load_scene(tmp_path), plain)
+    assert not is_unposed(tmp_path)
+    (tmp_path / "images").rename(tmp_path / "scan")
+    with pytest.raises(InputError, match=r"its folder scan holds one; use .*scan"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["poly.zip", "scan.R3D"])
+def test_archives_are_to_be_unpacked(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(b"PK")
+    with pytest.raises(InputError, match="is an archive; unpack it, and give the folder"):
+        load_scene(tmp_path / name)
+
+
 def test_other_files_of_the_same_endings_are_no_scenes(tmp_path: Path) -> None:
     write_pictures(tmp_path / "images", ["a.png", "b.png"])
     (tmp_path / "list.csv").write_text("name,x,y\na,1,2\n")
     (tmp_path / "page.xml").write_text("<html/>")
+    (tmp_path / "cameras").mkdir()
+    (tmp_path / "cameras/a.json").write_text('{"position": [0, 0, 0]}')
     (tmp_path / "metadata.json").write_text('{"poses": [], "K": []}')
     assert survey(tmp_path).format == "none"
     with pytest.raises(InputError, match="no scene found"):

@@ -25,6 +25,9 @@ from warpnerf.scenes.scene import Scene
 
 __all__ = ["load_scene"]
 
+ARCHIVES = (".zip", ".r3d", ".tar", ".gz", ".tgz", ".7z", ".rar")
+"""As which captures are shared: Record3D's .r3d, and what the others export."""
+
 BUILTIN = "builtin:"
 BUILTIN_NAMES = ("room", "room-sparse")
 
@@ -97,6 +100,8 @@ def load_scene(
     if path.suffix.lower() in VIDEOS:
         command = pose_command(shlex.quote(str(path)))
         raise InputError(f"{path}: is a video, not a scene; make one of it by {command}.")
+    if path.suffix.lower() in ARCHIVES:
+        raise InputError(f"{path}: is an archive; unpack it, and give the folder that it makes.")
     raise InputError(f"{path}: is not a scene; give its folder or a transforms*.json in it.")
 
 

@@ -183,9 +183,11 @@ def _aligned(file: Path, chunk: ElementTree.Element) -> tuple[list[ElementTree.E
         )
     if len(aligned) < len(on):
         first = next(camera for camera in on if camera.find("transform") is None)
+        rigged = sum(c.find("transform") is None and "master_id" in c.attrib for c in on)
+        rest = f", {rigged} of them of a rig, which are placed by another camera" if rigged else ""
         notes.append(
             f"{file.name}: left out {len(on) - len(aligned)} of {len(on)} cameras that are not "
-            f"aligned (first: {printable(first.get('label', '')[:80])})"
+            f"aligned (first: {printable(first.get('label', '')[:80])}){rest}"
         )
     parts: dict[str, list[ElementTree.Element]] = {}
     for camera in aligned:

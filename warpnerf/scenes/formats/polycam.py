@@ -32,6 +32,8 @@ FOLDERS = ("corrected_cameras", "cameras")
 IMAGES = {"corrected_cameras": ("corrected_images", "images"), "cameras": ("images",)}
 """Of the photographs that belong to them."""
 MILLIMETRE = 1e-3
+LOOKED_AT = 65536
+"""Bytes at the beginning of a camera's file by which it is recognised."""
 
 
 class CameraFile(msgspec.Struct):
@@ -61,14 +63,23 @@ def find_polycam(folder: Path) -> Path | None:
     """Where the cameras of an export are; None where there is none."""
     for place in (folder / "keyframes", folder):
         for name in FOLDERS:
-            try:
-                if any(path.suffix == ".json" for path in (place / name).iterdir()) and any(
-                    (place / images).is_dir() for images in IMAGES[name]
-                ):
-                    return place / name
-            except OSError:
-                continue
+            if any((place / images).is_dir() for images in IMAGES[name]) and _is_polycam(
+                place / name
+            ):
+                return place / name
     return None
+
+
+def _is_polycam(cameras: Path) -> bool:
+    """Whether a folder's first file of JSON has a camera's keys."""
+    try:
+        first = min((path for path in cameras.iterdir() if path.suffix == ".json"), default=None)
+        if first is None or not first.is_file():
+            return False
+        with first.open("rb") as stream:
+            return b'"t_00"' in stream.read(LOOKED_AT)
+    except OSError:
+        return False
 
 
 def load_polycam(cameras: Path, reading: Reading) -> Scene:

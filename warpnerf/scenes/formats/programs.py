@@ -32,15 +32,16 @@ class Export:
 
 
 def exports_in(folder: Path) -> list[Export]:
-    """All exports in a folder, in the order in which one is chosen."""
+    """All exports in a folder, and among the photographs in its images/, the one to choose first."""
     found: list[Export] = []
     polycam, record3d = find_polycam(folder), find_record3d(folder)
     if polycam is not None:
         found.append(Export("Polycam", polycam, load_polycam))
     if record3d is not None:
         found.append(Export("Record3D", record3d, load_record3d))
-    found += [Export("Metashape", path, load_metashape) for path in find_metashape(folder)]
-    found += [Export("RealityCapture", path, load_reality) for path in find_reality(folder)]
+    for place in (folder, folder / "images"):
+        found += [Export("Metashape", path, load_metashape) for path in find_metashape(place)]
+        found += [Export("RealityCapture", path, load_reality) for path in find_reality(place)]
     return found
 
 
