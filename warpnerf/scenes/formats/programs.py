@@ -32,7 +32,7 @@ class Export:
 
 
 def exports_in(folder: Path) -> list[Export]:
-    """All exports in a folder, and among the photographs in its images/, the one to choose first."""
+    """All exports in a folder, or among photographs in its images/, the one to choose first."""
     found: list[Export] = []
     polycam, record3d = find_polycam(folder), find_record3d(folder)
     if polycam is not None:

@@ -18,7 +18,7 @@ from warpnerf.scenes.cameras.undistort import LENS, directions, posed
 
 N_KNOTS = 65
 """Along each side of the image."""
-BAND = 2**18
+BAND = 2**16
 """Pixels, about, that are moved at a time."""
 FAR = 1e6
 """Pixels that something is moved by for which the photograph shows nothing."""
@@ -45,20 +45,24 @@ class Resampling:
             The same shape; beyond the photograph's edges, its edges.
         """
         height, width, channels = pixels.shape
-        flat = pixels.reshape(-1, channels).astype(np.float32)
+        # A plane for each channel: gathering single numbers is six times as fast as rows of three.
+        planes = np.ascontiguousarray(pixels.reshape(-1, channels).T)
         if channels == 4:  # colours count by their alpha
-            flat[:, :3] *= flat[:, 3:] / 255.0
+            planes = planes.astype(np.float32)
+            planes[:3] *= planes[3] / 255.0
         result = np.empty_like(pixels)
         for rows in _bands(height, width):
             u, v = self._positions(rows)
             across, along = _taps(u, width), _taps(v, height)
-            total = np.zeros((*u.shape, channels), np.float32)
+            total = np.zeros((channels, *u.shape), np.float32)
             for row, down in along:
                 for column, right in across:
-                    total += (down * right)[..., None] * flat[row * width + column]
+                    place, weight = row * width + column, down * right
+                    for channel in range(channels):
+                        total[channel] += weight * planes[channel][place]
             if channels == 4:
-                total[..., :3] *= 255.0 / np.maximum(total[..., 3:], 1.0)
-            result[rows] = np.clip(np.rint(total), 0.0, 255.0)
+                total[:3] *= 255.0 / np.maximum(total[3], 1.0)
+            result[rows] = np.clip(np.rint(total), 0.0, 255.0).transpose(1, 2, 0)
         return result
 
     def mask(self, counts: np.ndarray | None) -> np.ndarray:
@@ -85,29 +89,30 @@ class Resampling:
         """Where in the photograph rows of pixels are, (u, v), pixels from its edges."""
         values = tuple(getattr(self.camera, name) for name in LENS)
         moved = _moved(self.lens, self.plane, values)
-        across = np.arange(self.plane.width) + 0.5
         along = np.arange(rows.start, rows.stop) + 0.5
-        right = _shares(across * ((N_KNOTS - 1) / self.plane.width))
-        down = _shares(along * ((N_KNOTS - 1) / self.plane.height))
-        return across + down @ moved[..., 0] @ right.T, along[:, None] + down @ moved[..., 1] @ (
-            right.T
-        )
+        at = along * ((N_KNOTS - 1) / self.plane.height)
+        above = np.minimum(at.astype(int), N_KNOTS - 2)
+        share = (at - above)[:, None].astype(np.float32)
+        across = np.arange(self.plane.width) + 0.5
+        u, v = (1.0 - share) * moved[:, above] + share * moved[:, above + 1]
+        return across + u, along[:, None] + v
 
 
 @functools.lru_cache(maxsize=16)
 def _moved(lens: ForeignLens, plane: ImagePlane, values: tuple[Any, ...]) -> np.ndarray:
-    """By how much knots from corner to corner are moved, [N_KNOTS, N_KNOTS, 2] pixels, to a lens
-    that is given by a camera's fields ``LENS``."""
+    """By how much pixels of rows of knots are moved, (u, v) [2, N_KNOTS, W] pixels.
+
+    The lens that they are moved to is given by a camera's fields ``LENS``.
+    """
     u, v = np.linspace(0.0, plane.width, N_KNOTS), np.linspace(0.0, plane.height, N_KNOTS)
     knots = np.stack(np.meshgrid(u, v), axis=2).reshape(-1, 2)
     rays = directions(posed(values), knots) * [1.0, -1.0, -1.0]
     moved = plane.pixels(lens.project(rays)) - knots
-    return np.nan_to_num(moved, nan=FAR, posinf=FAR, neginf=-FAR).reshape(N_KNOTS, N_KNOTS, 2)
-
-
-def _shares(at: np.ndarray) -> np.ndarray:
-    """How much of each knot is at places counted in knots, [n, N_KNOTS]."""
-    return np.maximum(0.0, 1.0 - np.abs(at[:, None] - np.arange(N_KNOTS)))
+    moved = np.nan_to_num(moved, nan=FAR, posinf=FAR, neginf=-FAR)
+    at = (np.arange(plane.width) + 0.5) * ((N_KNOTS - 1) / plane.width)
+    rows = moved.reshape(N_KNOTS, N_KNOTS, 2).transpose(2, 0, 1)
+    shares = np.maximum(0.0, 1.0 - np.abs(at[:, None] - np.arange(N_KNOTS)))
+    return np.asarray(rows @ shares.T, np.float32)
 
 
 def _bands(height: int, width: int) -> list[slice]:
