@@ -29,6 +29,12 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "kernels"))
 
 from tests.scenes.test_colmap import write_model
 from tests.scenes.test_llff import write_llff
+from tests.support.program_exports import (
+    write_metashape,
+    write_polycam,
+    write_reality,
+    write_record3d,
+)
 from tests.support.tiny_scenes import picture, ring, save, write_transforms
 from warpnerf.checks import InputError
 from warpnerf.scenes.formats.load import load_scene
@@ -123,6 +129,28 @@ def npz(folder: Path) -> Path:
     return folder / "scene.npz"
 
 
+def other_lens(folder: Path) -> Path:
+    """A COLMAP model whose lens is none of OpenCV's."""
+    file = colmap("cameras.txt")(folder)
+    numbers = "10 11 4.25 2.75 0.02 -0.01 0.003 -0.002 0.003 0.001 0.01 -0.005"
+    file.write_text(f"7 THIN_PRISM_FISHEYE 8 6 {numbers}\n")
+    return file
+
+
+def polycam(folder: Path) -> Path:
+    return write_polycam(folder) / "102.json"
+
+
+def metashape(folder: Path) -> Path:
+    turn = "<rotation>1 0 0 0 1 0 0 0 1</rotation><scale>2</scale>"
+    rest = f'<components><component id="0"><transform>{turn}</transform></component></components>'
+    return write_metashape(folder, rest=rest, component='component_id="0"')
+
+
+def reality(folder: Path) -> Path:
+    return write_reality(folder, lens="-0.05,0.02,-0.01,0.005,0.001,0")
+
+
 FORMATS: dict[str, Callable[[Path], Path]] = {
     **{f"colmap-{n}": colmap(n) for n in ("cameras.bin", "images.bin", "points3D.bin")},
     **{f"colmap-{n}": colmap(n) for n in ("cameras.txt", "images.txt", "points3D.txt")},
@@ -131,6 +159,11 @@ FORMATS: dict[str, Callable[[Path], Path]] = {
     "ply-ascii": ply("ascii"),
     "ply-binary": ply("binary_little_endian"),
     "npz": npz,
+    "colmap-other-lens": other_lens,
+    "polycam": polycam,
+    "record3d": write_record3d,
+    "metashape": metashape,
+    "reality": reality,
 }
 
 

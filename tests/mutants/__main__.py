@@ -27,6 +27,7 @@ import factors
 import hashed
 import heads
 import host_command
+import host_formats
 import host_output
 import host_runs
 import host_scenes
@@ -58,6 +59,7 @@ MUTANTS = (
     *resampled.MUTANTS,
     *host_training.MUTANTS,
     *host_scenes.MUTANTS,
+    *host_formats.MUTANTS,
     *host_output.MUTANTS,
     *host_runs.MUTANTS,
     *host_command.MUTANTS,

@@ -187,8 +187,8 @@ def change(file: Path, before: str, after: str) -> None:
     file.write_text(text.replace(before, after))
 
 
-def field_of_view(model: Path) -> None:
-    change(model / "cameras.txt", "7 PINHOLE", "7 FOV")
+def all_around(model: Path) -> None:
+    change(model / "cameras.txt", "7 PINHOLE", "7 EQUIRECTANGULAR")
 
 
 def other_camera(model: Path) -> None:
@@ -236,7 +236,7 @@ def empty_model(model: Path) -> None:
 @pytest.mark.parametrize(
     ("act", "says"),
     [
-        (field_of_view, "camera 7: the lens FOV is not modelled; undistort"),
+        (all_around, "camera 7: the lens EQUIRECTANGULAR is not modelled; undistort"),
         (other_camera, "its camera 8 is not in cameras.txt"),
         (no_photographs, r"none of the model\'s 4 photographs is in .*images .first: 000.png"),
         (no_folder, "photographs are not there; put them into (?!.*sparse).*images"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import msgspec
@@ -12,6 +12,7 @@ import numpy as np
 
 from warpnerf.checks import InputError
 from warpnerf.scenes.cameras.camera import Camera
+from warpnerf.scenes.cameras.foreign import ForeignLens, ImagePlane, fitted
 from warpnerf.scenes.cameras.undistort import COEFFICIENTS, has_invertible_distortion
 
 FISHEYE = "OPENCV_FISHEYE"
@@ -85,6 +86,8 @@ class Lens:
     """Where in the file each of ``values`` stands."""
     fisheye: bool = False
     """Whether it is OpenCV's fisheye lens."""
+    foreign: ForeignLens | None = None
+    """Where it is none of OpenCV's lenses: its distortion, which ``values`` then do not hold."""
 
     def camera(self, *, width: int, height: int, c2w: np.ndarray, image: str) -> Camera:
         """Complete the lens for an image of ``width`` by ``height`` pixels.
@@ -118,6 +121,9 @@ class Lens:
             **{name: values.get(name, 0.0) for name in COEFFICIENTS},
         )
         self._check_proportions(camera, image)
+        nearest = self.nearest(camera, image)
+        if nearest is not None:
+            return nearest[1]
         coefficients = {k: values[k] for k in COEFFICIENTS if values.get(k)}
         if coefficients and not has_invertible_distortion(camera):
             named = ", ".join(f"{self.fields[k]} = {v:g}" for k, v in coefficients.items())
@@ -126,6 +132,36 @@ class Lens:
                 "cannot be undone; calibrate again, or crop or undistort the images."
             )
         return camera
+
+    def nearest(self, camera: Camera, image: str) -> tuple[ImagePlane, Camera, float] | None:
+        """The lens of OpenCV's that is nearest to that of another program.
+
+        Args:
+            camera: For an image, with its focal lengths and principal point.
+            image: For messages.
+
+        Returns:
+            The image's plane; the camera with that lens; and the most that it is off, pixels. None
+            where the lens is one of OpenCV's.
+
+        Raises:
+            InputError: The lens shows nearly nothing of the image.
+        """
+        if self.foreign is None:
+            return None
+        width, height = camera.width, camera.height
+        fx, fy = self._focal_lengths(width, height)
+        cx, cy = self.values.get("cx", width / 2), self.values.get("cy", height / 2)
+        plane = ImagePlane(width, height, fx, fy, cx, cy)
+        found = fitted(self.foreign, plane)
+        if found is None:
+            named = ", ".join(f"{value:g}" for value in self.foreign.parameters)
+            raise InputError(
+                f"{self.file}: {self.fields['fl_x']}: with it, and the parameters {named}, the "
+                f"lens {self.foreign.model} shows nearly nothing of {image}, {width}x{height}; "
+                "calibrate again, or undistort the images."
+            )
+        return plane, replace(found[0], c2w=camera.c2w), found[1]
 
     def _focal_lengths(self, width: int, height: int) -> tuple[float, float]:
         """Focal lengths along u and v, pixels; one stands in for the other where it is missing."""

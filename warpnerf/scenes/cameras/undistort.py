@@ -13,7 +13,7 @@ from warpnerf.scenes.cameras.fisheye import angle_of, distorted_angle, largest_a
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 """Of a lens, by their names."""
 
-_LENS = ("width", "height", "fx", "fy", "cx", "cy", *COEFFICIENTS, "fisheye")
+LENS = ("width", "height", "fx", "fy", "cx", "cy", *COEFFICIENTS, "fisheye")
 """The fields of a camera that are not its pose."""
 
 MIN_DETERMINANT = 0.01
@@ -39,19 +39,19 @@ def has_invertible_distortion(camera: Camera) -> bool:
     """
     if camera.fisheye:
         return _share_seen(camera) >= MIN_SEEN
-    return _is_invertible(*(getattr(camera, name) for name in _LENS))
+    return _is_invertible(*(getattr(camera, name) for name in LENS))
 
 
 @functools.lru_cache(maxsize=64)
 def _is_invertible(*lens: Any) -> bool:
-    camera = _posed(lens)
+    camera = posed(lens)
     targets = (_grid(camera) - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
     return _undistorted(camera, targets, N_STRIDES) is not None
 
 
-def _posed(lens: tuple[Any, ...]) -> Camera:
-    """A camera of a lens that is given by its fields ``_LENS``; its pose does not matter."""
-    return Camera(**dict(zip(_LENS, lens, strict=True)), c2w=np.eye(3, 4))
+def posed(lens: tuple[Any, ...]) -> Camera:
+    """A camera of a lens that is given by its fields ``LENS``; its pose does not matter."""
+    return Camera(**dict(zip(LENS, lens, strict=True)), c2w=np.eye(3, 4))
 
 
 def _grid(camera: Camera, n: int = N_GRID) -> np.ndarray:
@@ -148,7 +148,7 @@ def axis_cosines(camera: Camera) -> np.ndarray:
     if not camera.fisheye and not any(getattr(camera, name) for name in COEFFICIENTS):
         x, y = (across - camera.cx) / camera.fx, (along - camera.cy) / camera.fy
         return np.asarray(1.0 / np.sqrt(1.0 + x * x + (y * y)[:, None]))
-    knots = _knot_cosines(*(getattr(camera, name) for name in _LENS))
+    knots = _knot_cosines(*(getattr(camera, name) for name in LENS))
     shares = (along * ((N_KNOTS - 1) / camera.height), across * ((N_KNOTS - 1) / camera.width))
     down, right = (np.maximum(0.0, 1.0 - np.abs(s[:, None] - np.arange(N_KNOTS))) for s in shares)
     return np.asarray(down @ knots @ right.T)
@@ -156,8 +156,8 @@ def axis_cosines(camera: Camera) -> np.ndarray:
 
 @functools.lru_cache(maxsize=16)
 def _knot_cosines(*lens: Any) -> np.ndarray:
-    """Of a lens with the fields ``_LENS``, from corner to corner, [N_KNOTS, N_KNOTS]."""
-    camera = _posed(lens)
+    """Of a lens with the fields ``LENS``, from corner to corner, [N_KNOTS, N_KNOTS]."""
+    camera = posed(lens)
     return -directions(camera, _grid(camera, N_KNOTS))[:, 2].reshape(N_KNOTS, N_KNOTS)
 
 

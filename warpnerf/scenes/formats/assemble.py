@@ -13,14 +13,14 @@ from warpnerf.checks import InputError
 from warpnerf.runtime.memory import usable_cores
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.cameras.focus import estimate_extent
-from warpnerf.scenes.cameras.lens import Lens
 from warpnerf.scenes.cameras.undistort import seen_pixels
 from warpnerf.scenes.extent.points import Points, extent_by_points
 from warpnerf.scenes.files import by_number, exists
-from warpnerf.scenes.images.depths import Depth, DepthFile, read_depth
+from warpnerf.scenes.formats.frame import Frame, lens_notes
+from warpnerf.scenes.formats.reduced import with_reduced
+from warpnerf.scenes.images.depths import Depth, read_depth
 from warpnerf.scenes.images.images import exif_orientation, image_shape, read_image
 from warpnerf.scenes.images.masks import (
-    Mask,
     PackedMask,
     all_of_blocks,
     mask_beside,
@@ -45,27 +45,6 @@ POSED = "pose.json"
 
 HOLD_OUT = 8
 """Without a split in the file every 8th image is for testing, as in LLFF and Mip-NeRF 360."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Frame:
-    """One entry of a scene file, checked, its image found but not read."""
-
-    name: str
-    """The image's path relative to the scene's folder, with /."""
-    path: Path
-    """The image."""
-    c2w: np.ndarray
-    """[3, 4] float64, OpenGL axes, scene units."""
-    lens: Lens
-    mask: Mask | None = None
-    """Which pixels count; None: all."""
-    depth: DepthFile | None = None
-    """True depth; None: not known."""
-    image: np.ndarray | None = None
-    """As a view has it, where it was read already; None: it is in ``path``."""
-    bounds: tuple[float, float] | None = None
-    """Depth of the nearest and of the farthest content, scene units; None: not known."""
 
 
 def assemble(
@@ -108,6 +87,8 @@ def assemble(
         complete, notes = {"train": set(names) - test, "test": test}, [note]
     used = set().union(*complete.values())
     frames = [frame for frame in frames if frame.name in used]
+    frames, reduced = with_reduced(frames, downscale)
+    notes += reduced
     if masks is not None:
         found = masks_of_folder(masks, [frame.name for frame in frames])
         frames = [replace(frame, mask=mask) for frame, mask in zip(frames, found, strict=True)]
@@ -124,6 +105,7 @@ def assemble(
     left = [entry for entry in read if entry is not None]
     complete, mask_warnings = _without_masked(file, frames, left, complete)
     notes += _mask_notes(left)
+    notes += lens_notes([(entry.frame, entry.whole, entry.photograph.resampling) for entry in left])
     warnings = [*warnings, *_transparency_warning(left)]
     kept = keep([entry.photograph for entry in left], keeping, file=file, downscale=downscale)
     views = [
@@ -386,6 +368,9 @@ class _Read:
     """A frame, all of which is read but its photograph."""
 
     name: str
+    frame: Frame
+    whole: Camera
+    """Of the photograph before it is reduced."""
     camera: Camera
     photograph: Photograph
     depth: Depth | None
@@ -411,9 +396,14 @@ def _read_frame(frame: Frame, downscale: int, is_object: bool) -> _Read | None:
             "smaller factor."
         )
     camera = whole if downscale == 1 else whole.downscaled(downscale)
+    resampling = frame.resampling(whole, camera)
     mask = seen_pixels(camera)
+    given = None
     if frame.mask is not None:
         given = read_mask(frame.mask, width=width, height=height, downscale=downscale)
+    if resampling is not None:
+        given = resampling.mask(given)
+    if given is not None:
         mask = given if mask is None else mask & given
     ignored = 0.0
     if channels == 4 and not is_object:
@@ -422,21 +412,25 @@ def _read_frame(frame: Frame, downscale: int, is_object: bool) -> _Read | None:
             ignored = 1.0 - float(seen.mean())
             size = (height // downscale, width // downscale)
             seen = all_of_blocks(seen, downscale, size)
+            seen = seen if resampling is None else resampling.mask(seen)
             mask = seen if mask is None else mask & seen
     if mask is not None and not mask.any():
         return None
     if mask is not None and mask.all():
         mask = None
     photograph = Photograph(
-        path=frame.path,
+        path=frame.reduced or frame.path,
         shape=(camera.height, camera.width, channels if is_object else 3),
-        downscale=downscale,
+        downscale=downscale if frame.reduced is None else 1,
         image=frame.image,
         drops_alpha=channels == 4 and not is_object,
+        resampling=resampling,
     )
     depth = None if frame.depth is None else read_depth(frame.depth, whole, downscale)
     return _Read(
         name=frame.name,
+        frame=frame,
+        whole=whole,
         camera=camera,
         photograph=photograph,
         depth=depth,

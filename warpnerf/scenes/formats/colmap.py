@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from warpnerf.checks import InputError
+from warpnerf.scenes.cameras.foreign import MODELS, ForeignLens
 from warpnerf.scenes.cameras.lens import Lens
 from warpnerf.scenes.cameras.poses import check_pose
 from warpnerf.scenes.extent.points import Points
@@ -27,7 +28,7 @@ from warpnerf.scenes.files import (
     printable,
     require_regular_file,
 )
-from warpnerf.scenes.formats.assemble import Frame, assemble
+from warpnerf.scenes.formats.assemble import assemble
 from warpnerf.scenes.formats.colmap_files import (
     PARAMETERS,
     ModelCamera,
@@ -39,6 +40,7 @@ from warpnerf.scenes.formats.colmap_files import (
     stated_images,
 )
 from warpnerf.scenes.formats.colmap_points import read_points
+from warpnerf.scenes.formats.frame import Frame
 from warpnerf.scenes.formats.llff import ENDINGS
 from warpnerf.scenes.formats.split_lists import read_split_lists
 from warpnerf.scenes.images.images import image_size
@@ -366,9 +368,17 @@ def _lens(file: Path, number: int, camera: ModelCamera, photograph: Path, reduce
     for name, factor in (("fl_x", across), ("cx", across), ("fl_y", along), ("cy", along)):
         values[name] *= factor
     values |= {"w": size[0], "h": size[1]}
+    foreign = None
+    if camera.model in MODELS:
+        rest = [name for name in names if name not in ("fl", "fl_x", "fl_y", "cx", "cy")]
+        foreign = ForeignLens(camera.model, tuple(values.pop(name) for name in rest))
+        wrong = foreign.wrong
+        if wrong:
+            raise InputError(f"{file}: {place}: {wrong}; export it again.")
     return Lens(
         file=file,
         values=values,
         fields={name: f"{place}: {name}" for name in values},
-        fisheye=camera.model.endswith("FISHEYE"),
+        fisheye=foreign is None and camera.model.endswith("FISHEYE"),
+        foreign=foreign,
     )

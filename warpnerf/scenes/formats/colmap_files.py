@@ -29,6 +29,17 @@ PARAMETERS = {
     "RADIAL_FISHEYE": ("fl", "cx", "cy", "k1", "k2"),
     "SIMPLE_FISHEYE": ("fl", "cx", "cy"),
     "FISHEYE": ("fl_x", "fl_y", "cx", "cy"),
+    "FOV": ("fl_x", "fl_y", "cx", "cy", "omega"),
+    "THIN_PRISM_FISHEYE": (
+        *("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"),
+    ),
+    "RAD_TAN_THIN_PRISM_FISHEYE": (
+        *("fl_x", "fl_y", "cx", "cy", "k0", "k1", "k2", "k3", "k4", "k5"),
+        *("p0", "p1", "s0", "s1", "s2", "s3"),
+    ),
+    "SIMPLE_DIVISION": ("fl", "cx", "cy", "k"),
+    "DIVISION": ("fl_x", "fl_y", "cx", "cy", "k"),
+    "EUCM": ("fl_x", "fl_y", "cx", "cy", "alpha", "beta"),
 }
 """Of the lenses that are read, in the order of the files."""
 
@@ -36,7 +47,7 @@ MODEL_NAMES = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"),
     *("FULL_OPENCV", "FOV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE"),
     *("RAD_TAN_THIN_PRISM_FISHEYE", "SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE"),
-    "EUCM",
+    *("EUCM", "EQUIRECTANGULAR"),
 )
 """By their numbers in cameras.bin."""
 

@@ -12,6 +12,7 @@ from warpnerf.scenes.formats import llff
 from warpnerf.scenes.formats.blender import SPLITS, split_file
 from warpnerf.scenes.formats.colmap import find_model
 from warpnerf.scenes.formats.npz import is_scene_file, single_npz
+from warpnerf.scenes.formats.programs import exports_in
 from warpnerf.scenes.images.masks import without_masks
 
 UNREAD_PHOTOGRAPHS = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf")
@@ -30,7 +31,7 @@ def holds_scene(folder: Path) -> bool:
     """Whether a folder holds one of the formats that ``load_scene`` reads."""
     files = [*map(split_file, SPLITS[:1]), "transforms.json", llff.FILE]
     known = any(exists(folder / name) for name in files)
-    if known or find_model(folder) is not None:
+    if known or find_model(folder) is not None or exports_in(folder):
         return True
     archive = single_npz(folder)  # programs export other things as .npz too
     return archive is not None and is_scene_file(archive)

@@ -16,13 +16,19 @@ from warpnerf.scenes.formats import llff
 from warpnerf.scenes.formats.blender import SPLITS, load_blender, split_file
 from warpnerf.scenes.formats.colmap import find_model, load_colmap
 from warpnerf.scenes.formats.contents import VIDEOS, is_unposed, pose_command, what_is_there
+from warpnerf.scenes.formats.found_photographs import Reading
 from warpnerf.scenes.formats.npz import load_npz, single_npz
+from warpnerf.scenes.formats.programs import export_of, exports_in
+from warpnerf.scenes.formats.survey import forms_in
 from warpnerf.scenes.formats.transforms import load_transforms
 from warpnerf.scenes.images.photographs import Keeping, Place
 from warpnerf.scenes.scene import Scene
 from warpnerf.scenes.split import Split, checked_split, withheld
 
 __all__ = ["load_scene"]
+
+ARCHIVES = (".zip", ".r3d", ".tar", ".gz", ".tgz", ".7z", ".rar")
+"""As which captures are shared: Record3D's .r3d, and what the others export."""
 
 BUILTIN = "builtin:"
 BUILTIN_NAMES = ("room", "room-sparse")
@@ -41,11 +47,12 @@ def load_scene(
     """Load a scene: photographs, cameras, split, and the extent estimated from the cameras.
 
     A folder is tried as Blender / NeRF-synthetic (transforms_train.json), then as instant-ngp or
-    nerfstudio (transforms.json), COLMAP (sparse/0), LLFF (poses_bounds.npy), and one .npz file.
+    nerfstudio (transforms.json), COLMAP (sparse/0), LLFF (poses_bounds.npy), an export of Polycam,
+    Record3D, Metashape or RealityCapture, and one .npz file.
 
     Args:
-        path: A folder, a transforms*.json, poses_bounds.npy or .npz file in it, the folder of a
-            COLMAP model, or "builtin:" and the name of a built-in scene.
+        path: A folder, a transforms*.json, poses_bounds.npy, .npz or exported file in it, the
+            folder of a COLMAP model, or "builtin:" and the name of a built-in scene.
         downscale: Edge of the blocks of pixels that become one; 1 keeps the images as they are.
         masks: Folder of masks, named after the photographs: pixels that are black there are neither
             trained on nor measured. They take the place of masks that the scene brings itself.
@@ -100,9 +107,14 @@ def load_scene(
         return llff.load_llff(path.parent, **how)
     if path.suffix == ".npz":
         return load_npz(path, **how)
+    export = export_of(path)
+    if export is not None:
+        return export.load(path, Reading(**how))
     if path.suffix.lower() in VIDEOS:
         command = pose_command(shlex.quote(str(path)))
         raise InputError(f"{path}: is a video, not a scene; make one of it by {command}.")
+    if path.suffix.lower() in ARCHIVES:
+        raise InputError(f"{path}: is an archive; unpack it, and give the folder that it makes.")
     raise InputError(f"{path}: is not a scene; give its folder or a transforms*.json in it.")
 
 
@@ -119,6 +131,16 @@ def _with_split(scene: Scene, split: Split | None) -> Scene:
 
 
 def _load_folder(folder: Path, how: dict[str, Any]) -> Scene:
+    scene = _first_of_folder(folder, how)
+    others = forms_in(folder)[1:]
+    if not others:
+        return scene
+    note = f"also in the folder, and not read: {', '.join(others)}"
+    return replace(scene, notes=(*scene.notes, note))
+
+
+def _first_of_folder(folder: Path, how: dict[str, Any]) -> Scene:
+    """The scene of the first form that a folder has."""
     if exists(folder / split_file("train")):
         return load_blender(folder, **how)
     if exists(folder / "transforms.json"):
@@ -128,13 +150,16 @@ def _load_folder(folder: Path, how: dict[str, Any]) -> Scene:
         return load_colmap(model, **how)
     if exists(folder / llff.FILE):
         return llff.load_llff(folder, **how)
+    for export in exports_in(folder):
+        return export.load(export.path, Reading(**how))
     archive = single_npz(folder)
     if archive is not None and not is_unposed(folder):
         return load_npz(archive, **how)
     raise InputError(
         f"{folder}: no scene found: {what_is_there(folder)}. A scene has {split_file('train')} "
         "(Blender), transforms.json (instant-ngp, nerfstudio), sparse/0 (COLMAP), "
-        f"{llff.FILE} (LLFF), or one .npz file."
+        f"{llff.FILE} (LLFF), an export of Polycam, Record3D, Metashape (.xml) or RealityCapture "
+        "(.csv), or one .npz file."
     )
 
 

@@ -14,7 +14,8 @@ from warpnerf.scenes.files import exists, printable, read_json
 from warpnerf.scenes.formats import llff
 from warpnerf.scenes.formats.blender import SPLITS, split_file
 from warpnerf.scenes.formats.colmap import find_model, model_kind
-from warpnerf.scenes.formats.npz import single_npz
+from warpnerf.scenes.formats.npz import is_scene_file, single_npz
+from warpnerf.scenes.formats.programs import export_of, exports_in
 from warpnerf.scenes.formats.transforms import FrameEntry, TransformsFile
 
 SINGLE_PRECISION = 1e-5
@@ -102,22 +103,38 @@ def _files(path: str | Path) -> tuple[str, list[Path]]:
         return f"LLFF ({llff.FILE})", []
     if path.suffix == ".npz":
         return f"npz ({printable(path.name)})", []
+    export = export_of(path)
+    if export is not None:
+        return export.described(path.parent), []
     return f"instant-ngp / nerfstudio ({printable(path.name)})", [path]
 
 
 def _files_of_folder(folder: Path) -> tuple[str, list[Path]]:
     if exists(folder / split_file("train")):
         return _blender(folder)
+    files = [folder / "transforms.json"] if exists(folder / "transforms.json") else []
+    return (forms_in(folder) or ["none"])[0], files
+
+
+def forms_in(folder: Path) -> list[str]:
+    """All forms of scenes that a folder has, in words: ``load_scene`` reads the first.
+
+    A COLMAP model beside another scene gives that one its points, and is none of its own.
+    """
+    forms = [_blender(folder)[0]] if exists(folder / split_file("train")) else []
     if exists(folder / "transforms.json"):
-        return "instant-ngp / nerfstudio (transforms.json)", [folder / "transforms.json"]
+        forms.append("instant-ngp / nerfstudio (transforms.json)")
     model = find_model(folder)
-    if model is not None:
+    if model is not None and not forms:
         words = {"bin": "binary", "txt": "text"}[str(model_kind(model))]
-        return f"COLMAP ({model.relative_to(folder).as_posix()}, {words})", []
+        forms.append(f"COLMAP ({model.relative_to(folder).as_posix()}, {words})")
     if exists(folder / llff.FILE):
-        return f"LLFF ({llff.FILE})", []
+        forms.append(f"LLFF ({llff.FILE})")
+    forms += [export.described(folder) for export in exports_in(folder)]
     archive = single_npz(folder)
-    return "none" if archive is None else f"npz ({printable(archive.name)})", []
+    if archive is not None and (not forms or is_scene_file(archive)):
+        forms.append(f"npz ({printable(archive.name)})")
+    return forms
 
 
 def _blender(folder: Path) -> tuple[str, list[Path]]:

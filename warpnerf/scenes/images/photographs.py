@@ -22,6 +22,7 @@ from warpnerf.checks import InputError
 from warpnerf.runtime.memory import available_memory, lies_in_memory, usable_cores
 from warpnerf.scenes.images.images import box_filter, read_image
 from warpnerf.scenes.images.pixel_file import PixelFile
+from warpnerf.scenes.images.resampling import Resampling
 
 Place = Literal["auto", "memory", "disk", "files"]
 """memory; disk: read once, into a nameless file that is mapped; files: read again at each look;
@@ -77,6 +78,8 @@ class Photograph:
     """Its pixels before that, [H, W, 3 or 4] uint8, where they are in memory anyway."""
     drops_alpha: bool = False
     """Whether alpha in its file is left out."""
+    resampling: Resampling | None = None
+    """By which it is undistorted, after it is reduced; None: it is used as it is."""
 
     @property
     def n_bytes(self) -> int:
@@ -95,6 +98,8 @@ class Photograph:
         image = read_image(self.path) if self.image is None else self.image
         if self.downscale > 1:
             image = box_filter(image, self.downscale)
+        if self.resampling is not None and image.shape[:2] == self.shape[:2]:
+            image = self.resampling.image(image)
         if self.drops_alpha and image.shape[2] == 4:
             image = np.ascontiguousarray(image[..., :3])
         if image.shape != self.shape:

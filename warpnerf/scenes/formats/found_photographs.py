@@ -1,0 +1,207 @@
+"""Photographs of a capture that another program wrote cameras of, found by their names.
+
+Such programs write names only, with or without the extension; where the photographs are, and of
+what size they now are, is for the reader to find.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from warpnerf.checks import InputError
+from warpnerf.scenes.files import IMAGE_SUFFIXES, printable
+from warpnerf.scenes.formats.assemble import assemble
+from warpnerf.scenes.formats.frame import Frame
+from warpnerf.scenes.formats.llff import ENDINGS
+from warpnerf.scenes.images.masks import without_masks
+from warpnerf.scenes.images.photographs import Keeping
+from warpnerf.scenes.scene import Scene
+from warpnerf.scenes.split import Split
+
+NO_PHOTOGRAPHS = re.compile(r"(images_\d{1,3}|masks?|depths?|confidence)", re.IGNORECASE)
+"""Folders within one of photographs whose images are none, or are the same ones reduced."""
+
+UNPOSED = 0.1
+"""Share of the photographs without a camera, above which that is a warning."""
+
+
+class Photographs:
+    """The photographs in a scene's images/, or else anywhere in its folder, by name."""
+
+    def __init__(self, folder: Path, among: Path | None = None) -> None:
+        """Look for photographs.
+
+        Args:
+            folder: The scene's.
+            among: Where they are; None: in its images/ if there is one, else anywhere in it.
+        """
+        images = folder / "images"
+        self.folder = folder
+        self.root = among or (images if images.is_dir() else folder)
+        self.paths = _photographs_below(self.root)
+        self._by_name: dict[str, list[Path]] = {}
+        for path in self.paths:
+            for key in {path.name.casefold(), path.stem.casefold()}:
+                self._by_name.setdefault(key, []).append(path)
+
+    def find(self, name: str, field: str) -> Path | None:
+        """The photograph of a name, with or without folders and extension; None: it is not there.
+
+        Raises:
+            InputError: Several photographs have that name.
+        """
+        *folders, last = name.replace("\\", "/").split("/")
+        stem, dot, ending = last.rpartition(".")
+        keys = [last, stem] if dot and f".{ending.lower()}" in (*ENDINGS, ".tif") else [last]
+        for key in keys:
+            found = self._by_name.get(key.casefold(), [])
+            while len(found) > 1 and folders:
+                below = folders.pop().casefold()
+                found = [path for path in found if path.parent.name.casefold() == below] or found
+            if len(found) > 1:
+                first, second = (self.name(path) for path in found[:2])
+                raise InputError(
+                    f"{field}: {printable(name[:80])!r} is the name of {len(found)} photographs "
+                    f"({first}, {second}); give each a name of its own, or leave one of them."
+                )
+            if found:
+                return found[0]
+        return None
+
+    def name(self, path: Path) -> str:
+        """A photograph's path relative to the scene's folder, with /."""
+        return path.relative_to(self.folder).as_posix()
+
+    def missing(self, file: Path, n: int, names: Sequence[str]) -> list[str]:
+        """A warning of cameras, of n, whose photographs are not there.
+
+        Raises:
+            InputError: None is.
+        """
+        if not names:
+            return []
+        first = printable(names[0][:80])
+        if len(names) == n:
+            raise InputError(
+                f"{file}: none of its {n} photographs is in {self.root} (first: {first}); put them "
+                "there."
+            )
+        return [
+            f"{file.name}: left out {len(names)} of {n} cameras for want of a photograph (first: "
+            f"{first})"
+        ]
+
+    def unposed(self, file: Path, used: Collection[Path]) -> tuple[list[str], list[str]]:
+        """Notes and warnings of photographs that have no camera."""
+        left = [path for path in self.paths if path not in used]
+        if not left:
+            return [], []
+        said = [
+            f"{len(left)} of {len(self.paths)} photographs have no camera in {file.name} (first: "
+            f"{printable(self.name(left[0])[:80])})"
+        ]
+        return ([], said) if len(left) > UNPOSED * len(self.paths) else (said, [])
+
+
+def _photographs_below(root: Path) -> list[Path]:
+    """All photographs in a folder and in folders within it, by name."""
+    found: list[Path] = []
+    for place, folders, names in os.walk(root):
+        folders[:] = sorted(
+            name
+            for name in folders
+            if not name.startswith(".") and not NO_PHOTOGRAPHS.fullmatch(name)
+        )
+        found += [
+            Path(place) / name
+            for name in names
+            if name.lower().endswith((*ENDINGS, *IMAGE_SUFFIXES)) and not name.startswith(".")
+        ]
+    return sorted(without_masks(found))
+
+
+def scaled(
+    values: Mapping[str, float], stated: tuple[int, int], size: tuple[int, int]
+) -> dict[str, float]:
+    """A lens for photographs of another size and the same shape.
+
+    Args:
+        values: Its focal lengths and principal point, pixels, and coefficients.
+        stated: Width and height that these are for.
+        size: Of the photograph.
+
+    Returns:
+        The values for that, with its w and h; those stated where the shape is another, which is
+        then refused.
+    """
+    width, height = stated
+    # Sides are rounded to whole pixels, so that one may be off by one.
+    if size == stated or abs(size[0] / width * height - size[1]) > 1.0:
+        return {**values, "w": width, "h": height}
+    across, along = size[0] / width, size[1] / height
+    factors = {"fl_x": across, "cx": across, "fl_y": along, "cy": along}
+    there = {name: value * factors.get(name, 1.0) for name, value in values.items()}
+    return {**there, "w": size[0], "h": size[1]}
+
+
+def scaled_note(frames: Sequence[Frame], stated: Sequence[tuple[int, int]]) -> list[str]:
+    """That photographs are of another size than their lenses were for.
+
+    Args:
+        frames: Whose lenses ``scaled`` may have scaled.
+        stated: The size that each of them was for.
+    """
+    other = [
+        (frame.name, size, (frame.lens.values["w"], frame.lens.values["h"]))
+        for frame, size in zip(frames, stated, strict=True)
+        if (frame.lens.values["w"], frame.lens.values["h"]) != size
+    ]
+    if not other:
+        return []
+    name, (width, height), (w, h) = other[0]
+    return [
+        f"{len(other)} of {len(frames)} photographs are of another size than their lenses were for "
+        f"(first: {name} {w:g}x{h:g}, the lens {width}x{height}): the lenses are scaled"
+    ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reading:
+    """How photographs are to be read, whatever the format."""
+
+    downscale: int
+    """Edge of the blocks of pixels that become one."""
+    masks: Path | None
+    """Folder of masks for all photographs."""
+    keeping: Keeping
+    """Where their pixels are kept."""
+    withhold: Split | None = None
+    """What for testing; None: every 8th."""
+
+
+def scene_of(
+    folder: Path,
+    file: Path,
+    frames: Sequence[Frame],
+    reading: Reading,
+    *,
+    notes: Sequence[str] = (),
+    warnings: Sequence[str] = (),
+) -> Scene:
+    """The scene of another program's cameras, every 8th of them for testing."""
+    scene = assemble(
+        folder=folder,
+        file=file,
+        frames=frames,
+        splits={},
+        warnings=warnings,
+        downscale=reading.downscale,
+        masks=reading.masks,
+        keeping=reading.keeping,
+        withhold=reading.withhold,
+    )
+    return replace(scene, notes=(*notes, *scene.notes))

@@ -1,0 +1,77 @@
+"""One posed photograph of a scene file, before its pixels are read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from warpnerf.scenes.cameras.camera import Camera
+from warpnerf.scenes.cameras.foreign import TOLERANCE, ImagePlane
+from warpnerf.scenes.cameras.lens import Lens
+from warpnerf.scenes.images.depths import DepthFile
+from warpnerf.scenes.images.masks import Mask
+from warpnerf.scenes.images.resampling import Resampling
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Frame:
+    """One entry of a scene file, checked, its image found but not read."""
+
+    name: str
+    """The image's path relative to the scene's folder, with /."""
+    path: Path
+    """The image."""
+    c2w: np.ndarray
+    """[3, 4] float64, OpenGL axes, scene units."""
+    lens: Lens
+    mask: Mask | None = None
+    """Which pixels count; None: all."""
+    depth: DepthFile | None = None
+    """True depth; None: not known."""
+    image: np.ndarray | None = None
+    """As a view has it, where it was read already; None: it is in ``path``."""
+    reduced: Path | None = None
+    """The same photograph, reduced as is requested; None: it is still to be reduced."""
+    bounds: tuple[float, float] | None = None
+    """Depth of the nearest and of the farthest content, scene units; None: not known."""
+
+    def resampling(self, whole: Camera, reduced: Camera) -> Resampling | None:
+        """How the photograph is undistorted to a camera that ``lens`` made; None: not at all.
+
+        Args:
+            whole: That camera.
+            reduced: The same for the reduced photograph.
+        """
+        nearest = self.lens.nearest(whole, self.name)
+        if self.lens.foreign is None or nearest is None or nearest[2] <= TOLERANCE:
+            return None
+        plane, share = nearest[0], reduced.fx / whole.fx
+        plane = ImagePlane(
+            reduced.width,
+            reduced.height,
+            *(value * share for value in (plane.fx, plane.fy, plane.cx, plane.cy)),
+        )
+        return Resampling(self.lens.foreign, plane, reduced)
+
+
+def lens_notes(used: Sequence[tuple[Frame, Camera, Resampling | None]]) -> list[str]:
+    """What becomes of photographs whose lenses are none of OpenCV's.
+
+    Args:
+        used: Frames, the cameras of their whole photographs, and how these are undistorted.
+    """
+    found: dict[tuple[str, bool], list[float]] = {}
+    for frame, camera, resampling in used:
+        nearest = frame.lens.nearest(camera, frame.name)
+        if frame.lens.foreign is not None and nearest is not None:
+            key = frame.lens.foreign.model, resampling is not None
+            found.setdefault(key, []).append(nearest[2])
+    return [
+        f"{len(off)} photographs have a {model} lens; OpenCV's nearest one is at most "
+        f"{max(off):.2g} pixels off, "
+        + ("so they are undistorted to it" if moved else "and is used in its place")
+        for (model, moved), off in found.items()
+    ]

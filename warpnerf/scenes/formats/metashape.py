@@ -1,0 +1,345 @@
+"""Agisoft Metashape's cameras, exported as XML: lenses of sensors, poses of aligned cameras.
+
+Poses are camera to chunk in OpenCV axes. The transform of a camera's component, else the chunk's,
+leads on to the coordinates that the project has; those of the whole earth are turned to east, north
+and up around the cameras' middle, because in metres from the centre of the earth nothing is exact.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from warpnerf.checks import InputError
+from warpnerf.scenes.cameras.brown import brown_lens
+from warpnerf.scenes.cameras.lens import Lens
+from warpnerf.scenes.cameras.poses import check_pose
+from warpnerf.scenes.files import MAX_JSON_BYTES, printable, require_regular_file
+from warpnerf.scenes.formats.found_photographs import (
+    Photographs,
+    Reading,
+    scaled,
+    scaled_note,
+    scene_of,
+)
+from warpnerf.scenes.formats.frame import Frame
+from warpnerf.scenes.images.images import image_size
+from warpnerf.scenes.scene import Scene
+
+LOOKED_AT = 4096
+"""Bytes at the beginning of a file by which it is recognised."""
+
+KINDS = {
+    "frame": "BROWN",
+    "fisheye": "BROWN_FISHEYE",
+    "equidistant_fisheye": "BROWN_FISHEYE",
+    "equisolid_fisheye": "BROWN_EQUISOLID",
+}
+"""Lenses by Metashape's types of sensors."""
+
+EARTH = (6.2e6, 6.5e6)
+"""Metres from the centre of the earth within which cameras are taken to be on it."""
+AXES = np.array([6378137.0, 6378137.0, 6356752.314245])
+"""Half axes of WGS 84, metres."""
+
+
+@dataclass(frozen=True)
+class Transform:
+    """From a chunk's coordinates to the project's: scale R x + t."""
+
+    rotation: np.ndarray
+    translation: np.ndarray
+    scale: float
+
+
+def find_metashape(folder: Path) -> list[Path]:
+    """Files of cameras in a folder, by name, cameras.xml first."""
+    try:
+        files = [path for path in folder.iterdir() if path.suffix.lower() == ".xml"]
+    except OSError:
+        return []
+    found = [path for path in sorted(files) if is_metashape(path)]
+    return sorted(found, key=lambda path: path.name.lower() != "cameras.xml")
+
+
+def is_metashape(file: Path) -> bool:
+    """Whether a file begins as Metashape's do."""
+    try:
+        if not file.is_file():
+            return False
+        with file.open("rb") as stream:
+            head = stream.read(LOOKED_AT)
+    except OSError:
+        return False
+    return b"<document" in head and b"<chunk" in head
+
+
+def load_metashape(file: Path, reading: Reading) -> Scene:
+    """Load a scene from cameras of Metashape.
+
+    Args:
+        file: The XML.
+        reading: How photographs are read.
+
+    Returns:
+        The scene, in the project's units: metres where it has scale.
+
+    Raises:
+        InputError: The file is damaged, a lens is not modelled, or no photograph is there.
+    """
+    folder = file.parent
+    chunk, notes = _chunk(file)
+    aligned, more = _aligned(file, chunk)
+    notes += more
+    sensors = {sensor.get("id", ""): sensor for sensor in chunk.iterfind("sensors/sensor")}
+    photographs = Photographs(folder)
+    frames: list[Frame] = []
+    stated: list[tuple[int, int]] = []
+    missing: list[str] = []
+    poses = _poses(file, chunk, aligned)
+    poses, said = _on_the_ground(poses)
+    for camera, pose in zip(aligned, poses, strict=True):
+        label = camera.get("label", "")
+        place = _place(camera)
+        path = photographs.find(label, f"{file}: {place}")
+        if path is None:
+            missing.append(label)
+            continue
+        sensor = sensors.get(camera.get("sensor_id", ""))
+        if sensor is None:
+            raise InputError(f"{file}: {place}: its sensor is not in the file; export it again.")
+        lens, size = _lens(file, sensor, image_size(path))
+        c2w = check_pose(pose.tolist(), field=f"{file}: {place}: transform")
+        frames.append(Frame(name=photographs.name(path), path=path, c2w=c2w, lens=lens))
+        stated.append(size)
+    twice = {frame.name for frame in frames}
+    if len(twice) < len(frames):
+        raise InputError(
+            f"{file}: {len(frames) - len(twice)} cameras are of a photograph that another one is "
+            "of; remove them in Metashape, and export again."
+        )
+    warnings = photographs.missing(file, len(aligned), missing)
+    few, many = photographs.unposed(file, {frame.path for frame in frames})
+    return scene_of(
+        folder,
+        file,
+        frames,
+        reading,
+        notes=[*notes, *said, *few, *scaled_note(frames, stated)],
+        warnings=[*warnings, *many],
+    )
+
+
+def _chunk(file: Path) -> tuple[ElementTree.Element, list[str]]:
+    """The chunk of most aligned cameras, and a note of others."""
+    require_regular_file(file)
+    if file.stat().st_size > MAX_JSON_BYTES:
+        raise InputError(f"{file}: is larger than {MAX_JSON_BYTES >> 20} MiB, so no cameras.")
+    text = file.read_bytes()
+    if b"<!" in text.replace(b"<!--", b"").replace(b"<![CDATA[", b""):
+        raise InputError(f"{file}: declares entities or a document type; export it again.")
+    try:
+        root = ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise InputError(f"{file}: is no valid XML: {error}; export the cameras again.") from None
+    chunks = [root] if root.tag == "chunk" else root.findall("chunk")
+    if not chunks:
+        raise InputError(f"{file}: holds no chunk; export cameras in Agisoft XML.")
+    counts = [sum(c.find("transform") is not None for c in _cameras(chunk)) for chunk in chunks]
+    best = max(range(len(chunks)), key=lambda i: counts[i])
+    if len(chunks) == 1:
+        return chunks[0], []
+    name = printable(chunks[best].get("label", "")[:40])
+    return chunks[best], [
+        f"{file.name}: of {len(chunks)} chunks {name!r} is read, that of most cameras "
+        f"({counts[best]})"
+    ]
+
+
+def _cameras(chunk: ElementTree.Element) -> list[ElementTree.Element]:
+    """Of a chunk, also those in groups."""
+    cameras = chunk.find("cameras")
+    return [] if cameras is None else list(cameras.iter("camera"))
+
+
+def _aligned(file: Path, chunk: ElementTree.Element) -> tuple[list[ElementTree.Element], list[str]]:
+    """The cameras that have a pose, in coordinates that are comparable; and notes of others."""
+    cameras = _cameras(chunk)
+    on = [camera for camera in cameras if camera.get("enabled", "1") not in ("0", "false")]
+    aligned = [camera for camera in on if camera.find("transform") is not None]
+    if not aligned:
+        raise InputError(
+            f"{file}: none of its {len(cameras)} cameras is aligned; align them, and export again."
+        )
+    notes = []
+    if len(on) < len(cameras):
+        notes.append(
+            f"{file.name}: left out {len(cameras) - len(on)} cameras that are switched off"
+        )
+    if len(aligned) < len(on):
+        first = next(camera for camera in on if camera.find("transform") is None)
+        rigged = sum(c.find("transform") is None and "master_id" in c.attrib for c in on)
+        rest = f", {rigged} of them of a rig, which are placed by another camera" if rigged else ""
+        notes.append(
+            f"{file.name}: left out {len(on) - len(aligned)} of {len(on)} cameras that are not "
+            f"aligned (first: {printable(first.get('label', '')[:80])}){rest}"
+        )
+    parts: dict[str, list[ElementTree.Element]] = {}
+    for camera in aligned:
+        parts.setdefault(camera.get("component_id", ""), []).append(camera)
+    placed = {c.get("id", "") for c in chunk.iterfind("components/component[transform]")}
+    if len(parts) > 1 and not set(parts) <= placed:
+        largest = max(parts.values(), key=len)
+        notes.append(
+            f"{file.name}: left out {len(aligned) - len(largest)} cameras of {len(parts) - 1} "
+            "smaller components, which have no transform to the largest one"
+        )
+        aligned = largest
+    return aligned, notes
+
+
+def _poses(
+    file: Path, chunk: ElementTree.Element, cameras: Sequence[ElementTree.Element]
+) -> np.ndarray:
+    """Camera to world, [n, 3, 4], OpenGL axes."""
+    own = _transform(file, "chunk", chunk.find("transform"))
+    components = {
+        part.get("id", ""): _transform(
+            file, f"component {printable(part.get('id', '')[:20])}", part.find("transform")
+        )
+        for part in chunk.iterfind("components/component")
+    }
+    poses = []
+    for camera in cameras:
+        place = f"{_place(camera)}: transform"
+        numbers = _numbers(file, place, camera.find("transform"), 16)
+        pose = check_pose(numbers.reshape(4, 4).tolist(), field=f"{file}: {place}")
+        to = components.get(camera.get("component_id", "")) or own
+        if to is not None:
+            with np.errstate(over="ignore", invalid="ignore"):  # refused where they are checked
+                position = to.scale * to.rotation @ pose[:, 3] + to.translation
+            pose = np.concatenate([to.rotation @ pose[:, :3], position[:, None]], axis=1)
+        poses.append(pose * [1.0, -1.0, -1.0, 1.0])
+    return np.array(poses)
+
+
+def _transform(file: Path, place: str, element: ElementTree.Element | None) -> Transform | None:
+    """Of a chunk or a component; None where it has none."""
+    if element is None or len(element) == 0:
+        return None
+    place = f"{place}: transform"
+    parts = {
+        name: _numbers(file, f"{place}: {name}", element.find(name), n)
+        for name, n in (("rotation", 9), ("translation", 3), ("scale", 1))
+        if element.find(name) is not None
+    }
+    scale = float(parts.get("scale", np.ones(1))[0])
+    if not scale > 0.0:
+        raise InputError(f"{file}: {place}: its scale is {scale:g}, not above 0; export it again.")
+    rows = np.eye(3, 4)
+    rows[:, :3] = parts.get("rotation", np.eye(3).ravel()).reshape(3, 3)
+    rotation = check_pose(rows.tolist(), field=f"{file}: {place}: rotation")[:, :3]
+    return Transform(rotation, parts.get("translation", np.zeros(3)), scale)
+
+
+def _on_the_ground(poses: np.ndarray) -> tuple[np.ndarray, list[str]]:
+    """Poses in geocentric coordinates, turned to east, north and up around their middle."""
+    middle = np.median(poses[:, :, 3], axis=0)
+    if not EARTH[0] < float(np.linalg.norm(middle)) < EARTH[1]:
+        return poses, []
+    up = middle / AXES**2
+    up /= np.linalg.norm(up)
+    east = np.cross([0.0, 0.0, 1.0], up)
+    if np.linalg.norm(east) < 1e-6:
+        east = np.array([0.0, 1.0, 0.0])
+    east /= np.linalg.norm(east)
+    turn = np.stack([east, np.cross(up, east), up])
+    there = turn @ (poses - np.concatenate([np.zeros((3, 3)), middle[:, None]], axis=1))
+    at = ", ".join(f"{value:.3f}" for value in middle)
+    return there, [
+        "geocentric coordinates are turned to east, north and up, in metres from the middle of the "
+        f"cameras at ({at})"
+    ]
+
+
+def _lens(
+    file: Path, sensor: ElementTree.Element, photograph: tuple[int, int]
+) -> tuple[Lens, tuple[int, int]]:
+    """The lens of a sensor for a photograph, and the size of images that it is for."""
+    place = f"sensor {printable(sensor.get('id', '')[:20])}"
+    calibrations = sensor.findall("calibration")
+    adjusted = [c for c in calibrations if c.get("class") == "adjusted"]
+    if not calibrations:
+        raise InputError(
+            f"{file}: {place}: has no calibration; align the cameras, and export again."
+        )
+    calibration = (adjusted or calibrations)[-1]
+    kind = calibration.get("type") or sensor.get("type", "frame")
+    if kind not in KINDS:
+        raise InputError(
+            f"{file}: {place}: the lens {printable(str(kind)[:40])!r} is not modelled; export "
+            "undistorted photographs from Metashape, with their cameras."
+        )
+    resolution = calibration.find("resolution")
+    resolution = sensor.find("resolution") if resolution is None else resolution
+    sides = {} if resolution is None else resolution.attrib
+    try:
+        width, height = int(sides["width"]), int(sides["height"])
+    except (KeyError, ValueError):
+        width = height = 0
+    if min(width, height) < 1:
+        raise InputError(f"{file}: {place}: has no resolution in pixels; export it again.")
+    names = ("f", "fx", "fy", "cx", "cy", "b1", "b2", "skew", *COEFFICIENTS)
+    given = {
+        name: float(_numbers(file, f"{place}: {name}", element, 1)[0])
+        for name in names
+        if (element := calibration.find(name)) is not None
+    }
+    if "fx" in given:  # PhotoScan's before 1.2: the principal point from the edges
+        fx, fy = given["fx"], given.get("fy", given["fx"])
+        cx, cy = given.get("cx", 0.5 * width), given.get("cy", 0.5 * height)
+        slant, tangential = given.get("skew", 0.0), ("p2", "p1", "p3", "p4")
+    else:
+        if "f" not in given:
+            raise InputError(f"{file}: {place}: has no focal length f; export it again.")
+        fx, fy = given["f"] + given.get("b1", 0.0), given["f"]
+        cx, cy = 0.5 * width + given.get("cx", 0.0), 0.5 * height + given.get("cy", 0.0)
+        slant, tangential = given.get("b2", 0.0), ("p1", "p2", "p3", "p4")
+    if min(fx, fy) <= 0.0:
+        raise InputError(f"{file}: {place}: its focal length must be above 0; export it again.")
+    values = scaled({"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}, (width, height), photograph)
+    lens = brown_lens(
+        file,
+        place,
+        values,
+        radial=[given.get(name, 0.0) for name in COEFFICIENTS[:4]],
+        tangential=[given.get(name, 0.0) for name in tangential],
+        skew=slant / fx,
+        kind=KINDS[kind],
+    )
+    return lens, (width, height)
+
+
+COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
+
+
+def _numbers(file: Path, place: str, element: ElementTree.Element | None, n: int) -> np.ndarray:
+    """The numbers of an element, [n]."""
+    words = ("" if element is None else element.text or "").split()
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        numbers = []
+    if len(numbers) != n or not all(map(math.isfinite, numbers)):
+        many = "a finite number" if n == 1 else f"{n} finite numbers"
+        raise InputError(f"{file}: {place}: holds something else than {many}; export it again.")
+    return np.array(numbers)
+
+
+def _place(camera: ElementTree.Element) -> str:
+    return f"camera {printable(camera.get('label', '')[:80])!r}"

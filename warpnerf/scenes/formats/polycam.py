@@ -1,0 +1,168 @@
+"""Polycam's raw data: keyframes with a file of JSON for the camera of each.
+
+keyframes/cameras/N.json belongs to keyframes/images/N.jpg and keyframes/depth/N.png; where Polycam
+has optimised them, they are in corrected_cameras and corrected_images. Poses are ARKit's: camera to
+world in OpenGL axes, y up, metres. Depth is in millimetres.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+
+from warpnerf.checks import InputError
+from warpnerf.scenes.cameras.lens import Lens
+from warpnerf.scenes.cameras.poses import check_pose
+from warpnerf.scenes.files import exists, read_json
+from warpnerf.scenes.formats.found_photographs import (
+    Photographs,
+    Reading,
+    scaled,
+    scaled_note,
+    scene_of,
+)
+from warpnerf.scenes.formats.frame import Frame
+from warpnerf.scenes.images.depths import DepthFile
+from warpnerf.scenes.images.images import image_size
+from warpnerf.scenes.scene import Scene
+
+FOLDERS = ("corrected_cameras", "cameras")
+"""Of cameras, the better ones first."""
+IMAGES = {"corrected_cameras": ("corrected_images", "images"), "cameras": ("images",)}
+"""Of the photographs that belong to them."""
+MILLIMETRE = 1e-3
+LOOKED_AT = 65536
+"""Bytes at the beginning of a camera's file by which it is recognised."""
+
+
+class CameraFile(msgspec.Struct):
+    """The camera of a keyframe; other keys are allowed and not read."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: float
+    height: float
+    t_00: float
+    t_01: float
+    t_02: float
+    t_03: float
+    t_10: float
+    t_11: float
+    t_12: float
+    t_13: float
+    t_20: float
+    t_21: float
+    t_22: float
+    t_23: float
+
+
+def find_polycam(folder: Path) -> Path | None:
+    """Where the cameras of an export are; None where there is none."""
+    for place in (folder / "keyframes", folder):
+        for name in FOLDERS:
+            if any((place / images).is_dir() for images in IMAGES[name]) and _is_polycam(
+                place / name
+            ):
+                return place / name
+    return None
+
+
+def _is_polycam(cameras: Path) -> bool:
+    """Whether a folder's first file of JSON has a camera's keys."""
+    try:
+        first = min((path for path in cameras.iterdir() if path.suffix == ".json"), default=None)
+        if first is None or not first.is_file():
+            return False
+        with first.open("rb") as stream:
+            return b'"t_00"' in stream.read(LOOKED_AT)
+    except OSError:
+        return False
+
+
+def load_polycam(cameras: Path, reading: Reading) -> Scene:
+    """Load a scene from Polycam's raw data.
+
+    Args:
+        cameras: The folder of cameras that ``find_polycam`` finds.
+        reading: How photographs are read.
+
+    Returns:
+        The scene, in metres, y up.
+
+    Raises:
+        InputError: A camera's file is damaged, or no photograph is there.
+    """
+    keyframes = cameras.parent
+    folder = keyframes.parent if keyframes.name == "keyframes" else keyframes
+    images = next(keyframes / name for name in IMAGES[cameras.name] if (keyframes / name).is_dir())
+    photographs = Photographs(folder, among=images)
+    files = sorted(path for path in cameras.iterdir() if path.suffix == ".json")
+    frames: list[Frame] = []
+    stated: list[tuple[int, int]] = []
+    missing: list[str] = []
+    other_depth: list[str] = []
+    for file in files:
+        path = photographs.find(file.stem, f"{file}")
+        if path is None:
+            missing.append(file.stem)
+            continue
+        camera = read_json(file, CameraFile)
+        pose = [[getattr(camera, f"t_{i}{j}") for j in range(4)] for i in range(3)]
+        values, size = _lens(file, camera)
+        shape = image_size(path)
+        values = scaled(values, size, shape)
+        depth = keyframes / "depth" / f"{file.stem}.png"
+        there = exists(depth)
+        if there and not _same_shape(image_size(depth), shape):
+            other_depth.append(depth.name)
+            there = False
+        frames.append(
+            Frame(
+                name=photographs.name(path),
+                path=path,
+                c2w=check_pose(pose, field=f"{file}: t_00 to t_23"),
+                lens=Lens(file=file, values=values, fields={name: KEYS[name] for name in values}),
+                depth=DepthFile(depth, MILLIMETRE) if there else None,
+            )
+        )
+        stated.append(size)
+    warnings = photographs.missing(cameras, len(files), missing)
+    notes, without = photographs.unposed(cameras, {frame.path for frame in frames})
+    if other_depth:
+        warnings.append(
+            f"keyframes/depth: left out {len(other_depth)} depth maps of another shape than their "
+            f"photographs (first: {other_depth[0]})"
+        )
+    return scene_of(
+        folder,
+        cameras,
+        frames,
+        reading,
+        notes=[*notes, *scaled_note(frames, stated)],
+        warnings=[*warnings, *without],
+    )
+
+
+KEYS = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", "w": "width", "h": "height"}
+"""Of a camera's file, by the names of a lens."""
+
+
+def _lens(file: Path, camera: CameraFile) -> tuple[dict[str, float], tuple[int, int]]:
+    """Focal lengths and principal point, and the size of images that they are for."""
+    for key in ("fx", "fy", "width", "height"):
+        value = getattr(camera, key)
+        if value <= 0.0 or (key in ("width", "height") and not value.is_integer()):
+            raise InputError(
+                f"{file}: $.{key}: {value:g} is no {'size' if key[0] in 'wh' else 'focal length'} "
+                "in pixels; export the capture again."
+            )
+    values = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
+    return values, (int(camera.width), int(camera.height))
+
+
+def _same_shape(one: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether two sizes are of one shape, as a depth map's and its photograph's have to be."""
+    return abs(one[0] * other[1] - one[1] * other[0]) <= max(other)
