@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from warpnerf.checks import InputError
     from warpnerf.config import GridConfig, MarchConfig, TrainConfig
     from warpnerf.evaluation.evaluate import Evaluation, evaluate
-    from warpnerf.exporting.export import export
+    from warpnerf.exporting.export import export, export_all
     from warpnerf.exporting.splats import Splats, splats_of
     from warpnerf.exporting.surface import Surface, extract_surface
     from warpnerf.exporting.visibility import Visibility, visibility
@@ -81,6 +81,7 @@ _HOMES = {
     "Evaluation": "evaluation.evaluate",
     "evaluate": "evaluation.evaluate",
     "export": "exporting.export",
+    "export_all": "exporting.export",
     "Visibility": "exporting.visibility",
     "visibility": "exporting.visibility",
     "Splats": "exporting.splats",
@@ -137,6 +138,7 @@ __all__ = [  # noqa: RUF022 (grouped by home, as above)
     "Evaluation",
     "evaluate",
     "export",
+    "export_all",
     "Visibility",
     "visibility",
     "Splats",

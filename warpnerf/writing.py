@@ -1,9 +1,12 @@
-"""Files that are written whole or not at all."""
+"""Files that are written whole or not at all, alone or several together."""
 
 from __future__ import annotations
 
 import os
+import shutil
+from collections.abc import Callable
 from pathlib import Path
+from types import TracebackType
 
 CHUNK = 1 << 24
 """Bytes per write: signals such as Ctrl-C wait for one to end."""
@@ -17,14 +20,37 @@ def write_atomically(path: str | Path, *pieces: bytes | memoryview) -> None:
     Raises:
         OSError: It cannot be written.
     """
-    path = Path(path)
-    if _takes_a_stream(path):
-        with path.open("wb") as stream:
-            stream.writelines(pieces)
-        return
-    path = Path(os.path.realpath(path))
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
+    with StagedWrites() as staged:
+        staged.add(path, *pieces)
+
+
+class StagedWrites:
+    """Atomic writes of several files and folders: all of them are replaced, or none is.
+
+    Within a `with` statement everything is written under temporary names beside its place. At the
+    end all are renamed; after an exception all are removed. What was there before is left until
+    everything is written.
+    """
+
+    def __init__(self) -> None:
+        """Nothing is written yet."""
+        self._ready: list[tuple[Path, Path]] = []
+        self._streams: list[tuple[Path, tuple[bytes | memoryview, ...]]] = []
+
+    def add(self, path: str | Path, *pieces: bytes | memoryview) -> None:
+        """Write a file beside its place.
+
+        A link stays, and what it leads to is replaced. Pipes and devices are written to in the end.
+
+        Raises:
+            OSError: It cannot be written.
+        """
+        path = Path(path)
+        if _takes_a_stream(path):
+            self._streams.append((path, pieces))
+            return
+        path = Path(os.path.realpath(path))
+        temporary = self._beside(path)
         flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | getattr(os, "O_BINARY", 0)
         file = os.open(temporary, flags, 0o666)
         try:
@@ -35,16 +61,57 @@ def write_atomically(path: str | Path, *pieces: bytes | memoryview) -> None:
             os.fsync(file)
         finally:
             os.close(file)
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-    if os.name == "posix":
-        folder = os.open(path.parent, os.O_RDONLY)
+
+    def add_folder(self, path: Path, fill: Callable[[Path], None]) -> None:
+        """Fill a folder beside its place, which is new or an empty folder.
+
+        Args:
+            path: Of the folder.
+            fill: Writes what is in it, given the temporary folder.
+
+        Raises:
+            OSError: It cannot be written.
+        """
+        temporary = self._beside(path)
+        temporary.mkdir()
+        fill(temporary)
+
+    def _beside(self, path: Path) -> Path:
+        temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+        self._ready.append((temporary, path))
+        return temporary
+
+    def __enter__(self) -> StagedWrites:
+        """Begin."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Rename all, or remove all."""
         try:
-            os.fsync(folder)
+            if kind is None:
+                for path, pieces in self._streams:
+                    with path.open("wb") as stream:
+                        stream.writelines(pieces)
+                for temporary, path in self._ready:
+                    temporary.replace(path)
         finally:
-            os.close(folder)
+            for temporary, _ in self._ready:
+                if temporary.is_dir():
+                    shutil.rmtree(temporary, ignore_errors=True)
+                else:
+                    temporary.unlink(missing_ok=True)
+        if os.name == "posix":
+            for parent in {path.parent for _, path in self._ready}:
+                folder = os.open(parent, os.O_RDONLY)
+                try:
+                    os.fsync(folder)
+                finally:
+                    os.close(folder)
 
 
 def _takes_a_stream(path: Path) -> bool:

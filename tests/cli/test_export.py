@@ -16,7 +16,9 @@ from tests.support.tiny_scenes import write_transforms
 from warpnerf.checks import InputError
 from warpnerf.cli.export import export_command
 from warpnerf.config import TrainConfig
+from warpnerf.exporting import splats, surface, visibility_file, volume
 from warpnerf.exporting.export import FORMATS, export
+from warpnerf.exporting.visibility import visibility as computed_visibility
 from warpnerf.runs.run import Run
 from warpnerf.scenes.formats.load import load_scene
 
@@ -43,7 +45,7 @@ def test_every_ending_becomes_a_file(
 ) -> None:
     target = tmp_path / f"BALL{ending.upper()}"
     target.write_bytes(b"older")
-    assert export_command(run_folder, target, threads=1) == 0
+    assert export_command(run_folder, (target,), threads=1) == 0
     assert len(target.read_bytes()) > 1000
     assert [path.name for path in tmp_path.iterdir()] == [target.name]
     said = capsys.readouterr().out
@@ -66,15 +68,15 @@ def test_lenses_that_3dgs_does_not_read_are_said(
     run = Run(tmp_path / "run")
     run.create(scene, str(tmp_path / "scene"), 1, scene.content_distance, TrainConfig())
     run.save_field(ball_field())
-    assert export_command(tmp_path / "run", tmp_path / "out", threads=1) == 0
+    assert export_command(tmp_path / "run", (tmp_path / "out",), threads=1) == 0
     said = capsys.readouterr().out
     assert ("3DGS reads PINHOLE only: colmap image_undistorter --image_path" in said) == (k1 > 0.0)
 
 
 def test_options_reach_the_surface(run_folder: Path, tmp_path: Path) -> None:
     whole, half = tmp_path / "whole.ply", tmp_path / "half.ply"
-    export_command(run_folder, whole, level=LEVEL, threads=1)
-    export_command(run_folder, half, level=LEVEL, crop=(-1, -1, -1, 0.1, 1, 1), threads=1)
+    export_command(run_folder, (whole,), level=LEVEL, threads=1)
+    export_command(run_folder, (half,), level=LEVEL, crop=(-1, -1, -1, 0.1, 1, 1), threads=1)
     points, _ = read_ply(half.read_bytes())
     assert points["x"].max() <= 0.1 < read_ply(whole.read_bytes())[0]["x"].max()
     assert np.hypot(*(points[c] - m for c, m in zip("xy", (0.1, -0.05), strict=True))).max() < 0.61
@@ -108,13 +110,94 @@ def test_bad_input_is_refused_and_nothing_is_written(
     def takes_long(*_: object) -> None:
         pytest.fail("looks through all cameras first")
 
-    monkeypatch.setattr("warpnerf.exporting.export.visibility", takes_long)
+    monkeypatch.setattr("warpnerf.exporting.export.cached_visibility", takes_long)
     (tmp_path / "folder.ply").mkdir()
     before = contents(run_folder)
     with pytest.raises(InputError, match=says):
-        export_command(run_folder, tmp_path / file, **options)
+        export_command(run_folder, (tmp_path / file,), **options)
     assert contents(run_folder) == before
     assert [path.name for path in tmp_path.iterdir()] == ["folder.ply"]
+
+
+def test_several_files_are_written_in_one_pass(
+    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each with the bytes that it has alone; cameras, surface and splats are computed once."""
+    names = ("a.glb", "b.ply", "c.splat.ply", "d.npz", "e")
+    for name in names:
+        export_command(run_folder, (tmp_path / name,), level=LEVEL if name in "ae" else None)
+    Run(run_folder).visibility_file.unlink()
+    counted: dict[str, int] = {}
+
+    def count(module: Any, name: str) -> None:
+        function = getattr(module, name)
+
+        def counting(*arguments: Any, **options: Any) -> Any:
+            counted[name] = counted.get(name, 0) + 1
+            return function(*arguments, **options)
+
+        monkeypatch.setattr(module, name, counting)
+
+    count(visibility_file.computed, "visibility")
+    count(surface, "extract_surface")
+    count(splats, "splats_of")
+    (tmp_path / "all").mkdir()
+    together = tuple(tmp_path / "all" / name for name in names)
+    assert export_command(run_folder, together, threads=1) == 0
+    assert counted == {"visibility": 1, "extract_surface": 1, "splats_of": 1}
+    for name in names[:-1]:
+        assert (tmp_path / "all" / name).read_bytes() == (tmp_path / name).read_bytes(), name
+    assert {path.name for path in (tmp_path / "all").iterdir()} == {*names}
+    assert export_command(run_folder, (tmp_path / "all" / "f.glb",), threads=1) == 0
+    assert counted["visibility"] == 1  # read from the run's folder
+    assert (tmp_path / "all" / "f.glb").read_bytes() == (tmp_path / "a.glb").read_bytes()
+
+
+def test_of_another_field_the_visibility_is_computed_again(tmp_path: Path) -> None:
+    scene, file = ball_scene(), tmp_path / "seen.safetensors"
+    views = [scene.views[index] for index in scene.splits["train"]]
+    first = visibility_file.cached_visibility(ball_field(), views, file)
+    again = visibility_file.cached_visibility(ball_field(), views, file)
+    np.testing.assert_array_equal(first.light, again.light)
+    np.testing.assert_array_equal(first.colour, again.colour)
+    small = ball_field(radius=0.3)
+    left = np.broadcast_to(np.arange(48) < 24, (40, 48))
+    masked = [replace(views[0], mask=left), *views[1:]]
+    nearer = [
+        replace(view, camera=replace(view.camera, c2w=view.camera.c2w * [1, 1, 1, 0.8]))
+        for view in views
+    ]
+    for field, seen in ((small, views), (ball_field(), masked), (ball_field(), nearer)):
+        found = visibility_file.cached_visibility(field, seen, file)
+        np.testing.assert_array_equal(found.light, computed_visibility(field, seen).light)
+    file.write_bytes(file.read_bytes()[:-40] + bytes(40))  # damaged
+    found = visibility_file.cached_visibility(ball_field(), views, file)
+    np.testing.assert_array_equal(found.light, first.light)
+
+
+def test_a_link_in_place_of_the_cache_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "other").write_bytes(b"mine")
+    (tmp_path / "seen.safetensors").symlink_to(tmp_path / "other")
+    views = ball_scene().views
+    visibility_file.cached_visibility(ball_field(), views, tmp_path / "seen.safetensors")
+    assert (tmp_path / "other").read_bytes() == b"mine"
+
+
+def test_if_one_file_cannot_be_written_none_is(
+    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    (tmp_path / "a.glb").write_bytes(b"older")
+    monkeypatch.setattr(volume, "volume_npz", full)
+    files = (tmp_path / "a.glb", tmp_path / "scene", tmp_path / "b.npz")
+    with pytest.raises(InputError, match="No space left on device; name another place"):
+        export_command(run_folder, files, threads=1)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.glb"]
+    assert (tmp_path / "a.glb").read_bytes() == b"older"
+    with pytest.raises(InputError, match="named twice"):
+        export_command(run_folder, (tmp_path / "x.glb", tmp_path / "." / "x.glb"), threads=1)
 
 
 def test_what_is_no_run_ends_with_a_sentence(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""`warpnerf export`: a trained scene as a file for other programs."""
+"""`warpnerf export`: a trained scene as files for other programs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ from warpnerf.runtime.progress import ProgressBar
 
 def export_command(
     folder: RunFolder,
-    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")],
+    files: Annotated[
+        tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FILE [FILE ...]")
+    ],
     /,
     level: float | None = None,
     crop: Corners = None,
@@ -25,7 +27,7 @@ def export_command(
     device: str = "cpu",
     threads: int | None = None,
 ) -> int:
-    """Write a trained run for other programs, as the ending of the file's name says.
+    """Write a trained run for other programs, as the endings of the files' names say.
 
     .glb, .ply, .obj: a mesh with colours. .points.ply: points with normals and colours.
     .splat.ply: Gaussian splats. .html: a page that shows splats in any browser, offline.
@@ -34,7 +36,8 @@ def export_command(
 
     Args:
         folder: Output folder of a training run.
-        file: Where to write; a file is replaced, a folder has to be new.
+        files: Where to write; a file is replaced, a folder has to be new. Several take little
+            longer than one, and either all are written or none is.
         level: Density of the surface, 1 / scene unit; by default that of which a voxel edge is
             20 % opaque.
         crop: Two corners of the box that is written, scene units; by default what the cameras see,
@@ -47,21 +50,21 @@ def export_command(
         threads: CPU threads; by default one per usable core.
     """
     from warpnerf.exporting.cameras import camera_model
-    from warpnerf.exporting.export import FORMATS, checked_ending, export
+    from warpnerf.exporting.export import FORMATS, checked_ending, export_all
     from warpnerf.runs.run import Run
     from warpnerf.runs.scene import load_run_scene
 
     run = Run(folder)
     config = run.read_config()
-    ending = checked_ending(file)
-    kind = FORMATS[ending]
+    endings = [checked_ending(file) for file in files]
     field, notes = run.load_field(device, threads)
     for note in notes:
         print(f"warpnerf: note: {note}", file=sys.stderr)
     views = load_run_scene(config, scene, threads)
     n_cameras = len(views.training_cameras)
     grid = " x ".join(map(str, field.lattice.size))
-    what = kind if kind.endswith("s") else f"a {kind}"
+    kinds = dict.fromkeys(FORMATS[ending] for ending in endings)
+    what = " and ".join(kind if kind.endswith("s") else f"a {kind}" for kind in kinds)
     print(f"exporting a grid of {grid} nodes as {what}", flush=True)
     with ProgressBar("first training camera") as bar:
 
@@ -70,26 +73,29 @@ def export_command(
             bar.report(done / n_cameras, text)
 
         try:
-            export(
+            export_all(
                 field,
-                file,
+                files,
                 scene=views,
                 unseen=unseen,
                 level=level,
                 crop=None if crop is None else (crop[:3], crop[3:]),
                 min_size=min_size,
                 on_camera=on_camera,
+                cache=run.visibility_file,
             )
         except OSError as error:
             raise InputError(
-                f"{file} cannot be written: {error.strerror or error}; name another place, or make "
-                "room."
+                f"{error.filename or files[0]} cannot be written: {error.strerror or error}; name "
+                "another place, or make room."
             ) from error
-    print(f"wrote {file}")
-    if ending == "" and any(camera_model(camera) != "PINHOLE" for camera in views.cameras):
+    for file in files:
+        print(f"wrote {file}")
+    folders = [file for file, ending in zip(files, endings, strict=True) if ending == ""]
+    if folders and any(camera_model(camera) != "PINHOLE" for camera in views.cameras):
         print(
             "note: the lenses have distortion, as in the photographs; 3DGS reads PINHOLE only: "
-            f"colmap image_undistorter --image_path {file}/images --input_path {file}/sparse/0 "
-            "--output_path NEW makes such a folder of it"
+            f"colmap image_undistorter --image_path {folders[0]}/images --input_path "
+            f"{folders[0]}/sparse/0 --output_path NEW makes such a folder of it"
         )
     return 0

@@ -9,8 +9,6 @@ masks/               white where pixels count, where any photograph has a mask
 
 from __future__ import annotations
 
-import os
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -28,10 +26,10 @@ MAX_POINTS = 100_000
 
 
 def write_scene(folder: Path, scene: Scene, surface: Surface) -> None:
-    """Write the folder, whole or not at all.
+    """Write the dataset into an empty folder.
 
     Args:
-        folder: New, or empty.
+        folder: Empty.
         scene: What to write; images as they are in memory, so reduced where the run's were.
         surface: Of the field that was trained on it.
 
@@ -42,28 +40,20 @@ def write_scene(folder: Path, scene: Scene, surface: Surface) -> None:
 
     points = thinned(surface)
     files = picture_files([view.name for view in scene.views])
-    model = colmap_text(scene, files, points)
-    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
-    temporary.mkdir()
-    try:
-        (temporary / "images").mkdir()
-        (temporary / "sparse" / "0").mkdir(parents=True)
-        (temporary / "transforms.json").write_text(transforms_json(scene, files))
-        (temporary / "points.ply").write_bytes(b"".join(points_ply(points)))
-        for name, text in model.items():
-            (temporary / "sparse" / "0" / name).write_text(text)
+    (folder / "images").mkdir()
+    (folder / "sparse" / "0").mkdir(parents=True)
+    (folder / "transforms.json").write_text(transforms_json(scene, files))
+    (folder / "points.ply").write_bytes(b"".join(points_ply(points)))
+    for name, text in colmap_text(scene, files, points).items():
+        (folder / "sparse" / "0" / name).write_text(text)
+    if _masked(scene):
+        (folder / "masks").mkdir()
+    for view in scene.views:
+        Image.fromarray(view.image).save(folder / "images" / files[view.name])
         if _masked(scene):
-            (temporary / "masks").mkdir()
-        for view in scene.views:
-            Image.fromarray(view.image).save(temporary / "images" / files[view.name])
-            if _masked(scene):
-                size = (view.camera.height, view.camera.width)
-                kept = np.ones(size, bool) if view.mask is None else view.mask
-                Image.fromarray(kept).convert("L").save(temporary / "masks" / files[view.name])
-        temporary.replace(folder)
-    except BaseException:
-        shutil.rmtree(temporary, ignore_errors=True)
-        raise
+            size = (view.camera.height, view.camera.width)
+            kept = np.ones(size, bool) if view.mask is None else view.mask
+            Image.fromarray(kept).convert("L").save(folder / "masks" / files[view.name])
 
 
 def thinned(surface: Surface) -> Surface:

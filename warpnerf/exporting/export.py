@@ -1,19 +1,22 @@
-"""The entry point of exports: ``export`` writes the format that the name of the file says."""
+"""The entry point of exports: the name of a file says its format; several are written together."""
 
 from __future__ import annotations
 
+import functools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from warpnerf.checks import InputError, require_kind
 from warpnerf.exporting import cameras as scenes
 from warpnerf.exporting import mesh, page, splats, surface, volume
-from warpnerf.exporting.visibility import visibility
+from warpnerf.exporting.visibility import Visibility
+from warpnerf.exporting.visibility_file import cached_visibility
 from warpnerf.rendering.field import Field
 from warpnerf.scenes.cameras.focus import up_direction
 from warpnerf.scenes.scene import Scene
-from warpnerf.writing import write_atomically
+from warpnerf.writing import StagedWrites
 
 SURFACES = (".glb", ".obj", ".ply", ".points.ply", "")
 SPLATS = (".splat.ply", ".html")
@@ -72,50 +75,145 @@ def export(
             format, a missing scene or package, or nothing to write.
         OSError: It cannot be written; what was there before is left as it was.
     """
+    (written,) = export_all(
+        field,
+        [path],
+        scene=scene,
+        unseen=unseen,
+        level=level,
+        crop=crop,
+        min_size=min_size,
+        on_camera=on_camera,
+    )
+    return written
+
+
+def export_all(
+    field: Field,
+    paths: Sequence[str | Path],
+    *,
+    scene: Scene | None = None,
+    unseen: bool = False,
+    level: float | None = None,
+    crop: surface.Crop | None = None,
+    min_size: float | None = None,
+    on_camera: Callable[[int], None] | None = None,
+    cache: Path | None = None,
+) -> list[Path]:
+    """Export a field in several formats at once: each as the ending of its name says.
+
+    What the cameras see, the surface and the splats are computed once. All files are written, or
+    none is.
+
+    Args:
+        field: What to write.
+        paths: Of the files, which are replaced, and of new folders; at least one, all different.
+        scene: As for ``export``.
+        unseen: As for ``export``.
+        level: Of surfaces, where there is one among the files.
+        crop: As for ``export``.
+        min_size: Of surfaces, where there is one among the files.
+        on_camera: As for ``export``.
+        cache: A file that keeps the visibility for the next export; see ``cached_visibility``.
+
+    Returns:
+        Where they went.
+
+    Raises:
+        InputError: As ``export``, or no path, or one that is given twice.
+        OSError: One cannot be written; what was there before is left as it was.
+    """
     require_kind(field, Field, "export wants a field", "load_field reads that of a run")
     if scene is not None:
         require_kind(scene, Scene, "export wants a scene", "load_scene gives that of a folder")
-    path = Path(path)
-    ending = checked_ending(path)
+    targets = [Path(path) for path in paths]
+    if not targets:
+        raise InputError("export wants at least one file to write; name one.")
+    if len({os.path.realpath(path) for path in targets}) < len(targets):
+        raise InputError("a file to export is named twice; name each once.")
+    endings = [checked_ending(path) for path in targets]
     for name, value in (("level", level), ("min_size", min_size)):
-        if value is not None and ending not in SURFACES:
+        if value is not None and not set(endings) & set(SURFACES):
             raise InputError(
-                f"{path}: {name} is of surfaces, and this file holds none; leave it out."
+                f"{targets[0]}: {name} is of surfaces, and this file holds none; leave it out."
             )
     # Before what takes long:
     surface.check_options(field, level, crop, min_size)
-    if ending in SURFACES:
-        surface.require_crossed(field, level, crop)
-    if scene is None and ending in ("", ".html"):
-        raise InputError(f"{path}: a {FORMATS[ending]} needs the scene of the training; give it.")
-    if ending in VOLUMES:
-        volume.checked_block(field, crop)
+    for path, ending in zip(targets, endings, strict=True):
+        if scene is None and ending in ("", ".html"):
+            raise InputError(
+                f"{path}: a {FORMATS[ending]} needs the scene of the training; give it."
+            )
+        if ending in SURFACES:
+            surface.require_crossed(field, level, crop)
+        if ending in VOLUMES:
+            volume.checked_block(field, crop)
     views = [] if scene is None else [scene.views[index] for index in scene.splits["train"]]
-    visible = visibility(field, views, on_camera) if views else None
-    up = None if scene is None else up_direction(scene.training_cameras)
-    if ending in SPLATS:
-        made = splats.splats_of(field, visible, unseen=unseen, crop=crop)
-        if scene is not None and ending == ".html":
-            pieces = page.splats_html(made, scene, field.background)
-        else:
-            pieces = splats.splats_ply(made, up)
-    elif ending in VOLUMES:
-        block = volume.volume_of(field, visible, unseen=unseen, crop=crop)
-        pieces = volume.volume_nvdb(block) if ending == ".nvdb" else volume.volume_npz(block)
-    else:
-        found = surface.extract_surface(
-            field, visible, unseen=unseen, level=level, crop=crop, min_size=min_size
+    products = _Products(
+        field=field,
+        scene=scene,
+        visible=cached_visibility(field, views, cache, on_camera) if views else None,
+        unseen=unseen,
+        level=level,
+        crop=crop,
+        min_size=min_size,
+    )
+    with StagedWrites() as staged:
+        for path, ending in zip(targets, endings, strict=True):
+            if scene is not None and ending == "":
+                fill = functools.partial(scenes.write_scene, scene=scene, surface=products.surface)
+                staged.add_folder(path, fill)
+            else:
+                staged.add(path, *products.pieces(ending))
+    return targets
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Products:
+    """What files are made of, each computed once, when the first file needs it."""
+
+    field: Field
+    scene: Scene | None
+    visible: Visibility | None
+    unseen: bool
+    level: float | None
+    crop: surface.Crop | None
+    min_size: float | None
+
+    @functools.cached_property
+    def surface(self) -> surface.Surface:
+        return surface.extract_surface(
+            self.field,
+            self.visible,
+            unseen=self.unseen,
+            level=self.level,
+            crop=self.crop,
+            min_size=self.min_size,
         )
-        if scene is not None and ending == "":
-            scenes.write_scene(path, scene, found)
-            return path
+
+    @functools.cached_property
+    def splats(self) -> splats.Splats:
+        return splats.splats_of(self.field, self.visible, unseen=self.unseen, crop=self.crop)
+
+    @functools.cached_property
+    def volume(self) -> volume.Volume:
+        return volume.volume_of(self.field, self.visible, unseen=self.unseen, crop=self.crop)
+
+    def pieces(self, ending: str) -> list[bytes]:
+        """The pieces of the file of a format."""
+        up = None if self.scene is None else up_direction(self.scene.training_cameras)
+        if ending == ".html" and self.scene is not None:
+            return page.splats_html(self.splats, self.scene, self.field.background)
+        if ending == ".splat.ply":
+            return splats.splats_ply(self.splats, up)
+        if ending == ".nvdb":
+            return volume.volume_nvdb(self.volume)
+        if ending == ".npz":
+            return volume.volume_npz(self.volume)
         if ending == ".glb":
-            pieces = mesh.mesh_glb(found, up)
-        else:
-            write = {".obj": mesh.mesh_obj, ".ply": mesh.mesh_ply, ".points.ply": mesh.points_ply}
-            pieces = write[ending](found)
-    write_atomically(path, *pieces)
-    return path
+            return mesh.mesh_glb(self.surface, up)
+        write = {".obj": mesh.mesh_obj, ".ply": mesh.mesh_ply, ".points.ply": mesh.points_ply}
+        return write[ending](self.surface)
 
 
 def checked_ending(path: str | Path) -> str:

@@ -71,10 +71,10 @@ def save_field(path: str | Path, field: Field, precision: Precision = "float32")
         OSError: The file cannot be written; an older one is then left as it was.
     """
     require_one_of("precision", precision, get_args(Precision))
-    kind, tensors = FIELD, _field_tensors(field)
+    kind, tensors = FIELD, field_tensors(field)
     if precision == "float16":
         kind, tensors = COMPACT, compact(field, tensors)
-    write_tensors(path, {"format": kind} | _field_header(field), tensors)
+    write_tensors(path, {"format": kind} | field_header(field), tensors)
 
 
 def save_checkpoint(path: str | Path, state: TrainingState) -> None:
@@ -99,8 +99,8 @@ def save_checkpoint(path: str | Path, state: TrainingState) -> None:
     else:
         kind, config = WITHOUT_PLAN, config_to_json(state.config)
         training |= asdict(state.plan) | {"config": config}
-    header = {"format": kind, "training": training} | _field_header(state.field)
-    write_tensors(path, header, _optimiser_tensors(state) | _field_tensors(state.field))
+    header = {"format": kind, "training": training} | field_header(state.field)
+    write_tensors(path, header, _optimiser_tensors(state) | field_tensors(state.field))
 
 
 def load_field(path: str | Path, device: str = "cpu", threads: int | None = None) -> Field:
@@ -235,7 +235,8 @@ class _Header(msgspec.Struct, frozen=True):
     proposal: StoredProposal | None = None
 
 
-def _field_header(field: Field) -> dict[str, Any]:
+def field_header(field: Field) -> dict[str, Any]:
+    """How a field is rendered, in JSON."""
     lattice, frustum = field.lattice, field.lattice.frustum
     header = {
         "model": to_json(field.model),
@@ -264,7 +265,8 @@ def _field_header(field: Field) -> dict[str, Any]:
     return header
 
 
-def _field_tensors(field: Field) -> dict[str, np.ndarray]:
+def field_tensors(field: Field) -> dict[str, np.ndarray]:
+    """The arrays of a field, by name: with its header, all that it renders with."""
     tensors = field.storage.tensors()
     if field.proposal is not None:
         tensors[PARAMETER] = field.proposal.grid.tensors()["values"]

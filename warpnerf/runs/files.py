@@ -29,6 +29,8 @@ SHEET = "test.png"
 """The picture of a few test views."""
 CURVES = "curves.png"
 """The picture of the training's loss and PSNR."""
+VISIBILITY = "visibility.safetensors"
+"""What the training cameras see of the field, kept by the first export for later ones."""
 PREVIOUS = "previous"
 """Folder for the files of an older run."""
 
@@ -174,7 +176,7 @@ def take_scene(folder: Path, source: str) -> None:
 
 def _by_products(folder: Path) -> list[Path]:
     """What else a run writes, but its configuration."""
-    names = ("log.jsonl", CSV, CURVES, "metrics.json", SHEET)
+    names = ("log.jsonl", CSV, CURVES, "metrics.json", SHEET, VISIBILITY)
     files = [*(folder / name for name in names), *(folder / TENSORBOARD).glob(EVENTS)]
     files += [folder / "test" / name for name in _pictures(folder)]
     return [path for path in files if path.exists()]

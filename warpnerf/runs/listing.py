@@ -104,7 +104,7 @@ def in_words(config: TrainConfig) -> str:
 
 
 def remove_checkpoints(run: RunSummary) -> int:
-    """Remove the checkpoints of a finished run; its field stays.
+    """Remove the checkpoints of a finished run, and what exports keep; its field stays.
 
     Args:
         run: Any; one that is not finished is left alone.
@@ -119,7 +119,8 @@ def remove_checkpoints(run: RunSummary) -> int:
         return 0
     n_bytes = 0
     with lock.only_writer(run.folder):
-        for path in files.checkpoints(run.folder):
+        kept = run.folder / files.VISIBILITY
+        for path in [*files.checkpoints(run.folder), *([kept] if kept.exists() else [])]:
             n_bytes += path.stat().st_size
             path.unlink()
     return n_bytes

@@ -6,6 +6,7 @@ log.csv, tensorboard/        the same, by --log
 curves.png                   loss and PSNR over steps and seconds, once it is finished
 checkpoint-*.safetensors     the training after so many steps; the last two, until it is finished
 field.safetensors            the trained field, in half precision
+visibility.safetensors       what training cameras see of it, once it has been exported
 metrics.json                 figures of the test views
 test.png                     a few test views, to look at first: truth, rendering, depth, PSNR
 test/                        truth, rendering and depth of each test view, side by side
@@ -83,6 +84,11 @@ class Run:
     def sheet(self) -> Path:
         """The picture of a few test views."""
         return self.folder / run_files.SHEET
+
+    @property
+    def visibility_file(self) -> Path:
+        """Where exports keep what the training cameras see."""
+        return self.folder / run_files.VISIBILITY
 
     @property
     def last_step(self) -> int | None:
