@@ -22,6 +22,7 @@ def export_command(
     level: float | None = None,
     crop: Corners = None,
     min_size: float | None = None,
+    faces: int | None = None,
     unseen: bool = False,
     scene: str | None = None,
     device: str = "cpu",
@@ -44,6 +45,7 @@ def export_command(
             for splats all of space.
         min_size: Parts of a surface are dropped whose box has a shorter diagonal, scene units; by
             default eight voxel edges.
+        faces: Triangles of the mesh, about; by default two for each voxel that it crosses.
         unseen: Also write what no training camera sees.
         scene: Where the run's photographs are now, if they have moved.
         device: cpu, cuda, cuda:1, ...
@@ -81,6 +83,7 @@ def export_command(
                 level=level,
                 crop=None if crop is None else (crop[:3], crop[3:]),
                 min_size=min_size,
+                n_faces=faces,
                 on_camera=on_camera,
                 cache=run.visibility_file,
             )

@@ -11,6 +11,7 @@ from pathlib import Path
 from warpnerf.checks import InputError, require_kind
 from warpnerf.exporting import cameras as scenes
 from warpnerf.exporting import mesh, page, splats, surface, volume
+from warpnerf.exporting.surface import Surface
 from warpnerf.exporting.visibility import Visibility
 from warpnerf.exporting.visibility_file import cached_visibility
 from warpnerf.rendering.field import Field
@@ -18,6 +19,7 @@ from warpnerf.scenes.cameras.focus import up_direction
 from warpnerf.scenes.scene import Scene
 from warpnerf.writing import StagedWrites
 
+MESHES = (".glb", ".obj", ".ply")
 SURFACES = (".glb", ".obj", ".ply", ".points.ply", "")
 SPLATS = (".splat.ply", ".html")
 VOLUMES = (".nvdb", ".npz")
@@ -44,6 +46,7 @@ def export(
     level: float | None = None,
     crop: surface.Crop | None = None,
     min_size: float | None = None,
+    n_faces: int | None = None,
     on_camera: Callable[[int], None] | None = None,
 ) -> Path:
     """Export a field as a mesh, point cloud, Gaussian splats, volume or page, as the ending of the
@@ -65,6 +68,7 @@ def export(
         crop: Lower and upper corner of what is written, scene units; None: what cameras
             see, for splats all of space; volumes end at the box of the grid.
         min_size: Smaller parts of a surface are dropped, scene units; see ``extract_surface``.
+        n_faces: Triangles of a mesh, about; None: as many as there are.
         on_camera: Called with the number of training cameras that were looked through.
 
     Returns:
@@ -83,6 +87,7 @@ def export(
         level=level,
         crop=crop,
         min_size=min_size,
+        n_faces=n_faces,
         on_camera=on_camera,
     )
     return written
@@ -97,6 +102,7 @@ def export_all(
     level: float | None = None,
     crop: surface.Crop | None = None,
     min_size: float | None = None,
+    n_faces: int | None = None,
     on_camera: Callable[[int], None] | None = None,
     cache: Path | None = None,
 ) -> list[Path]:
@@ -113,6 +119,7 @@ def export_all(
         level: Of surfaces, where there is one among the files.
         crop: As for ``export``.
         min_size: Of surfaces, where there is one among the files.
+        n_faces: Of meshes, where there is one among the files.
         on_camera: As for ``export``.
         cache: A file that keeps the visibility for the next export; see ``cached_visibility``.
 
@@ -132,13 +139,17 @@ def export_all(
     if len({os.path.realpath(path) for path in targets}) < len(targets):
         raise InputError("a file to export is named twice; name each once.")
     endings = [checked_ending(path) for path in targets]
-    for name, value in (("level", level), ("min_size", min_size)):
-        if value is not None and not set(endings) & set(SURFACES):
+    for name, value, what, those in (
+        ("level", level, "surfaces", SURFACES),
+        ("min_size", min_size, "surfaces", SURFACES),
+        ("the number of faces", n_faces, "meshes", MESHES),
+    ):
+        if value is not None and not {*endings} & {*those}:
             raise InputError(
-                f"{targets[0]}: {name} is of surfaces, and this file holds none; leave it out."
+                f"{targets[0]}: {name} is of {what}, and this file holds none; leave it out."
             )
     # Before what takes long:
-    surface.check_options(field, level, crop, min_size)
+    surface.check_options(field, level, crop, min_size, n_faces)
     for path, ending in zip(targets, endings, strict=True):
         if scene is None and ending in ("", ".html"):
             raise InputError(
@@ -157,6 +168,7 @@ def export_all(
         level=level,
         crop=crop,
         min_size=min_size,
+        n_faces=n_faces,
     )
     with StagedWrites() as staged:
         for path, ending in zip(targets, endings, strict=True):
@@ -179,9 +191,17 @@ class _Products:
     level: float | None
     crop: surface.Crop | None
     min_size: float | None
+    n_faces: int | None
 
     @functools.cached_property
-    def surface(self) -> surface.Surface:
+    def mesh(self) -> Surface:
+        return self.surface if self.n_faces is None else self._surface(self.n_faces)
+
+    @functools.cached_property
+    def surface(self) -> Surface:
+        return self._surface(None)
+
+    def _surface(self, n_faces: int | None) -> Surface:
         return surface.extract_surface(
             self.field,
             self.visible,
@@ -189,6 +209,7 @@ class _Products:
             level=self.level,
             crop=self.crop,
             min_size=self.min_size,
+            n_faces=n_faces,
         )
 
     @functools.cached_property
@@ -211,9 +232,10 @@ class _Products:
         if ending == ".npz":
             return volume.volume_npz(self.volume)
         if ending == ".glb":
-            return mesh.mesh_glb(self.surface, up)
-        write = {".obj": mesh.mesh_obj, ".ply": mesh.mesh_ply, ".points.ply": mesh.points_ply}
-        return write[ending](self.surface)
+            return mesh.mesh_glb(self.mesh, up)
+        if ending == ".points.ply":
+            return mesh.points_ply(self.surface)
+        return {".obj": mesh.mesh_obj, ".ply": mesh.mesh_ply}[ending](self.mesh)
 
 
 def checked_ending(path: str | Path) -> str:

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from warpnerf.checks import InputError, require_at_least, require_positive
+from warpnerf.checks import InputError, require_at_least, require_positive, require_whole
 from warpnerf.exporting.colour import colours
+from warpnerf.exporting.decimation import decimated
 from warpnerf.exporting.visibility import SEEN, Visibility
 from warpnerf.fields.nodes import nodes_of, points_of, values_at, voxel_edges
 from warpnerf.renamed import renamed_argument
@@ -21,6 +22,9 @@ LEVEL_OPACITY = 0.2
 
 MIN_SIZE = 8.0
 """Smallest component that is kept by default, in voxel edges."""
+
+LEAST_FACES = 4
+"""Of a closed mesh."""
 
 Crop = tuple[Sequence[float], Sequence[float]]
 """Lower and upper corner, scene units."""
@@ -49,6 +53,7 @@ def extract_surface(
     level: float | None = None,
     crop: Crop | None = None,
     min_size: float | None = None,
+    n_faces: int | None = None,
 ) -> Surface:
     """Extract the isosurface of the density as a triangle mesh, by marching cubes.
 
@@ -66,6 +71,8 @@ def extract_surface(
         crop: Only triangles inside this box; None: what cameras see.
         min_size: Components whose box has a shorter diagonal are dropped, scene units; None: eight
             voxel edges.
+        n_faces: Decimate to about so many triangles; None: about two for each voxel that the
+            surface crosses.
 
     Returns:
         The surface. It is open where the crop cuts through something, and where cameras see no
@@ -76,7 +83,7 @@ def extract_surface(
     """
     lattice = field.lattice
     edge = float(lattice.voxel_size.mean())
-    check_options(field, level, crop, min_size)
+    check_options(field, level, crop, min_size, n_faces)
     require_crossed(field, level, crop)
     level = default_level(field) if level is None else level
     box = checked_crop(field, crop)
@@ -104,24 +111,32 @@ def extract_surface(
             "size, or keep what is unseen."
         )
     used, faces = np.unique(faces, return_inverse=True)
-    points = points[used]
+    points, faces = points[used], faces.reshape(-1, 3)
+    if n_faces is not None:
+        points, faces = decimated(points, faces, n_faces)
     normals = normals_at(field, raw, points)
     return Surface(
         points=points.astype(np.float32),
-        faces=faces.reshape(-1, 3).astype(np.int32),
+        faces=faces.astype(np.int32),
         normals=normals.astype(np.float32),
         rgb=colours(field, visibility, points, normals),
     )
 
 
 def check_options(
-    field: Field, level: float | None, crop: Crop | None, min_size: float | None
+    field: Field,
+    level: float | None,
+    crop: Crop | None,
+    min_size: float | None,
+    n_faces: int | None = None,
 ) -> None:
     """Raise InputError if a value that was given is of no use."""
     if level is not None:
         require_positive("level", level)
     if min_size is not None:
         require_at_least("min_size", min_size, 0.0)
+    if n_faces is not None:
+        require_whole("the number of faces", n_faces, LEAST_FACES)
     checked_crop(field, crop)
 
 
