@@ -92,7 +92,7 @@ def test_options_reach_the_surface(run_folder: Path, tmp_path: Path) -> None:
         ("ball.ply", {"level": 1e7}, "where it is .* to 400 per"),
         ("ball.ply", {"crop": (5, 5, 5, 6, 6, 6)}, "lies outside of the field"),
         ("ball.ply", {"crop": (1, 0, 0, 0, 1, 1)}, "the first below the second"),
-        ("ball.splat.ply", {"level": 3.0}, "level is of surfaces"),
+        ("ball.splat.ply", {"level": 3.0}, "level is of surfaces, and there is none"),
         ("ball.npz", {"min_size": 3.0}, "min_size is of surfaces"),
         ("ball.npz", {"crop": (-0.01, 0, 0, 0.04, 1, 1)}, "fewer than two nodes"),
         ("ball.ply", {"scene": "/no/such/place"}, "does not exist"),

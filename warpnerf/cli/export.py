@@ -23,6 +23,7 @@ def export_command(
     crop: Corners = None,
     min_size: float | None = None,
     faces: int | None = None,
+    texture: bool = False,
     unseen: bool = False,
     scene: str | None = None,
     device: str = "cpu",
@@ -31,7 +32,7 @@ def export_command(
     """Write a trained run for other programs, as the endings of the files' names say.
 
     .glb, .ply, .obj: a mesh with colours. .points.ply: points with normals and colours.
-    .splat.ply: Gaussian splats. .html: a page that shows splats in any browser, offline.
+    .splat.ply, .spz: Gaussian splats. .html: a page that shows splats in any browser, offline.
     .nvdb, .npz: density on a grid. A name without an ending: a folder with photographs, cameras as
     transforms.json and COLMAP text, and points.
 
@@ -46,6 +47,8 @@ def export_command(
         min_size: Parts of a surface are dropped whose box has a shorter diagonal, scene units; by
             default eight voxel edges.
         faces: Triangles of the mesh, about; by default two for each voxel that it crosses.
+        texture: Give a .glb texture coordinates and a texture, which more programs show than
+            vertex colours.
         unseen: Also write what no training camera sees.
         scene: Where the run's photographs are now, if they have moved.
         device: cpu, cuda, cuda:1, ...
@@ -84,6 +87,7 @@ def export_command(
                 crop=None if crop is None else (crop[:3], crop[3:]),
                 min_size=min_size,
                 n_faces=faces,
+                texture=texture,
                 on_camera=on_camera,
                 cache=run.visibility_file,
             )

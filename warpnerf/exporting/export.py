@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from warpnerf.checks import InputError, require_kind
+from warpnerf.exporting import atlas, mesh, page, splats, spz, surface, volume
 from warpnerf.exporting import cameras as scenes
-from warpnerf.exporting import mesh, page, splats, surface, volume
+from warpnerf.exporting.colour import colours
 from warpnerf.exporting.surface import Surface
 from warpnerf.exporting.visibility import Visibility
 from warpnerf.exporting.visibility_file import cached_visibility
@@ -19,9 +20,15 @@ from warpnerf.scenes.cameras.focus import up_direction
 from warpnerf.scenes.scene import Scene
 from warpnerf.writing import StagedWrites
 
+TEXELS = 3
+"""Of a texture, along a voxel edge: the field has no finer detail."""
+
+LARGEST_TEXTURE = 8192
+"""Texels: what browsers on all devices take."""
+
 MESHES = (".glb", ".obj", ".ply")
 SURFACES = (".glb", ".obj", ".ply", ".points.ply", "")
-SPLATS = (".splat.ply", ".html")
+SPLATS = (".splat.ply", ".spz", ".html")
 VOLUMES = (".nvdb", ".npz")
 FORMATS = {
     ".glb": "mesh",
@@ -29,6 +36,7 @@ FORMATS = {
     ".ply": "mesh",
     ".points.ply": "points",
     ".splat.ply": "splats",
+    ".spz": "splats",
     ".html": "page",
     ".nvdb": "volume",
     ".npz": "volume",
@@ -47,15 +55,16 @@ def export(
     crop: surface.Crop | None = None,
     min_size: float | None = None,
     n_faces: int | None = None,
+    texture: bool = False,
     on_camera: Callable[[int], None] | None = None,
 ) -> Path:
     """Export a field as a mesh, point cloud, Gaussian splats, volume or page, as the ending of the
     name says.
 
     .glb, .obj, .ply: a mesh with colours at its vertices. .points.ply: its vertices, with normals
-    and colours. .splat.ply: Gaussian splats. .html: a page that shows these without a network;
-    needs the extra ``viewer``. .nvdb, .npz: density, and colour in .npz, on a grid. No ending: a
-    folder with photographs, cameras for nerfstudio and COLMAP, and points.
+    and colours. .splat.ply, .spz: Gaussian splats. .html: a page that shows these without a
+    network; needs the extra ``viewer``. .nvdb, .npz: density, and colour in .npz, on a grid. No
+    ending: a folder with photographs, cameras for nerfstudio and COLMAP, and points.
 
     Args:
         field: What to write.
@@ -69,6 +78,7 @@ def export(
             see, for splats all of space; volumes end at the box of the grid.
         min_size: Smaller parts of a surface are dropped, scene units; see ``extract_surface``.
         n_faces: Triangles of a mesh, about; None: as many as there are.
+        texture: Give a .glb texture coordinates and a texture instead of vertex colours.
         on_camera: Called with the number of training cameras that were looked through.
 
     Returns:
@@ -88,6 +98,7 @@ def export(
         crop=crop,
         min_size=min_size,
         n_faces=n_faces,
+        texture=texture,
         on_camera=on_camera,
     )
     return written
@@ -103,6 +114,7 @@ def export_all(
     crop: surface.Crop | None = None,
     min_size: float | None = None,
     n_faces: int | None = None,
+    texture: bool = False,
     on_camera: Callable[[int], None] | None = None,
     cache: Path | None = None,
 ) -> list[Path]:
@@ -120,6 +132,7 @@ def export_all(
         crop: As for ``export``.
         min_size: Of surfaces, where there is one among the files.
         n_faces: Of meshes, where there is one among the files.
+        texture: Of .glb, where there is one among the files.
         on_camera: As for ``export``.
         cache: A file that keeps the visibility for the next export; see ``cached_visibility``.
 
@@ -140,14 +153,13 @@ def export_all(
         raise InputError("a file to export is named twice; name each once.")
     endings = [checked_ending(path) for path in targets]
     for name, value, what, those in (
+        ("a texture", texture or None, ".glb files", (".glb",)),
         ("level", level, "surfaces", SURFACES),
         ("min_size", min_size, "surfaces", SURFACES),
         ("the number of faces", n_faces, "meshes", MESHES),
     ):
         if value is not None and not {*endings} & {*those}:
-            raise InputError(
-                f"{targets[0]}: {name} is of {what}, and this file holds none; leave it out."
-            )
+            raise InputError(f"{targets[0]}: {name} is of {what}, and there is none; leave it out.")
     # Before what takes long:
     surface.check_options(field, level, crop, min_size, n_faces)
     for path, ending in zip(targets, endings, strict=True):
@@ -169,6 +181,7 @@ def export_all(
         crop=crop,
         min_size=min_size,
         n_faces=n_faces,
+        texture=texture,
     )
     with StagedWrites() as staged:
         for path, ending in zip(targets, endings, strict=True):
@@ -192,6 +205,7 @@ class _Products:
     crop: surface.Crop | None
     min_size: float | None
     n_faces: int | None
+    texture: bool
 
     @functools.cached_property
     def mesh(self) -> Surface:
@@ -212,6 +226,12 @@ class _Products:
             n_faces=n_faces,
         )
 
+    @property
+    def textured(self) -> atlas.Textured:
+        texel = float(self.field.lattice.voxel_size.mean()) / TEXELS
+        bake = functools.partial(colours, self.field, self.visible)
+        return atlas.textured(self.mesh, texel, LARGEST_TEXTURE, bake)
+
     @functools.cached_property
     def splats(self) -> splats.Splats:
         return splats.splats_of(self.field, self.visible, unseen=self.unseen, crop=self.crop)
@@ -227,12 +247,14 @@ class _Products:
             return page.splats_html(self.splats, self.scene, self.field.background)
         if ending == ".splat.ply":
             return splats.splats_ply(self.splats, up)
+        if ending == ".spz":
+            return spz.splats_spz(self.splats, up)
         if ending == ".nvdb":
             return volume.volume_nvdb(self.volume)
         if ending == ".npz":
             return volume.volume_npz(self.volume)
         if ending == ".glb":
-            return mesh.mesh_glb(self.mesh, up)
+            return mesh.mesh_glb(self.textured if self.texture else self.mesh, up)
         if ending == ".points.ply":
             return mesh.points_ply(self.surface)
         return {".obj": mesh.mesh_obj, ".ply": mesh.mesh_ply}[ending](self.mesh)

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import json
 import struct
+from typing import Any
 
 import numpy as np
 
+from warpnerf.exporting.atlas import Textured
 from warpnerf.exporting.ply import ply, surface_columns
 from warpnerf.exporting.surface import Surface
+from warpnerf.media.pictures import png
 
 ARRAY, INDICES = 34962, 34963
 UINT32, FLOAT32 = 5125, 5126
-"""glTF's numbers for kinds of buffers and of values."""
+LINEAR, CLAMP = 9729, 33071
+"""glTF's numbers for kinds of buffers, of values, and of a texture's filter and borders."""
 
 
 def mesh_ply(surface: Surface) -> list[bytes]:
@@ -41,12 +45,14 @@ def mesh_obj(surface: Surface) -> list[bytes]:
     return texts
 
 
-def mesh_glb(surface: Surface, up: np.ndarray | None = None) -> list[bytes]:
-    """A mesh as binary glTF 2.0.
+def mesh_glb(surface: Surface | Textured, up: np.ndarray | None = None) -> list[bytes]:
+    """A mesh as binary glTF 2.0, with vertex colours, or with a texture.
 
     Vertices are in scene coordinates. As y points up in glTF, the mesh hangs on a node that turns
-    the scene's up to y. Colours are in linear light, as glTF wants them, and the material is not
-    lit again: the photographs' light is in them.
+    the scene's up to y. The material is not lit again: the photographs' light is in it. Vertex
+    colours are in linear light, as glTF wants them. It multiplies a texture by them, so that
+    beside a texture they have a name of their own, _COLOR_0, which only programs that look for it
+    read.
 
     Format: https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html, and KHR_materials_unlit.
 
@@ -54,43 +60,74 @@ def mesh_glb(surface: Surface, up: np.ndarray | None = None) -> list[bytes]:
         surface: The mesh.
         up: [3] unit vector; None: y.
     """
-    arrays = (
-        (surface.points.astype("<f4"), FLOAT32, "VEC3", ARRAY),
-        (surface.normals.astype("<f4"), FLOAT32, "VEC3", ARRAY),
-        (linear_light(surface.rgb).astype("<f4"), FLOAT32, "VEC3", ARRAY),
-        (surface.faces.astype("<u4").reshape(-1), UINT32, "SCALAR", INDICES),
-    )
-    accessors, views, begin = [], [], 0
-    for index, (array, kind, shape, target) in enumerate(arrays):
-        accessor = {
+    image = surface.texture if isinstance(surface, Textured) else None
+    uv = surface.uv if isinstance(surface, Textured) else None
+    surface = surface.surface if isinstance(surface, Textured) else surface
+    named = {
+        "POSITION": surface.points,
+        "NORMAL": surface.normals,
+        "COLOR_0" if uv is None else "_COLOR_0": linear_light(surface.rgb),
+        **({} if uv is None else {"TEXCOORD_0": uv}),
+    }
+    pieces = [np.ascontiguousarray(array, "<f4").tobytes() for array in named.values()]
+    accessors = [
+        {
             "bufferView": index,
-            "componentType": kind,
+            "componentType": FLOAT32,
             "count": len(array),
-            "type": shape,
+            "type": f"VEC{array.shape[1]}",
         }
-        if index == 0:  # required of positions
-            accessor |= {"min": array.min(axis=0).tolist(), "max": array.max(axis=0).tolist()}
-        accessors.append(accessor)
-        size = array.nbytes
-        views.append({"buffer": 0, "byteOffset": begin, "byteLength": size, "target": target})
-        begin += size  # all sizes are multiples of 4
+        for index, array in enumerate(named.values())
+    ]
+    low, high = surface.points.min(axis=0), surface.points.max(axis=0)
+    accessors[0] |= {"min": low.tolist(), "max": high.tolist()}  # required of positions
+    accessors.append(
+        {
+            "bufferView": len(pieces),
+            "componentType": UINT32,
+            "count": 3 * len(surface.faces),
+            "type": "SCALAR",
+        }
+    )
+    targets: list[int | None] = [*([ARRAY] * len(pieces)), INDICES]
+    pieces.append(surface.faces.astype("<u4").tobytes())
+    pbr: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+    extra: dict[str, Any] = {}
+    if image is not None:
+        pbr["baseColorTexture"] = {"index": 0}
+        extra = {
+            "textures": [{"source": 0, "sampler": 0}],
+            "samplers": [
+                {"magFilter": LINEAR, "minFilter": LINEAR, "wrapS": CLAMP, "wrapT": CLAMP}
+            ],
+            "images": [{"bufferView": len(pieces), "mimeType": "image/png"}],
+        }
+        pieces.append(png(image))
+        targets.append(None)
+    views, begin = [], 0
+    for piece, target in zip(pieces, targets, strict=True):
+        view = {"buffer": 0, "byteOffset": begin, "byteLength": len(piece)}
+        views.append(view if target is None else view | {"target": target})
+        begin += len(piece) + -len(piece) % 4
     material = {
-        "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
+        "pbrMetallicRoughness": pbr,
         "doubleSided": True,
         "extensions": {"KHR_materials_unlit": {}},
     }
-    attributes = {"POSITION": 0, "NORMAL": 1, "COLOR_0": 2}
+    attributes = {name: index for index, name in enumerate(named)}
+    primitive = {"attributes": attributes, "indices": len(named), "material": 0}
     tree = {
         "asset": {"version": "2.0", "generator": "warpnerf"},
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "rotation": _to_y(up)}],
-        "meshes": [{"primitives": [{"attributes": attributes, "indices": 3, "material": 0}]}],
+        "meshes": [{"primitives": [primitive]}],
         "materials": [material],
         "accessors": accessors,
         "bufferViews": views,
         "buffers": [{"byteLength": begin}],
+        **extra,
     }
     text = json.dumps(tree).encode()
     text += b" " * (-len(text) % 4)
@@ -98,7 +135,7 @@ def mesh_glb(surface: Surface, up: np.ndarray | None = None) -> list[bytes]:
     return [
         header + struct.pack("<I4s", len(text), b"JSON") + text,
         struct.pack("<I4s", begin, b"BIN\0"),
-        *(array.tobytes() for array, *_ in arrays),
+        *(piece + bytes(-len(piece) % 4) for piece in pieces),
     ]
 
 

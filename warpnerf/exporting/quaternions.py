@@ -39,3 +39,13 @@ def quaternions(rotations: np.ndarray) -> np.ndarray:
     )
     quaternion = rows[diagonal.argmax(axis=1), np.arange(len(m))]
     return quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
+
+
+def to_y(up: np.ndarray | None) -> np.ndarray:
+    """The shortest rotation that turns a unit vector [3] to y, [3, 3]; None: none."""
+    x, y, z = (0.0, 1.0, 0.0) if up is None else np.asarray(up, np.float64)
+    if y < -1.0 + 1e-9:
+        return np.diag([1.0, -1.0, -1.0])
+    axis = np.array([-z, 0.0, x])  # up x y
+    cross = np.array([[0.0, -axis[2], 0.0], [axis[2], 0.0, -axis[0]], [0.0, axis[0], 0.0]])
+    return np.asarray(np.eye(3) + cross + cross @ cross / (1.0 + y))
