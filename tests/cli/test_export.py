@@ -70,7 +70,7 @@ def test_lenses_that_3dgs_does_not_read_are_said(
     run.save_field(ball_field())
     assert export_command(tmp_path / "run", (tmp_path / "out",), threads=1) == 0
     said = capsys.readouterr().out
-    assert ("3DGS reads PINHOLE only: colmap image_undistorter --image_path" in said) == (k1 > 0.0)
+    assert ("3DGS reads PINHOLE only: --pinhole writes such a folder" in said) == (k1 > 0.0)
 
 
 def test_options_reach_the_surface(run_folder: Path, tmp_path: Path) -> None:

@@ -112,7 +112,7 @@ def test_transforms_say_what_nerfstudio_reads(tmp_path: Path) -> None:
     tree = json.loads((tmp_path / "out" / "transforms.json").read_text())
     assert tree["camera_model"] == "OPENCV"
     assert (tmp_path / "out" / tree["ply_file_path"]).exists()
-    assert tree["test_filenames"] == ["images/a_00.jpg.png", "images/a_01.jpg.png"]
+    assert tree["test_filenames"] == ["images/a_00.png", "images/a_01.png"]
     frame = tree["frames"][-1]
     assert (frame["w"], frame["h"], frame["k1"]) == (48, 40, 0.05)
     assert frame["transform_matrix"][3] == [0.0, 0.0, 0.0, 1.0]

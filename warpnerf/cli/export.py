@@ -24,6 +24,7 @@ def export_command(
     min_size: float | None = None,
     faces: int | None = None,
     texture: bool = False,
+    pinhole: bool = False,
     unseen: bool = False,
     scene: str | None = None,
     device: str = "cpu",
@@ -49,6 +50,7 @@ def export_command(
         faces: Triangles of the mesh, about; by default two for each voxel that it crosses.
         texture: Give a .glb texture coordinates and a texture, which more programs show than
             vertex colours.
+        pinhole: Undistort the photographs of a folder, for programs that read no other lenses.
         unseen: Also write what no training camera sees.
         scene: Where the run's photographs are now, if they have moved.
         device: cpu, cuda, cuda:1, ...
@@ -88,6 +90,7 @@ def export_command(
                 min_size=min_size,
                 n_faces=faces,
                 texture=texture,
+                pinhole=pinhole,
                 on_camera=on_camera,
                 cache=run.visibility_file,
             )
@@ -98,11 +101,10 @@ def export_command(
             ) from error
     for file in files:
         print(f"wrote {file}")
-    folders = [file for file, ending in zip(files, endings, strict=True) if ending == ""]
-    if folders and any(camera_model(camera) != "PINHOLE" for camera in views.cameras):
+    bent = any(camera_model(camera) != "PINHOLE" for camera in views.cameras)
+    if "" in endings and bent and not pinhole:
         print(
             "note: the lenses have distortion, as in the photographs; 3DGS reads PINHOLE only: "
-            f"colmap image_undistorter --image_path {folders[0]}/images --input_path "
-            f"{folders[0]}/sparse/0 --output_path NEW makes such a folder of it"
+            "--pinhole writes such a folder, with the photographs undistorted"
         )
     return 0

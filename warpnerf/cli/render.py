@@ -195,7 +195,7 @@ def _still_cameras(scene: Scene, split: str, size: tuple[int, int] | None) -> di
     from warpnerf.scenes.scene import require_split
 
     views = [scene.views[index] for index in require_split(scene, split)]
-    files = picture_files([view.name for view in views])
+    files = picture_files([view.name for view in views], stems=True)
     return {
         files[view.name]: view.camera if size is None else path_lens([view.camera], size)
         for view in views

@@ -39,7 +39,7 @@ def write_scene(folder: Path, scene: Scene, surface: Surface) -> None:
     from PIL import Image
 
     points = thinned(surface)
-    files = picture_files([view.name for view in scene.views])
+    files = picture_files([view.name for view in scene.views], stems=True)
     (folder / "images").mkdir()
     (folder / "sparse" / "0").mkdir(parents=True)
     (folder / "transforms.json").write_text(transforms_json(scene, files))

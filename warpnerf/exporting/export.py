@@ -12,6 +12,7 @@ from warpnerf.checks import InputError, require_kind
 from warpnerf.exporting import atlas, mesh, page, splats, spz, surface, volume
 from warpnerf.exporting import cameras as scenes
 from warpnerf.exporting.colour import colours
+from warpnerf.exporting.pinhole import pinhole_scene
 from warpnerf.exporting.surface import Surface
 from warpnerf.exporting.visibility import Visibility
 from warpnerf.exporting.visibility_file import cached_visibility
@@ -56,6 +57,7 @@ def export(
     min_size: float | None = None,
     n_faces: int | None = None,
     texture: bool = False,
+    pinhole: bool = False,
     on_camera: Callable[[int], None] | None = None,
 ) -> Path:
     """Export a field as a mesh, point cloud, Gaussian splats, volume or page, as the ending of the
@@ -79,6 +81,7 @@ def export(
         min_size: Smaller parts of a surface are dropped, scene units; see ``extract_surface``.
         n_faces: Triangles of a mesh, about; None: as many as there are.
         texture: Give a .glb texture coordinates and a texture instead of vertex colours.
+        pinhole: Undistort the photographs of a folder; see ``pinhole_scene``.
         on_camera: Called with the number of training cameras that were looked through.
 
     Returns:
@@ -99,6 +102,7 @@ def export(
         min_size=min_size,
         n_faces=n_faces,
         texture=texture,
+        pinhole=pinhole,
         on_camera=on_camera,
     )
     return written
@@ -115,6 +119,7 @@ def export_all(
     min_size: float | None = None,
     n_faces: int | None = None,
     texture: bool = False,
+    pinhole: bool = False,
     on_camera: Callable[[int], None] | None = None,
     cache: Path | None = None,
 ) -> list[Path]:
@@ -133,6 +138,7 @@ def export_all(
         min_size: Of surfaces, where there is one among the files.
         n_faces: Of meshes, where there is one among the files.
         texture: Of .glb, where there is one among the files.
+        pinhole: Of folders, where there is one among the files.
         on_camera: As for ``export``.
         cache: A file that keeps the visibility for the next export; see ``cached_visibility``.
 
@@ -154,6 +160,7 @@ def export_all(
     endings = [checked_ending(path) for path in targets]
     for name, value, what, those in (
         ("a texture", texture or None, ".glb files", (".glb",)),
+        ("undistortion", pinhole or None, "folders", ("",)),
         ("level", level, "surfaces", SURFACES),
         ("min_size", min_size, "surfaces", SURFACES),
         ("the number of faces", n_faces, "meshes", MESHES),
@@ -186,7 +193,8 @@ def export_all(
     with StagedWrites() as staged:
         for path, ending in zip(targets, endings, strict=True):
             if scene is not None and ending == "":
-                fill = functools.partial(scenes.write_scene, scene=scene, surface=products.surface)
+                shown = pinhole_scene(scene) if pinhole else scene
+                fill = functools.partial(scenes.write_scene, scene=shown, surface=products.surface)
                 staged.add_folder(path, fill)
             else:
                 staged.add(path, *products.pieces(ending))

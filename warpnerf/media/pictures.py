@@ -28,6 +28,8 @@ of what is seen of unbounded space lies in the nearest part of it."""
 
 _GAP = 4
 _LONGEST_STEM = 200
+PHOTOGRAPH = re.compile(r"\.(?:jpe?g|png|tiff?|bmp|webp|heic|exr|dng)$", re.IGNORECASE)
+"""Endings of photographs' names."""
 
 INK, FAINT = (30, 30, 34), (120, 120, 128)
 """Of text, and of what is less important; sRGB of 8 bits."""
@@ -187,7 +189,7 @@ def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     return ImageFont.load_default(size)
 
 
-def picture_files(names: Sequence[str]) -> dict[str, str]:
+def picture_files(names: Sequence[str], *, stems: bool = False) -> dict[str, str]:
     """File names for pictures of views, all in one folder: no two alike, none too long.
 
     They are the views' own names, with _ for /; where that makes two alike, or alike but for
@@ -195,11 +197,14 @@ def picture_files(names: Sequence[str]) -> dict[str, str]:
 
     Args:
         names: Of views, different from one another.
+        stems: Without the endings of photographs: a.png for a.jpg, and not a.jpg.png.
     """
     taken: set[str] = set()
     files = {}
     for name in names:
         flat = re.sub(r"[/\\]", "_", name).removesuffix(".png")
+        if stems:
+            flat = PHOTOGRAPH.sub("", flat) or flat
         # From the end, where numbers are; in bytes, which is what file systems count.
         stem = flat.encode(errors="replace")[-_LONGEST_STEM:].decode(errors="replace")
         file, count = f"{stem}.png", 1
