@@ -15,9 +15,13 @@ from tests.exporting.test_cameras import ball_scene
 from tests.support.solid_fields import ball_field
 from warpnerf.checks import InputError
 from warpnerf.exporting.export import export
+from warpnerf.exporting.first_view import widest_view
 from warpnerf.exporting.page import splats_html
-from warpnerf.exporting.splats import splats_of
+from warpnerf.exporting.splats import Splats, splats_of
+from warpnerf.exporting.visibility import visibility
 from warpnerf.scenes.cameras.camera import Camera
+from warpnerf.scenes.scene import Scene
+from warpnerf.viewer.viewpoint import first_look
 
 pytest.importorskip("viser")
 
@@ -30,7 +34,29 @@ FLAGS = [
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return export(ball_field(), tmp_path_factory.mktemp("page") / "b.html", scene=ball_scene())
+    field, scene = ball_field(), ball_scene()
+    views = [scene.views[index] for index in scene.splits["train"]]
+    splats = splats_of(field, visibility(field, views))
+    file = tmp_path_factory.mktemp("page") / "b.html"
+    file.write_bytes(b"".join(splats_html(splats, scene, field.background, scene.cameras[2])))
+    return file
+
+
+def test_an_exported_page_begins_where_most_is_seen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun: list[Camera] = []
+
+    def made(splats: Splats, scene: Scene, background: object, begin: Camera) -> list[bytes]:
+        begun.append(begin)
+        return [b"page"]
+
+    monkeypatch.setattr("warpnerf.exporting.page.splats_html", made)
+    field, scene = ball_field(), ball_scene()
+    assert export(field, tmp_path / "b.html", scene=scene).read_bytes() == b"page"
+    assert begun == [widest_view(field, scene.training_cameras)]
+    look = first_look(scene.training_cameras, begun[0])
+    np.testing.assert_array_equal(look.c2w, begun[0].c2w)
 
 
 def test_the_page_loads_nothing(page: Path, capfd: pytest.CaptureFixture[str]) -> None:

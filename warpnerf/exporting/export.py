@@ -12,6 +12,7 @@ from warpnerf.checks import InputError, require_kind
 from warpnerf.exporting import atlas, mesh, page, splats, spz, surface, volume
 from warpnerf.exporting import cameras as scenes
 from warpnerf.exporting.colour import colours
+from warpnerf.exporting.first_view import widest_view
 from warpnerf.exporting.pinhole import pinhole_scene
 from warpnerf.exporting.surface import Surface
 from warpnerf.exporting.visibility import Visibility
@@ -252,7 +253,8 @@ class _Products:
         """The pieces of the file of a format."""
         up = None if self.scene is None else up_direction(self.scene.training_cameras)
         if ending == ".html" and self.scene is not None:
-            return page.splats_html(self.splats, self.scene, self.field.background)
+            begin = widest_view(self.field, self.scene.training_cameras)
+            return page.splats_html(self.splats, self.scene, self.field.background, begin)
         if ending == ".splat.ply":
             return splats.splats_ply(self.splats, up)
         if ending == ".spz":

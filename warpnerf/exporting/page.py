@@ -9,6 +9,7 @@ import numpy as np
 
 from warpnerf.checks import require_extra
 from warpnerf.exporting.splats import Splats
+from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.scene import Scene
 from warpnerf.viewer.server import close_server, open_server
 from warpnerf.viewer.viewpoint import World, first_look
@@ -20,14 +21,18 @@ def require_viser() -> None:
 
 
 def splats_html(
-    splats: Splats, scene: Scene, background: tuple[float, float, float]
+    splats: Splats,
+    scene: Scene,
+    background: tuple[float, float, float],
+    begin: Camera | None = None,
 ) -> list[bytes]:
-    """A page of splats that begins with the view of the first training camera.
+    """A page of splats.
 
     Args:
         splats: What it shows.
         scene: What they were trained on.
         background: rgb in [0, 1].
+        begin: What it shows first; None: the view of the first training camera.
 
     Raises:
         InputError: viser is missing.
@@ -40,7 +45,8 @@ def splats_html(
     spread = world.scale * rotations * splats.scales[:, None, :]
     server = open_server("127.0.0.1", 0)
     try:
-        world.begin(server, first_look(scene.training_cameras))
+        look = first_look(scene.training_cameras, begin)
+        world.begin(server, look)
         pixel = np.round(255.0 * np.array(background)).astype(np.uint8)
         server.scene.set_background_image(np.broadcast_to(pixel, (1, 1, 3)).copy())
         server.scene.add_gaussian_splats(

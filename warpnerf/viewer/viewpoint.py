@@ -142,14 +142,15 @@ def fov_to_see(camera: Camera, aspect: float) -> float:
     return min(2.0 * math.atan(half), WIDEST)
 
 
-def first_look(cameras: Sequence[Camera]) -> FirstLook:
-    """From where the first of some cameras stands, seeing the middle of its photograph.
+def first_look(cameras: Sequence[Camera], begin: Camera | None = None) -> FirstLook:
+    """From where a camera stands, seeing the middle of its photograph.
 
     Args:
         cameras: Those of the training; they tell which way is up.
+        begin: The camera; None: the first of them.
     """
-    size = _within_most(cameras[0].width, cameras[0].height)
-    lens = path_lens(cameras[:1], size)
+    camera = cameras[0] if begin is None else begin
+    lens = path_lens([camera], _within_most(camera.width, camera.height))
     return FirstLook(c2w=lens.c2w, fov=fov_to_see(lens, ASPECT), up=up_direction(cameras))
 
 
