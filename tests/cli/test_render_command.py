@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import subprocess
 import sys
@@ -116,9 +117,60 @@ def test_stills_are_those_of_the_split(run_folder: Path, tmp_path: Path) -> None
     assert Image.open(tmp_path / "b" / "images_003.png").width == 2 * 31 + 4
 
 
+def test_outputs_crop_and_photographs_by_name(run_folder: Path, tmp_path: Path) -> None:
+    options: dict[str, Any] = {"show": ("normals", "colour"), "threads": 1, "transparent": True}
+    names = ("000.png", "002")  # the end of a name, and that without its ending
+    assert render_command(run_folder, photographs=names, output=tmp_path / "a", **options) == 0
+    files = sorted((tmp_path / "a").iterdir())
+    assert [path.name for path in files] == ["images_000.png", "images_002.png"]
+    picture = Image.open(files[1])
+    assert picture.size == (2 * 8 + 4, 6) and picture.mode == "RGBA"
+    field = Run(run_folder).load_field("cpu", 1)[0]
+    camera = load_scene(run_folder.parent / "scene").views[2].camera
+    alpha = np.asarray(picture)[:, 12:, 3] / 255.0
+    np.testing.assert_allclose(alpha, field.render(camera).opacity, atol=0.01)
+    low, high = field.lattice.box_min, 0.5 * (field.lattice.box_min + field.lattice.box_max)
+    cropped = {"photographs": names[1:], "output": tmp_path / "b", "show": ("opacity",)}
+    assert render_command(run_folder, crop=(*low, *high), threads=1, **cropped) == 0
+    shown = np.asarray(Image.open(tmp_path / "b" / "images_002.png"))[..., 0]
+    assert shown.sum() < 255.0 * alpha.sum()
+
+
+def test_a_path_of_nerfstudio_is_followed(
+    run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frames = [
+        {"camera_to_world": np.vstack([pose[:3], [0, 0, 0, 1]]).ravel().tolist(), "fov": 40.0}
+        for pose in ring(5)[:3]
+    ]
+    tree = {"camera_path": frames, "render_width": 30, "render_height": 20, "fps": 10}
+    file = tmp_path / "camera_path.json"
+    file.write_text(json.dumps(tree))
+    options: dict[str, Any] = {"fps": 10.0, "threads": 1, "show": ("colour",)}
+    assert render_command(run_folder, path=str(file), output=tmp_path / "f", **options) == 0
+    assert "taken to be in the scene's coordinates" in capsys.readouterr().out
+    assert len(list((tmp_path / "f").iterdir())) == 3
+    transforms = {"transform": np.eye(3, 4).tolist(), "scale": 1.0}
+    (tmp_path / "dataparser_transforms.json").write_text(json.dumps(transforms))
+    assert render_command(run_folder, path=str(file), output=tmp_path / "g", **options) == 0
+    assert "taken to be" not in capsys.readouterr().out
+    for name in ("00000.png", "00002.png"):
+        first, second = (np.asarray(Image.open(tmp_path / f / name)) for f in "fg")
+        np.testing.assert_array_equal(first, second)
+
+
 @pytest.mark.parametrize(
     ("options", "says"),
     [
+        ({"transparent": True}, r"no transparency; let the name end in \.mov"),
+        ({"show": ("colour", "colour")}, "given twice"),
+        ({"crop": (1, 0, 0, 0, 1, 1)}, "the first below the second"),
+        (
+            {"photographs": ("nowhere.png",), "output": "a", "fps": None, "seconds": None},
+            "none of the 6 photographs; the nearest is",
+        ),
+        ({"photographs": ("a",), "stills": "test"}, "give one of them"),
+        ({"path_transforms": Path("a.json")}, "is of a path of nerfstudio"),
         ({"seconds": 0.0}, "--seconds"),
         ({"seconds": 1e9}, "frames, more than"),
         ({"fps": float("nan")}, "frame rate"),

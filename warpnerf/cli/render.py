@@ -5,19 +5,20 @@ from __future__ import annotations
 import os
 import sys
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, cast, get_args
+from difflib import get_close_matches
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_args
 
 import tyro
 
 from warpnerf.checks import InputError, cannot_write, require_positive
-from warpnerf.cli.arguments import RunFolder
+from warpnerf.cli.arguments import Corners, RunFolder
 from warpnerf.runtime.progress import ProgressBar
 
 if TYPE_CHECKING:
     from warpnerf.media.recorded_path import RecordedPath
     from warpnerf.scenes.cameras.camera import Camera
-    from warpnerf.scenes.scene import Scene
+    from warpnerf.scenes.scene import Scene, View
 
 FPS = 30.0
 """Frames per second, unless requested."""
@@ -36,12 +37,28 @@ class RenderOptions:
     path: Annotated[str, tyro.conf.arg(metavar="{auto,orbit,through,back}|FILE.json")] = "auto"
     """orbit: around what the cameras look at. through: through the training cameras. back: the
     same, backing away from them, where floaters show. auto: orbit where the cameras look at one
-    thing, else through. FILE.json: a path recorded in the viewer."""
+    thing, else through. FILE.json: a path recorded in the viewer, or nerfstudio's
+    camera_path.json."""
+    path_transforms: Annotated[Path | None, tyro.conf.arg(metavar="FILE.json")] = None
+    """The dataparser_transforms.json of the nerfstudio run that a path belongs to; by default the
+    one beside the path, else the path is taken to be in the scene's coordinates."""
     stills: Literal["test", "train", "val", "all"] | None = None
     """Render the views of this split as PNG pictures instead of a video."""
+    photographs: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="NAME [NAME ...]")] = None
+    """Render from the places of these photographs, as PNG pictures instead of a video."""
+    show: Annotated[
+        tuple[Literal["colour", "depth", "opacity", "normals"], ...],
+        tyro.conf.arg(metavar="{colour,depth,opacity,normals} ..."),
+    ] = ("colour", "depth")
+    """What is shown, from left to right. Normals are in the camera's axes."""
+    crop: Corners = None
+    """Two corners of the box that is shown, scene units, to cells of two voxels."""
+    transparent: bool = False
+    """Without background, with an alpha channel: PNG files, or FILE.mov (ProRes 4444)."""
     output: Path | None = None
-    """FILE.mp4, FILE.gif, or a new folder for PNG frames; for stills a folder. By default PATH.mp4
-    (video.mp4 for auto, and for a recorded path its file's name) or stills/ in the run's folder."""
+    """FILE.mp4, FILE.gif, FILE.mov, or a new folder for PNG frames; for stills a folder. By default
+    PATH.mp4 (video.mp4 for auto, and for a path of a file its name; .mov where transparent) or
+    stills/ in the run's folder."""
     size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="WIDTH HEIGHT")] = None
     """Of the colour picture, pixels; by default as the photographs, or as recorded."""
     fps: float | None = None
@@ -52,6 +69,11 @@ class RenderOptions:
     """How far `back` backs away, scene units; by default half the content distance."""
     depths: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="NEAR FAR")] = None
     """What gets the first and the last colour, scene units; by default what is seen."""
+
+    @property
+    def only_stills(self) -> bool:
+        """Whether pictures are rendered, and no video."""
+        return self.stills is not None or self.photographs is not None
 
     def recorded(self, scene: str | None) -> RecordedPath | None:
         """The path that was recorded; None: it is of another kind.
@@ -66,16 +88,19 @@ class RenderOptions:
 
         if self.depths is not None:
             checked_depths(self.depths)
-        stills, path = self.stills is not None, self.path
+        if self.stills is not None and self.photographs is not None:
+            raise InputError("--stills is a split, --photographs are named; give one of them.")
+        stills, path = self.only_stills, self.path
         if self.distance is not None and (stills or path != "back"):
             raise InputError("--distance is how far --path back backs away; give both or neither.")
         if stills and path != "auto":
             raise InputError(
-                "--stills renders the views of a split, along no path; give one of them."
+                "--stills and --photographs render from photographs, along no path; give one of "
+                "them."
             )
         if stills and not (self.fps is None and self.seconds is None):
             raise InputError("--fps and --seconds are of a video, not of --stills; leave them out.")
-        recorded = _recorded(path)
+        recorded = _recorded(path, self.path_transforms)
         if recorded is not None and scene is not None:
             raise InputError(f"--scene is not needed for the cameras of {path}; leave it out.")
         return recorded
@@ -89,7 +114,7 @@ def render_command(
     device: str = "cpu",
     threads: int | None = None,
 ) -> int:
-    """Render a trained run: colour and depth side by side, along a path, or a split's views.
+    """Render a trained run, along a path or from photographs: colour, depth, opacity, normals.
 
     Args:
         folder: Output folder of a training run.
@@ -99,18 +124,21 @@ def render_command(
         threads: CPU threads; by default one per usable core.
     """
     from warpnerf.media.filming import depth_range, render_stills, render_video
-    from warpnerf.media.video import video_file
+    from warpnerf.media.panels import Panels
+    from warpnerf.media.video import require_alpha, video_file
     from warpnerf.runs.run import Run
     from warpnerf.runs.scene import load_run_scene
 
     recorded = options.recorded(scene)
-    path, stills, output = options.path, options.stills, options.output
+    path, stills, output = options.path, options.only_stills, options.output
     fps = FPS if options.fps is None else options.fps
     run = Run(folder)
     config = run.read_config()
-    if stills is None:
+    if not stills:
         name = "video" if path == "auto" else path if recorded is None else Path(path).stem
-        target, note = video_file(output or folder / f"{name}.mp4", fps)
+        ending = "mov" if options.transparent else "mp4"
+        target, note = video_file(output or folder / f"{name}.{ending}", fps)
+        require_alpha(target, options.transparent)
         if note:
             print(note, flush=True)
     else:
@@ -119,6 +147,9 @@ def render_command(
     field, notes = run.load_field(device, threads)
     for note in notes:
         print(f"warpnerf: note: {note}", file=sys.stderr)
+    Panels(field=field, outputs=options.show)  # refuses what cannot be shown
+    if options.crop is not None:
+        field = field.cropped(options.crop[:3], options.crop[3:])
 
     cameras: list[Camera]
     if recorded is not None:
@@ -126,7 +157,7 @@ def render_command(
         n_frames = _n_frames(fps, length if options.seconds is None else options.seconds)
         cameras = recorded.cameras(n_frames, options.size)
         what = f"{n_frames} frames, path {path}"
-    elif stills is None:
+    elif not stills:
         from warpnerf.media.camera_path import PathKind, camera_path, natural_path
 
         views = load_run_scene(config, scene, threads)
@@ -136,45 +167,67 @@ def render_command(
         what = f"{n_frames} frames, path {kind!r}"
     else:
         views = load_run_scene(config, scene, threads)
-        named = _still_cameras(views, stills, options.size)
+        named = _still_cameras(views, options)
         cameras = list(named.values())
         what = f"{len(cameras)} views"
     width, height = cameras[0].width, cameras[0].height
-    shown = options.depths or depth_range(field, cameras)
-    print(
-        f"rendering {what}, colour and depth of {width} x {height} pixels each, "
-        f"depth from {shown[0]:g} yellow to {shown[1]:g} blue, scene units",
-        flush=True,
-    )
+    shown, said = None, ""
+    if "depth" in options.show:
+        shown = options.depths or depth_range(field, cameras)
+        said = f", depth from {shown[0]:g} yellow to {shown[1]:g} blue, scene units"
+    outputs = " and ".join(options.show)
+    each = " each" if len(options.show) > 1 else ""
+    print(f"rendering {what}, {outputs} of {width} x {height} pixels{each}{said}", flush=True)
+    how: dict[str, Any] = {
+        "depths": shown,
+        "show": options.show,
+        "transparent": options.transparent,
+    }
     with ProgressBar("first frame") as bar:
 
         def on_frame(done: int) -> None:
             bar.report(done / len(cameras), f"frame {done} of {len(cameras)}")
 
         try:
-            if stills is None:
-                render_video(field, cameras, target, fps=fps, depths=shown, on_frame=on_frame)
+            if not stills:
+                render_video(field, cameras, target, fps=fps, on_frame=on_frame, **how)
             else:
-                render_stills(field, named, target, depths=shown, on_frame=on_frame)
+                render_stills(field, named, target, on_frame=on_frame, **how)
         except OSError as error:
             raise cannot_write(f"--output {target}", error) from error
     print(f"wrote {target}")
     return 0
 
 
-def _recorded(path: str) -> RecordedPath | None:
+def _recorded(path: str, transforms: Path | None) -> RecordedPath | None:
     """The path in a file; None where the name of a kind of path is given."""
     from warpnerf.media.camera_path import PathKind
+    from warpnerf.media.nerfstudio_path import TRANSFORMS, read_nerfstudio_path
     from warpnerf.media.recorded_path import read_path
+    from warpnerf.scenes.files import read_json
 
     kinds = ("auto", *get_args(PathKind))
     if path in kinds:
+        if transforms is not None:
+            raise InputError("--path-transforms is of a path of nerfstudio; leave it out.")
         return None
     if not path.endswith(".json"):
         raise InputError(
-            f"--path {path} is none of {', '.join(kinds)}, and no FILE.json that the viewer saved."
+            f"--path {path} is none of {', '.join(kinds)}, and no FILE.json that the viewer or "
+            "nerfstudio saved."
         )
-    return read_path(path)
+    if "camera_path" not in read_json(Path(path), dict):
+        if transforms is not None:
+            raise InputError("--path-transforms is of a path of nerfstudio; leave it out.")
+        return read_path(path)
+    if transforms is None and (Path(path).parent / TRANSFORMS).exists():
+        transforms = Path(path).parent / TRANSFORMS
+    if transforms is None:
+        print(
+            f"note: no {TRANSFORMS} beside {path}: it is taken to be in the scene's coordinates; "
+            "--path-transforms names that of its nerfstudio run"
+        )
+    return read_nerfstudio_path(Path(path), transforms)
 
 
 def _n_frames(fps: float, seconds: float) -> int:
@@ -188,22 +241,48 @@ def _n_frames(fps: float, seconds: float) -> int:
     return n_frames
 
 
-def _still_cameras(scene: Scene, split: str, size: tuple[int, int] | None) -> dict[str, Camera]:
-    """The cameras of a split's views by the file names of their pictures."""
+def _still_cameras(scene: Scene, options: RenderOptions) -> dict[str, Camera]:
+    """The cameras of a split's views, or of named ones, by the file names of their pictures."""
     from warpnerf.media.camera_path import path_lens
     from warpnerf.media.pictures import picture_files
     from warpnerf.scenes.scene import require_split
 
-    views = [scene.views[index] for index in require_split(scene, split)]
+    if options.photographs is not None:
+        views = [_named_view(scene, name) for name in dict.fromkeys(options.photographs)]
+    else:
+        chosen = require_split(scene, options.stills or "test")
+        views = [scene.views[index] for index in chosen]
     files = picture_files([view.name for view in views], stems=True)
+    size = options.size
     return {
         files[view.name]: view.camera if size is None else path_lens([view.camera], size)
         for view in views
     }
 
 
+def _named_view(scene: Scene, name: str) -> View:
+    """The view of a name: as it is, its end, or its end without the ending of the file."""
+    for shortened in (
+        lambda known: known,
+        lambda known: PurePosixPath(known).name,
+        lambda known: PurePosixPath(known).stem,
+    ):
+        found = [view for view in scene.views if shortened(view.name) == name]
+        if len(found) == 1:
+            return found[0]
+        if found:
+            raise InputError(
+                f"--photographs {name} is {found[0].name} or {found[1].name}; give the whole name."
+            )
+    names = [view.name for view in scene.views]
+    nearest = get_close_matches(name, names, n=1, cutoff=0.0)[0]
+    raise InputError(
+        f"--photographs {name} is none of the {len(names)} photographs; the nearest is {nearest}."
+    )
+
+
 def _require_folder(folder: Path) -> None:
-    if folder.suffix in (".mp4", ".gif"):
+    if folder.suffix in (".mp4", ".gif", ".mov"):
         raise InputError(f"--output {folder} is a video's name; stills go into a folder.")
     if folder.exists() and not folder.is_dir():
         raise InputError(f"--output {folder} is a file; stills go into a folder.")

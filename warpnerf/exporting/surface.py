@@ -16,6 +16,7 @@ from warpnerf.exporting.visibility import SEEN, Visibility
 from warpnerf.fields.nodes import nodes_of, points_of, values_at, voxel_edges
 from warpnerf.renamed import renamed_argument
 from warpnerf.rendering.field import Field
+from warpnerf.rendering.normals import normals_at
 
 LEVEL_OPACITY = 0.2
 """Of a voxel edge at the level that is the default; benchmarks/mesh.py tries others."""
@@ -217,29 +218,6 @@ def density(field: Field, raw: np.ndarray) -> np.ndarray:
     """Density of raw densities, in 1 / scene unit; the same shape."""
     stored = field.storage
     return (stored.density_scale * np.logaddexp(0.0, raw + stored.density_shift)).astype(np.float32)
-
-
-def normals_at(field: Field, raw: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Unit vectors against the gradient of the density, by differences over a voxel edge.
-
-    Args:
-        field: The field.
-        raw: Its raw density, [X, Y, Z].
-        points: [n, 3] scene units.
-
-    Returns:
-        [n, 3] float64; upward where the gradient is 0.
-    """
-    half = 0.5 * voxel_edges(field.lattice, points)
-    falling = np.empty((len(points), 3))
-    for axis, direction in enumerate(np.eye(3)):
-        before, after = (
-            values_at(raw, nodes_of(field.lattice, points + (sign * half)[:, None] * direction))
-            for sign in (-1.0, 1.0)
-        )
-        falling[:, axis] = before - after
-    length = np.linalg.norm(falling, axis=1, keepdims=True)
-    return np.where(length > 0.0, falling / np.maximum(length, 1e-30), [0.0, 0.0, 1.0])
 
 
 def _raw_of(field: Field, level: float) -> float:

@@ -1,4 +1,4 @@
-"""Video and still rendering of a field: colour and depth, along a path or from photographs."""
+"""Video and still rendering of a field, along a path or from photographs."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ import numpy as np
 
 from warpnerf.checks import InputError
 from warpnerf.media.camera_path import path_lens
-from warpnerf.media.pictures import colour_and_depth, write_png
-from warpnerf.media.video import write_video
+from warpnerf.media.panels import USUAL, Output, Panels
+from warpnerf.media.pictures import write_png
+from warpnerf.media.video import require_alpha, write_video
 from warpnerf.rendering.field import Field
 from warpnerf.scenes.cameras.camera import Camera
 
@@ -29,16 +30,20 @@ def render_video(
     *,
     fps: float = 30.0,
     depths: tuple[float, float] | None = None,
+    show: Sequence[Output] = USUAL,
+    transparent: bool = False,
     on_frame: Callable[[int], None] | None = None,
 ) -> Path:
-    """Render a video: colour and depth side by side, with a legend of the depths' colours.
+    """Render a video: colour and depth side by side, or other outputs.
 
     Args:
         field: What to look at.
         cameras: From ``camera_path``, or any of one size; one for each frame.
-        path: .mp4 (.gif where PyAV is missing), .gif, or a new folder for PNG files.
+        path: .mp4 (.gif where PyAV is missing), .gif, .mov, or a new folder for PNG files.
         fps: Frames per second.
         depths: What gets the first and the last colour, scene units; None: see ``depth_range``.
+        show: Outputs from left to right: colour, depth above a legend, opacity, normals.
+        transparent: With an alpha channel and without background: to .mov or PNG files.
         on_frame: Called with the number of frames that are done.
 
     Returns:
@@ -53,11 +58,12 @@ def render_video(
         raise InputError("a video needs at least one camera.")
     if len({(camera.width, camera.height) for camera in cameras}) > 1:
         raise InputError("the cameras of a video must all have one width and one height.")
-    near, far = depth_range(field, cameras) if depths is None else checked_depths(depths)
+    panels = _panels(field, cameras, depths, show, transparent)
+    require_alpha(path, transparent)
 
     def frames() -> Iterator[np.ndarray]:
         for number, camera in enumerate(cameras):
-            yield colour_and_depth(field.render(camera), near, far)
+            yield panels.picture(camera)
             if on_frame is not None:
                 on_frame(number + 1)
 
@@ -70,6 +76,8 @@ def render_stills(
     folder: str | Path,
     *,
     depths: tuple[float, float] | None = None,
+    show: Sequence[Output] = USUAL,
+    transparent: bool = False,
     on_frame: Callable[[int], None] | None = None,
 ) -> None:
     """Render still images of colour and depth, as in a video.
@@ -79,6 +87,8 @@ def render_stills(
         cameras: By the names of the files, which go into the folder.
         folder: Made if it does not exist; files of the same names are replaced.
         depths: As for ``render_video``.
+        show: As for ``render_video``.
+        transparent: With an alpha channel and without background.
         on_frame: Called with the number of pictures that are done.
 
     Raises:
@@ -87,13 +97,27 @@ def render_stills(
     """
     if not cameras:
         raise InputError("stills need at least one camera.")
-    shown = depth_range(field, list(cameras.values())) if depths is None else checked_depths(depths)
+    panels = _panels(field, list(cameras.values()), depths, show, transparent)
     folder = Path(folder)
     folder.mkdir(exist_ok=True)
     for number, (name, camera) in enumerate(cameras.items()):
-        write_png(folder / name, colour_and_depth(field.render(camera), *shown))
+        write_png(folder / name, panels.picture(camera))
         if on_frame is not None:
             on_frame(number + 1)
+
+
+def _panels(
+    field: Field,
+    cameras: Sequence[Camera],
+    depths: tuple[float, float] | None,
+    show: Sequence[Output],
+    transparent: bool,
+) -> Panels:
+    if depths is not None:
+        near, far = checked_depths(depths)
+    else:
+        near, far = depth_range(field, cameras) if "depth" in show else (0.0, 1.0)
+    return Panels(field=field, outputs=tuple(show), near=near, far=far, transparent=transparent)
 
 
 def depth_range(field: Field, cameras: Sequence[Camera]) -> tuple[float, float]:

@@ -106,7 +106,7 @@ def comparison(
     Returns:
         [H + legend, 3 W + 8, 3] uint8.
     """
-    return _above_legend(
+    return above_legend(
         [dimmed(target, mask), rendering.rgb, depth_picture(rendering, near, far)], near, far
     )
 
@@ -122,17 +122,32 @@ def colour_and_depth(rendering: Rendering, near: float, far: float) -> np.ndarra
     Returns:
         [H + legend, 2 W + 4, 3] uint8.
     """
-    return _above_legend([rendering.rgb, depth_picture(rendering, near, far)], near, far)
+    return above_legend([rendering.rgb, depth_picture(rendering, near, far)], near, far)
 
 
-def _above_legend(panels: Sequence[np.ndarray], near: float, far: float) -> np.ndarray:
-    """Panels [H, W, 3] side by side above a legend, uint8."""
-    gap = np.full((panels[0].shape[0], _GAP, 3), 255, np.uint8)
-    parts = [gap]
-    for panel in panels:
-        parts += [to_bytes(panel), gap]
-    pixels = np.concatenate(parts[1:-1], axis=1)
-    return np.concatenate([pixels, depth_legend(pixels.shape[1], near, far)])
+def above_legend(
+    panels: Sequence[np.ndarray], near: float | None = None, far: float | None = None
+) -> np.ndarray:
+    """Concatenate panels side by side, above a legend of depths.
+
+    Args:
+        panels: [H, W, C] each, uint8 or in [0, 1]; a fourth channel is alpha.
+        near: Depth of the first colour, scene units; None: without a legend.
+        far: Depth of the last.
+
+    Returns:
+        [H + legend, n W + 4 (n - 1), C] uint8.
+    """
+    pixels = [to_bytes(panel) for panel in panels]
+    height, channels = pixels[0].shape[0], pixels[0].shape[2]
+    gap = np.full((height, _GAP, channels), 255, np.uint8)
+    parts = [part for panel in pixels for part in (gap, panel)][1:]
+    picture = np.concatenate(parts, axis=1)
+    if near is None or far is None:
+        return picture
+    legend = depth_legend(picture.shape[1], near, far)
+    opaque = np.full((*legend.shape[:2], channels - 3), 255, np.uint8)
+    return np.concatenate([picture, np.concatenate([legend, opaque], axis=2)])
 
 
 def depth_legend(width: int, near: float, far: float) -> np.ndarray:

@@ -124,7 +124,19 @@ def read_path(path: str | Path) -> RecordedPath:
         InputError: It cannot be read, is no path, or holds what no camera can do.
     """
     path = Path(path)
-    recorded = read_json(path, RecordedPath)
+    return checked_path(read_json(path, RecordedPath), path)
+
+
+def checked_path(recorded: RecordedPath, path: Path) -> RecordedPath:
+    """The same camera path.
+
+    Args:
+        recorded: What was read.
+        path: Of its file, for messages.
+
+    Raises:
+        InputError: It holds what no camera can do.
+    """
     if recorded.warpnerf_path != VERSION:
         raise InputError(
             f"{path}: warpnerf_path is {recorded.warpnerf_path}, but this version of warpnerf "

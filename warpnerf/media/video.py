@@ -1,4 +1,5 @@
-"""Moving pictures to files: H.264 in MP4 where PyAV is installed, GIF, or a folder of PNG files.
+"""Moving pictures to files: H.264 in MP4 and ProRes 4444 in MOV where PyAV is installed, GIF, or a
+folder of PNG files.
 
 A file is written whole or not at all, and so is a folder.
 """
@@ -16,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from warpnerf.checks import InputError, require_positive
+from warpnerf.checks import InputError, require_extra, require_positive
 from warpnerf.media.pictures import png
 from warpnerf.writing import write_atomically
 
@@ -32,7 +33,7 @@ MAX_GIF_FPS = 50.0
 
 
 def video_file(path: str | Path, fps: float) -> tuple[Path, str | None]:
-    """Where a video will go, and in which format: .mp4, .gif, or without an ending a folder.
+    """Where a video will go, and in which format: .mp4, .mov, .gif, or without an ending a folder.
 
     Args:
         path: As it was requested.
@@ -51,6 +52,8 @@ def video_file(path: str | Path, fps: float) -> tuple[Path, str | None]:
     if path.suffix == ".mp4" and importlib.util.find_spec("av") is None:
         path = path.with_suffix(".gif")
         note = f'PyAV is not installed (pip install "warpnerf[video]"): writing {path} instead'
+    if path.suffix == ".mov":
+        require_extra("av", "video", "a video (.mov)")
     if fps < MIN_FPS:
         raise InputError(f"{path}: at least {MIN_FPS:g} frames per second, not {fps:g}.")
     limit = MAX_GIF_FPS if path.suffix == ".gif" else MAX_FPS
@@ -58,10 +61,10 @@ def video_file(path: str | Path, fps: float) -> tuple[Path, str | None]:
         raise InputError(
             f"{path}: has at most {limit:g} frames per second, not {fps:g}; use a lower frame rate."
         )
-    if path.suffix not in (".mp4", ".gif", ""):
+    if path.suffix not in (".mp4", ".gif", ".mov", ""):
         raise InputError(
-            f"{path}: no such video format; let the name end in .mp4 or .gif, or in nothing for a "
-            "folder of PNG files."
+            f"{path}: no such video format; let the name end in .mp4 or .gif (.mov for ProRes with "
+            "alpha), or in nothing for a folder of PNG files."
         )
     if not path.parent.is_dir():
         raise InputError(f"{path}: its folder does not exist; make it first.")
@@ -79,7 +82,8 @@ def write_video(path: str | Path, frames: Iterator[np.ndarray], fps: float) -> P
 
     Args:
         path: Of the file, or of a folder for PNG files. An older file is replaced.
-        frames: [H, W, 3] uint8 each, all of one size; at least one.
+        frames: [H, W, 3] uint8 each, or [H, W, 4] with alpha for .mov and PNG files, all of one
+            size; at least one.
         fps: Frames per second.
 
     Returns:
@@ -91,7 +95,9 @@ def write_video(path: str | Path, frames: Iterator[np.ndarray], fps: float) -> P
     """
     path, _ = video_file(path, fps)
     if path.suffix == ".mp4":
-        write_atomically(path, _mp4(frames, fps))
+        write_atomically(path, _encoded(frames, fps, "mp4"))
+    elif path.suffix == ".mov":
+        write_atomically(path, _encoded(frames, fps, "mov"))
     elif path.suffix == ".gif":
         write_atomically(path, _gif(frames, fps))
     else:
@@ -99,19 +105,33 @@ def write_video(path: str | Path, frames: Iterator[np.ndarray], fps: float) -> P
     return path
 
 
-def _mp4(frames: Iterator[np.ndarray], fps: float) -> memoryview:
-    """H.264, 4:2:0, in MP4. Edges are repeated to even sizes."""
+def require_alpha(path: str | Path, transparent: bool) -> None:
+    """Raise InputError where a video of this name has no alpha channel, and one is wanted."""
+    if transparent and Path(path).suffix not in (".mov", ""):
+        raise InputError(
+            f"{path}: this format has no transparency; let the name end in .mov (ProRes 4444), or "
+            "in nothing for a folder of PNG files."
+        )
+
+
+def _encoded(frames: Iterator[np.ndarray], fps: float, container_name: str) -> memoryview:
+    """H.264, 4:2:0, in MP4, or ProRes 4444 with alpha in MOV. Edges are repeated to even sizes."""
     import av
 
     rate = Fraction(fps).limit_denominator(1001)
     first = _even(next(frames))
     file = BytesIO()
-    with av.open(file, "w", format="mp4") as container:
-        stream = container.add_stream("h264", rate=rate, options={"crf": QUALITY})
+    with av.open(file, "w", format=container_name) as container:
+        if container_name == "mp4":
+            stream = container.add_stream("h264", rate=rate, options={"crf": QUALITY})
+            stream.pix_fmt = "yuv420p"
+        else:
+            stream = container.add_stream("prores_ks", rate=rate, options={"profile": "4444"})
+            stream.pix_fmt = "yuva444p10le"
         stream.height, stream.width = first.shape[:2]
-        stream.pix_fmt = "yuv420p"
+        kind = "rgb24" if first.shape[2] == 3 else "rgba"
         for pixels in _chain(first, map(_even, frames)):
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format=kind)))
         container.mux(stream.encode(None))
     return file.getbuffer()
 

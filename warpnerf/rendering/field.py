@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,8 +10,9 @@ import warp as wp
 from warpnerf_kernels.base.types import real, vec3
 from warpnerf_kernels.launch import assembly
 
-from warpnerf.checks import require_rays
+from warpnerf.checks import InputError, require_rays
 from warpnerf.fields.lattice import Lattice
+from warpnerf.fields.nodes import cells_within
 from warpnerf.fields.occupancy import FreeCells
 from warpnerf.fields.storage import Storage
 from warpnerf.model.interface import Model
@@ -82,6 +84,32 @@ class Field:
             free=replace(self.free, distance=distance),
             proposal=None if self.proposal is None else self.proposal.copied_to(device),
         )
+
+    def cropped(self, low: Sequence[float], high: Sequence[float]) -> Field:
+        """Crop a field to a box: rays see nothing outside of it.
+
+        Args:
+            low: Lower corner, [3] scene units.
+            high: Upper corner, above the lower one.
+
+        Returns:
+            A field with the same storage, cut to cells of two voxels.
+
+        Raises:
+            InputError: It is no box.
+        """
+        box = np.array([low, high], np.float64)
+        if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[0] < box[1]).all():
+            raise InputError(
+                "crop must be a lower and an upper corner, x y z each, the first below the second, "
+                f"not {' '.join(f'{x:g}' for x in box.ravel())}."
+            )
+        inside = cells_within(self.lattice, *box)
+        if not inside.any():
+            raise InputError(
+                "crop holds no cell of the field, of two voxels along each side; enlarge the box."
+            )
+        return replace(self, free=self.free.cropped(self.lattice, inside, self.workers))
 
     def render(self, camera: Camera) -> Rendering:
         """Render a camera's image: colour, opacity and depth by volume rendering.

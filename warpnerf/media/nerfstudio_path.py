@@ -1,0 +1,107 @@
+"""Camera paths of nerfstudio: what its viewer and its Blender add-on save as camera_path.json.
+
+Each frame has ``camera_to_world``, 16 numbers row by row in OpenGL axes, and ``fov``, the vertical
+field of view in degrees. They lie in nerfstudio's own coordinates: those of the photographs' poses,
+turned, moved and scaled by what its runs keep as dataparser_transforms.json.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from warpnerf.checks import InputError
+from warpnerf.media.camera_path import MAX_SIDE
+from warpnerf.media.recorded_path import MAX_KEYS, Key, RecordedPath, checked_path
+from warpnerf.scenes.files import read_json
+
+TRANSFORMS = "dataparser_transforms.json"
+"""Name of the file that says how nerfstudio's coordinates lie, in the folder of its run."""
+
+
+class Frame(msgspec.Struct):
+    """A frame of a path."""
+
+    camera_to_world: list[float]
+    fov: float
+
+
+class CameraPath(msgspec.Struct):
+    """camera_path.json, as far as it is read."""
+
+    camera_path: list[Frame]
+    render_width: float
+    render_height: float
+    camera_type: str = "perspective"
+    fps: float | None = None
+    seconds: float | None = None
+
+
+class Transforms(msgspec.Struct):
+    """dataparser_transforms.json: p of the scene is at scale * (transform @ (p, 1))."""
+
+    transform: list[list[float]]
+    scale: float
+
+
+def read_nerfstudio_path(path: Path, transforms: Path | None) -> RecordedPath:
+    """Read a camera path of nerfstudio in a scene's coordinates.
+
+    Args:
+        path: Of camera_path.json.
+        transforms: Of dataparser_transforms.json; None: the path is in the scene's coordinates.
+
+    Returns:
+        A path whose keys are the frames.
+
+    Raises:
+        InputError: A file cannot be read, or holds what no camera can do.
+    """
+    read = read_json(path, CameraPath)
+    if read.camera_type != "perspective":
+        raise InputError(
+            f"{path}: camera_type is {read.camera_type}, but only perspective is rendered; save "
+            "the path with perspective cameras."
+        )
+    n = len(read.camera_path)
+    if not 1 <= n <= MAX_KEYS:
+        raise InputError(f"{path}: camera_path has {n} frames, but must have 1 to {MAX_KEYS}.")
+    sizes = (read.render_width, read.render_height)
+    if not all(1 <= side <= MAX_SIDE for side in sizes):
+        raise InputError(f"{path}: render_width and render_height must be 1 to {MAX_SIDE} pixels.")
+    wrong = next((k for k, f in enumerate(read.camera_path) if len(f.camera_to_world) != 16), None)
+    if wrong is not None:
+        raise InputError(f"{path}: camera_path[{wrong}].camera_to_world must be 16 numbers.")
+    poses = np.array([frame.camera_to_world for frame in read.camera_path]).reshape(n, 4, 4)[:, :3]
+    if transforms is not None:
+        poses = _in_scene(poses, transforms)
+    fps = read.fps or 24.0
+    seconds = read.seconds if read.seconds and not read.fps else n / fps
+    times = np.linspace(0.0, seconds, n) if n > 1 else [0.0]
+    keys = [
+        Key(seconds=float(at), fov=frame.fov, c2w=pose.tolist())
+        for at, frame, pose in zip(times, read.camera_path, poses, strict=True)
+    ]
+    width, height = map(round, sizes)
+    return checked_path(RecordedPath(width=width, height=height, keys=keys), path)
+
+
+def _in_scene(poses: np.ndarray, transforms: Path) -> np.ndarray:
+    """Poses [n, 3, 4] of nerfstudio's coordinates in the scene's."""
+    read = read_json(transforms, Transforms)
+    shape = [len(row) for row in read.transform]
+    if shape != [4, 4, 4] or not read.scale > 0.0:
+        raise InputError(
+            f"{transforms}: transform must be three rows of four numbers, and scale above 0; name "
+            f"the {TRANSFORMS} of a nerfstudio run."
+        )
+    transform = np.array(read.transform)
+    rotation, shift = transform[:, :3], transform[:, 3]
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
+        raise InputError(f"{transforms}: transform must turn and move only.")
+    moved = poses.copy()
+    moved[:, :, :3] = rotation.T @ poses[:, :, :3]
+    moved[:, :, 3] = (poses[:, :, 3] / read.scale - shift) @ rotation
+    return moved
