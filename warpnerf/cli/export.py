@@ -22,6 +22,7 @@ def export_command(
     level: float | None = None,
     crop: Corners = None,
     min_size: float | None = None,
+    fill: float | None = None,
     faces: int | None = None,
     texture: bool = False,
     pinhole: bool = False,
@@ -47,6 +48,8 @@ def export_command(
             for splats all of space.
         min_size: Parts of a surface are dropped whose box has a shorter diagonal, scene units; by
             default eight voxel edges.
+        fill: Holes of a surface are closed whose box has a diagonal of at most this, scene units;
+            by default eight voxel edges; 0: none.
         faces: Triangles of the mesh, about; by default two for each voxel that it crosses.
         texture: Give a .glb texture coordinates and a texture, which more programs show than
             vertex colours.
@@ -88,6 +91,7 @@ def export_command(
                 level=level,
                 crop=None if crop is None else (crop[:3], crop[3:]),
                 min_size=min_size,
+                fill=fill,
                 n_faces=faces,
                 texture=texture,
                 pinhole=pinhole,

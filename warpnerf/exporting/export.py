@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import logging
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -21,6 +22,8 @@ from warpnerf.rendering.field import Field
 from warpnerf.scenes.cameras.focus import up_direction
 from warpnerf.scenes.scene import Scene
 from warpnerf.writing import StagedWrites
+
+log = logging.getLogger(__name__)
 
 TEXELS = 3
 """Of a texture, along a voxel edge: the field has no finer detail."""
@@ -56,6 +59,7 @@ def export(
     level: float | None = None,
     crop: surface.Crop | None = None,
     min_size: float | None = None,
+    fill: float | None = None,
     n_faces: int | None = None,
     texture: bool = False,
     pinhole: bool = False,
@@ -80,6 +84,7 @@ def export(
         crop: Lower and upper corner of what is written, scene units; None: what cameras
             see, for splats all of space; volumes end at the box of the grid.
         min_size: Smaller parts of a surface are dropped, scene units; see ``extract_surface``.
+        fill: Holes up to this size are closed, scene units; see ``extract_surface``.
         n_faces: Triangles of a mesh, about; None: as many as there are.
         texture: Give a .glb texture coordinates and a texture instead of vertex colours.
         pinhole: Undistort the photographs of a folder; see ``pinhole_scene``.
@@ -101,6 +106,7 @@ def export(
         level=level,
         crop=crop,
         min_size=min_size,
+        fill=fill,
         n_faces=n_faces,
         texture=texture,
         pinhole=pinhole,
@@ -118,6 +124,7 @@ def export_all(
     level: float | None = None,
     crop: surface.Crop | None = None,
     min_size: float | None = None,
+    fill: float | None = None,
     n_faces: int | None = None,
     texture: bool = False,
     pinhole: bool = False,
@@ -137,6 +144,7 @@ def export_all(
         level: Of surfaces, where there is one among the files.
         crop: As for ``export``.
         min_size: Of surfaces, where there is one among the files.
+        fill: Of surfaces, where there is one among the files.
         n_faces: Of meshes, where there is one among the files.
         texture: Of .glb, where there is one among the files.
         pinhole: Of folders, where there is one among the files.
@@ -164,12 +172,13 @@ def export_all(
         ("undistortion", pinhole or None, "folders", ("",)),
         ("level", level, "surfaces", SURFACES),
         ("min_size", min_size, "surfaces", SURFACES),
+        ("fill", fill, "surfaces", SURFACES),
         ("the number of faces", n_faces, "meshes", MESHES),
     ):
         if value is not None and not {*endings} & {*those}:
             raise InputError(f"{targets[0]}: {name} is of {what}, and there is none; leave it out.")
     # Before what takes long:
-    surface.check_options(field, level, crop, min_size, n_faces)
+    surface.check_options(field, level, crop, min_size, fill, n_faces)
     for path, ending in zip(targets, endings, strict=True):
         if scene is None and ending in ("", ".html"):
             raise InputError(
@@ -188,18 +197,31 @@ def export_all(
         level=level,
         crop=crop,
         min_size=min_size,
+        fill=fill,
         n_faces=n_faces,
         texture=texture,
     )
     with StagedWrites() as staged:
+        if {*endings} & {*MESHES}:
+            _say_borders(products.mesh)
         for path, ending in zip(targets, endings, strict=True):
             if scene is not None and ending == "":
                 shown = pinhole_scene(scene) if pinhole else scene
-                fill = functools.partial(scenes.write_scene, scene=shown, surface=products.surface)
-                staged.add_folder(path, fill)
+                write = functools.partial(scenes.write_scene, scene=shown, surface=products.surface)
+                staged.add_folder(path, write)
             else:
                 staged.add(path, *products.pieces(ending))
     return targets
+
+
+def _say_borders(made: Surface) -> None:
+    """Log where a mesh is open."""
+    if made.borders:
+        n, widest = len(made.borders), ", ".join(f"{width:.3g}" for width in made.borders[:3])
+        log.info(
+            f"the mesh has {n} open border{'s' * (n > 1)}, the widest {widest} scene units across: "
+            "where the cameras' view or the crop ends, or the surface is too faint for its level"
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -213,6 +235,7 @@ class _Products:
     level: float | None
     crop: surface.Crop | None
     min_size: float | None
+    fill: float | None
     n_faces: int | None
     texture: bool
 
@@ -232,6 +255,7 @@ class _Products:
             level=self.level,
             crop=self.crop,
             min_size=self.min_size,
+            fill=self.fill,
             n_faces=n_faces,
         )
 

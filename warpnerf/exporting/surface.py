@@ -12,6 +12,7 @@ import warp as wp
 from warpnerf.checks import InputError, require_at_least, require_positive, require_whole
 from warpnerf.exporting.colour import colours
 from warpnerf.exporting.decimation import decimated
+from warpnerf.exporting.holes import filled
 from warpnerf.exporting.visibility import SEEN, Visibility
 from warpnerf.fields.nodes import nodes_of, points_of, values_at, voxel_edges
 from warpnerf.renamed import renamed_argument
@@ -43,6 +44,8 @@ class Surface:
     """[n_vertices, 3] float32 unit vectors, outward: against the density's gradient."""
     rgb: np.ndarray
     """[n_vertices, 3] float32 in [0, 1], sRGB as in the photographs."""
+    borders: tuple[float, ...] = ()
+    """Diagonals of the boxes around its open borders, scene units, the widest first."""
 
 
 @renamed_argument("sight", "visibility")
@@ -54,6 +57,7 @@ def extract_surface(
     level: float | None = None,
     crop: Crop | None = None,
     min_size: float | None = None,
+    fill: float | None = None,
     n_faces: int | None = None,
 ) -> Surface:
     """Extract the isosurface of the density as a triangle mesh, by marching cubes.
@@ -72,6 +76,8 @@ def extract_surface(
         crop: Only triangles inside this box; None: what cameras see.
         min_size: Components whose box has a shorter diagonal are dropped, scene units; None: eight
             voxel edges.
+        fill: Holes whose box has a diagonal of at most this are closed, scene units; None: eight
+            voxel edges.
         n_faces: Decimate to about so many triangles; None: about two for each voxel that the
             surface crosses.
 
@@ -84,7 +90,7 @@ def extract_surface(
     """
     lattice = field.lattice
     edge = float(lattice.voxel_size.mean())
-    check_options(field, level, crop, min_size, n_faces)
+    check_options(field, level, crop, min_size, fill, n_faces)
     require_crossed(field, level, crop)
     level = default_level(field) if level is None else level
     box = checked_crop(field, crop)
@@ -99,10 +105,9 @@ def extract_surface(
         )
     if visibility is not None and not unseen:
         kept &= values_at(visibility.light, nodes) > SEEN
-    if min_size is None:
-        if lattice.frustum is not None and kept.any():
-            edge = float(np.median(voxel_edges(lattice, points[kept])))
-        min_size = MIN_SIZE * edge
+    if lattice.frustum is not None and kept.any():
+        edge = float(np.median(voxel_edges(lattice, points[kept])))
+    min_size = MIN_SIZE * edge if min_size is None else min_size
     faces = faces[kept[faces].all(axis=1)]
     faces = faces[_large_components(points, faces, min_size)]
     if not len(faces):
@@ -113,6 +118,7 @@ def extract_surface(
         )
     used, faces = np.unique(faces, return_inverse=True)
     points, faces = points[used], faces.reshape(-1, 3)
+    points, faces, borders = filled(points, faces, MIN_SIZE * edge if fill is None else fill)
     if n_faces is not None:
         points, faces = decimated(points, faces, n_faces)
     normals = normals_at(field, raw, points)
@@ -121,6 +127,7 @@ def extract_surface(
         faces=faces.astype(np.int32),
         normals=normals.astype(np.float32),
         rgb=colours(field, visibility, points, normals),
+        borders=tuple(borders),
     )
 
 
@@ -129,6 +136,7 @@ def check_options(
     level: float | None,
     crop: Crop | None,
     min_size: float | None,
+    fill: float | None = None,
     n_faces: int | None = None,
 ) -> None:
     """Raise InputError if a value that was given is of no use."""
@@ -136,6 +144,8 @@ def check_options(
         require_positive("level", level)
     if min_size is not None:
         require_at_least("min_size", min_size, 0.0)
+    if fill is not None:
+        require_at_least("fill", fill, 0.0)
     if n_faces is not None:
         require_whole("the number of faces", n_faces, LEAST_FACES)
     checked_crop(field, crop)
