@@ -167,7 +167,8 @@ def test_of_another_field_the_visibility_is_computed_again(tmp_path: Path) -> No
         replace(view, camera=replace(view.camera, c2w=view.camera.c2w * [1, 1, 1, 0.8]))
         for view in views
     ]
-    for field, seen in ((small, views), (ball_field(), masked), (ball_field(), nearer)):
+    ball = ball_field()
+    for field, seen in ((ball, masked), (ball, views), (ball, nearer), (small, nearer)):
         found = visibility_file.cached_visibility(field, seen, file)
         np.testing.assert_array_equal(found.light, computed_visibility(field, seen).light)
     file.write_bytes(file.read_bytes()[:-40] + bytes(40))  # damaged

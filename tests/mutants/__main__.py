@@ -27,6 +27,7 @@ import factors
 import hashed
 import heads
 import host_command
+import host_exports
 import host_formats
 import host_output
 import host_runs
@@ -63,6 +64,7 @@ MUTANTS = (
     *host_output.MUTANTS,
     *host_runs.MUTANTS,
     *host_command.MUTANTS,
+    *host_exports.MUTANTS,
 )
 
 NOTICED = (

@@ -143,7 +143,7 @@ MUTANTS = [
     of_host("visibility: corners of a fisheye", VISIBILITY, "return share if seen is None else share * seen", "return share", CIRCLE),
     # surface.py, mesh.py, volume.py
     of_host("mesh: inside out", SURFACE, ".reshape(-1, 3)[:, ::-1]", ".reshape(-1, 3)", BALL),
-    of_host("mesh: normals inward", SURFACE, "falling[:, axis] = before - after", "falling[:, axis] = after - before", ON_BALL),
+    of_host("mesh: normals inward", "rendering/normals.py", "falling[:, axis] = before - after", "falling[:, axis] = after - before", ON_BALL),
     of_host("mesh: level without the shift", SURFACE, " - field.storage.density_shift\n", "\n",
             ADDED),
     of_host("density without the shift", SURFACE, "raw + stored.density_shift", "raw", ADDED),
