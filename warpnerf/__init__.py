@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from warpnerf.checks import InputError
     from warpnerf.config import GridConfig, MarchConfig, TrainConfig
     from warpnerf.evaluation.evaluate import Evaluation, evaluate
-    from warpnerf.exporting.export import export, export_all
+    from warpnerf.exporting.export import ExportOptions, export, export_all
     from warpnerf.exporting.splats import Splats, splats_of
     from warpnerf.exporting.surface import Surface, extract_surface
     from warpnerf.exporting.visibility import Visibility, visibility
@@ -82,6 +82,7 @@ _HOMES = {
     "evaluate": "evaluation.evaluate",
     "export": "exporting.export",
     "export_all": "exporting.export",
+    "ExportOptions": "exporting.export",
     "Visibility": "exporting.visibility",
     "visibility": "exporting.visibility",
     "Splats": "exporting.splats",
@@ -139,6 +140,7 @@ __all__ = [  # noqa: RUF022 (grouped by home, as above)
     "evaluate",
     "export",
     "export_all",
+    "ExportOptions",
     "Visibility",
     "visibility",
     "Splats",

@@ -14,7 +14,7 @@ from tests.support import cli_process
 from tests.support.solid_fields import LEVEL, ball_field, read_ply
 from tests.support.tiny_scenes import write_transforms
 from warpnerf.checks import InputError
-from warpnerf.cli.export import export_command
+from warpnerf.cli import export as command
 from warpnerf.config import TrainConfig
 from warpnerf.exporting import splats, surface, visibility_file, volume
 from warpnerf.exporting.export import FORMATS, export
@@ -33,6 +33,14 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run.create(scene, str(folder / "scene"), 1, scene.content_distance, TrainConfig())
     run.save_field(ball_field())
     return folder / "run"
+
+
+OF_RUN = {"scene", "device", "threads"}
+
+
+def export_command(folder: Path, files: tuple[Path, ...], **options: Any) -> int:
+    of_run = {name: options.pop(name) for name in OF_RUN & options.keys()}
+    return command.export_command(folder, files, command.Options(**options), **of_run)
 
 
 def contents(folder: Path) -> dict[Path, bytes]:

@@ -13,7 +13,7 @@ from tests.exporting.test_mesh import CENTRE
 from tests.support.solid_fields import LEVEL, ball_field
 from warpnerf.checks import InputError
 from warpnerf.exporting.atlas import Textured, textured
-from warpnerf.exporting.export import export
+from warpnerf.exporting.export import ExportOptions, export
 from warpnerf.exporting.surface import Surface, extract_surface
 
 
@@ -81,7 +81,12 @@ def test_a_texture_stays_within_the_largest() -> None:
 
 def test_trimesh_reads_the_texture(tmp_path: Path) -> None:
     trimesh = pytest.importorskip("trimesh")
-    path = export(ball_field(), tmp_path / "ball.glb", level=LEVEL, n_faces=1000, texture=True)
+    path = export(
+        ball_field(),
+        tmp_path / "ball.glb",
+        level=LEVEL,
+        options=ExportOptions(n_faces=1000, texture=True),
+    )
     (mesh,) = trimesh.load(path, process=False).geometry.values()
     image = mesh.visual.material.baseColorTexture
     pixels = np.asarray(image.convert("RGB")) / 255.0
@@ -98,4 +103,6 @@ def test_trimesh_reads_the_texture(tmp_path: Path) -> None:
 
 def test_a_texture_of_what_is_no_glb_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"a texture is of \.glb files, and there is none"):
-        export(ball_field(), tmp_path / "ball.ply", level=LEVEL, texture=True)
+        export(
+            ball_field(), tmp_path / "ball.ply", level=LEVEL, options=ExportOptions(texture=True)
+        )

@@ -11,7 +11,7 @@ from tests.exporting.test_mesh import CENTRE, RADIUS, signed_volume
 from tests.support.solid_fields import LEVEL, ball_field
 from warpnerf.checks import InputError
 from warpnerf.exporting.decimation import decimated
-from warpnerf.exporting.export import export
+from warpnerf.exporting.export import ExportOptions, export
 from warpnerf.exporting.surface import extract_surface
 
 
@@ -79,4 +79,4 @@ def test_a_number_of_faces_that_cannot_be_is_refused(
     tmp_path: Path, file: str, n_faces: int, says: str
 ) -> None:
     with pytest.raises(InputError, match=says):
-        export(ball_field(), tmp_path / file, level=LEVEL, n_faces=n_faces)
+        export(ball_field(), tmp_path / file, level=LEVEL, options=ExportOptions(n_faces=n_faces))

@@ -12,7 +12,7 @@ import pytest
 from tests.exporting.test_cameras import ball_scene
 from tests.support.solid_fields import LEVEL, ball_field
 from warpnerf.checks import InputError
-from warpnerf.exporting.export import export
+from warpnerf.exporting.export import ExportOptions, export
 from warpnerf.exporting.pinhole import pinhole_scene
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.cameras.undistort import directions
@@ -86,11 +86,23 @@ def test_no_picture_gets_smaller_than_it_has_to() -> None:
 
 def test_the_folder_has_pinhole_cameras_only(tmp_path: Path) -> None:
     scene = ball_scene(k1=0.1, k2=0.02)
-    export(ball_field(), tmp_path / "out", scene=scene, level=LEVEL, pinhole=True)
+    export(
+        ball_field(),
+        tmp_path / "out",
+        scene=scene,
+        level=LEVEL,
+        options=ExportOptions(pinhole=True),
+    )
     lines = (tmp_path / "out" / "sparse" / "0" / "cameras.txt").read_text().splitlines()[1:]
     assert lines and all(line.split()[1] == "PINHOLE" for line in lines)
     assert sorted(path.name for path in (tmp_path / "out" / "images").iterdir())[0] == "a_00.png"
     read = load_scene(tmp_path / "out")
     np.testing.assert_allclose(read.views[3].camera.c2w, scene.views[3].camera.c2w, atol=1e-12)
     with pytest.raises(InputError, match="undistortion is of folders, and there is none"):
-        export(ball_field(), tmp_path / "a.ply", scene=scene, level=LEVEL, pinhole=True)
+        export(
+            ball_field(),
+            tmp_path / "a.ply",
+            scene=scene,
+            level=LEVEL,
+            options=ExportOptions(pinhole=True),
+        )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -13,20 +14,40 @@ from warpnerf.cli.arguments import Corners, RunFolder
 from warpnerf.runtime.progress import ProgressBar
 
 
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """What is exported of a run, and how."""
+
+    level: float | None = None
+    """Density of the surface, 1 / scene unit; by default that of which a voxel edge is 20 %
+    opaque."""
+    crop: Corners = None
+    """Two corners of the box that is written, scene units; by default what the cameras see, for
+    splats all of space."""
+    min_size: float | None = None
+    """Parts of a surface are dropped whose box has a shorter diagonal, scene units; by default
+    eight voxel edges."""
+    fill: float | None = None
+    """Holes of a surface are closed whose box has a diagonal of at most this, scene units; by
+    default eight voxel edges; 0: none."""
+    faces: int | None = None
+    """Triangles of the mesh, about; by default two for each voxel that it crosses."""
+    texture: bool = False
+    """Give a .glb texture coordinates and a texture, which more programs show than vertex
+    colours."""
+    pinhole: bool = False
+    """Undistort the photographs of a folder, for programs that read no other lenses."""
+    unseen: bool = False
+    """Also write what no training camera sees."""
+
+
 def export_command(
     folder: RunFolder,
     files: Annotated[
         tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FILE [FILE ...]")
     ],
+    options: Options,
     /,
-    level: float | None = None,
-    crop: Corners = None,
-    min_size: float | None = None,
-    fill: float | None = None,
-    faces: int | None = None,
-    texture: bool = False,
-    pinhole: bool = False,
-    unseen: bool = False,
     scene: str | None = None,
     device: str = "cpu",
     threads: int | None = None,
@@ -42,30 +63,19 @@ def export_command(
         folder: Output folder of a training run.
         files: Where to write; a file is replaced, a folder has to be new. Several take little
             longer than one, and either all are written or none is.
-        level: Density of the surface, 1 / scene unit; by default that of which a voxel edge is
-            20 % opaque.
-        crop: Two corners of the box that is written, scene units; by default what the cameras see,
-            for splats all of space.
-        min_size: Parts of a surface are dropped whose box has a shorter diagonal, scene units; by
-            default eight voxel edges.
-        fill: Holes of a surface are closed whose box has a diagonal of at most this, scene units;
-            by default eight voxel edges; 0: none.
-        faces: Triangles of the mesh, about; by default two for each voxel that it crosses.
-        texture: Give a .glb texture coordinates and a texture, which more programs show than
-            vertex colours.
-        pinhole: Undistort the photographs of a folder, for programs that read no other lenses.
-        unseen: Also write what no training camera sees.
+        options: What, and how.
         scene: Where the run's photographs are now, if they have moved.
         device: cpu, cuda, cuda:1, ...
         threads: CPU threads; by default one per usable core.
     """
     from warpnerf.exporting.cameras import camera_model
-    from warpnerf.exporting.export import FORMATS, checked_ending, export_all
+    from warpnerf.exporting.export import FORMATS, ExportOptions, checked_ending, export_all
     from warpnerf.runs.run import Run
     from warpnerf.runs.scene import load_run_scene
 
     run = Run(folder)
     config = run.read_config()
+    crop = options.crop
     endings = [checked_ending(file) for file in files]
     field, notes = run.load_field(device, threads)
     for note in notes:
@@ -87,14 +97,16 @@ def export_command(
                 field,
                 files,
                 scene=views,
-                unseen=unseen,
-                level=level,
+                unseen=options.unseen,
+                level=options.level,
                 crop=None if crop is None else (crop[:3], crop[3:]),
-                min_size=min_size,
-                fill=fill,
-                n_faces=faces,
-                texture=texture,
-                pinhole=pinhole,
+                min_size=options.min_size,
+                options=ExportOptions(
+                    fill=options.fill,
+                    n_faces=options.faces,
+                    texture=options.texture,
+                    pinhole=options.pinhole,
+                ),
                 on_camera=on_camera,
                 cache=run.visibility_file,
             )
@@ -106,7 +118,7 @@ def export_command(
     for file in files:
         print(f"wrote {file}")
     bent = any(camera_model(camera) != "PINHOLE" for camera in views.cameras)
-    if "" in endings and bent and not pinhole:
+    if "" in endings and bent and not options.pinhole:
         print(
             "note: the lenses have distortion, as in the photographs; 3DGS reads PINHOLE only: "
             "--pinhole writes such a folder, with the photographs undistorted"

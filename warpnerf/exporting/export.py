@@ -50,6 +50,20 @@ FORMATS = {
 """What files of these endings hold; without an ending it is a folder."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class ExportOptions:
+    """Export options of meshes, and of a folder's photographs."""
+
+    fill: float | None = None
+    """Holes up to this size are closed, scene units; see ``extract_surface``."""
+    n_faces: int | None = None
+    """Triangles of a mesh, about; None: as many as there are."""
+    texture: bool = False
+    """Give a .glb texture coordinates and a texture instead of vertex colours."""
+    pinhole: bool = False
+    """Undistort the photographs of a folder; see ``pinhole_scene``."""
+
+
 def export(
     field: Field,
     path: str | Path,
@@ -59,10 +73,7 @@ def export(
     level: float | None = None,
     crop: surface.Crop | None = None,
     min_size: float | None = None,
-    fill: float | None = None,
-    n_faces: int | None = None,
-    texture: bool = False,
-    pinhole: bool = False,
+    options: ExportOptions | None = None,
     on_camera: Callable[[int], None] | None = None,
 ) -> Path:
     """Export a field as a mesh, point cloud, Gaussian splats, volume or page, as the ending of the
@@ -84,10 +95,7 @@ def export(
         crop: Lower and upper corner of what is written, scene units; None: what cameras
             see, for splats all of space; volumes end at the box of the grid.
         min_size: Smaller parts of a surface are dropped, scene units; see ``extract_surface``.
-        fill: Holes up to this size are closed, scene units; see ``extract_surface``.
-        n_faces: Triangles of a mesh, about; None: as many as there are.
-        texture: Give a .glb texture coordinates and a texture instead of vertex colours.
-        pinhole: Undistort the photographs of a folder; see ``pinhole_scene``.
+        options: Holes, decimation and texture of meshes, and undistortion of photographs.
         on_camera: Called with the number of training cameras that were looked through.
 
     Returns:
@@ -106,10 +114,7 @@ def export(
         level=level,
         crop=crop,
         min_size=min_size,
-        fill=fill,
-        n_faces=n_faces,
-        texture=texture,
-        pinhole=pinhole,
+        options=options,
         on_camera=on_camera,
     )
     return written
@@ -124,10 +129,7 @@ def export_all(
     level: float | None = None,
     crop: surface.Crop | None = None,
     min_size: float | None = None,
-    fill: float | None = None,
-    n_faces: int | None = None,
-    texture: bool = False,
-    pinhole: bool = False,
+    options: ExportOptions | None = None,
     on_camera: Callable[[int], None] | None = None,
     cache: Path | None = None,
 ) -> list[Path]:
@@ -144,10 +146,7 @@ def export_all(
         level: Of surfaces, where there is one among the files.
         crop: As for ``export``.
         min_size: Of surfaces, where there is one among the files.
-        fill: Of surfaces, where there is one among the files.
-        n_faces: Of meshes, where there is one among the files.
-        texture: Of .glb, where there is one among the files.
-        pinhole: Of folders, where there is one among the files.
+        options: Of the files that they concern; there must be one for each that is given.
         on_camera: As for ``export``.
         cache: A file that keeps the visibility for the next export; see ``cached_visibility``.
 
@@ -161,6 +160,7 @@ def export_all(
     require_kind(field, Field, "export wants a field", "load_field reads that of a run")
     if scene is not None:
         require_kind(scene, Scene, "export wants a scene", "load_scene gives that of a folder")
+    given = ExportOptions() if options is None else options
     targets = [Path(path) for path in paths]
     if not targets:
         raise InputError("export wants at least one file to write; name one.")
@@ -168,17 +168,17 @@ def export_all(
         raise InputError("a file to export is named twice; name each once.")
     endings = [checked_ending(path) for path in targets]
     for name, value, what, those in (
-        ("a texture", texture or None, ".glb files", (".glb",)),
-        ("undistortion", pinhole or None, "folders", ("",)),
+        ("a texture", given.texture or None, ".glb files", (".glb",)),
+        ("undistortion", given.pinhole or None, "folders", ("",)),
         ("level", level, "surfaces", SURFACES),
         ("min_size", min_size, "surfaces", SURFACES),
-        ("fill", fill, "surfaces", SURFACES),
-        ("the number of faces", n_faces, "meshes", MESHES),
+        ("fill", given.fill, "surfaces", SURFACES),
+        ("the number of faces", given.n_faces, "meshes", MESHES),
     ):
         if value is not None and not {*endings} & {*those}:
             raise InputError(f"{targets[0]}: {name} is of {what}, and there is none; leave it out.")
     # Before what takes long:
-    surface.check_options(field, level, crop, min_size, fill, n_faces)
+    surface.check_options(field, level, crop, min_size, given.fill, given.n_faces)
     for path, ending in zip(targets, endings, strict=True):
         if scene is None and ending in ("", ".html"):
             raise InputError(
@@ -197,16 +197,14 @@ def export_all(
         level=level,
         crop=crop,
         min_size=min_size,
-        fill=fill,
-        n_faces=n_faces,
-        texture=texture,
+        options=given,
     )
     with StagedWrites() as staged:
         if {*endings} & {*MESHES}:
             _say_borders(products.mesh)
         for path, ending in zip(targets, endings, strict=True):
             if scene is not None and ending == "":
-                shown = pinhole_scene(scene) if pinhole else scene
+                shown = pinhole_scene(scene) if given.pinhole else scene
                 write = functools.partial(scenes.write_scene, scene=shown, surface=products.surface)
                 staged.add_folder(path, write)
             else:
@@ -235,13 +233,11 @@ class _Products:
     level: float | None
     crop: surface.Crop | None
     min_size: float | None
-    fill: float | None
-    n_faces: int | None
-    texture: bool
+    options: ExportOptions
 
     @functools.cached_property
     def mesh(self) -> Surface:
-        return self.surface if self.n_faces is None else self._surface(self.n_faces)
+        return self.surface if self.options.n_faces is None else self._surface(self.options.n_faces)
 
     @functools.cached_property
     def surface(self) -> Surface:
@@ -255,7 +251,7 @@ class _Products:
             level=self.level,
             crop=self.crop,
             min_size=self.min_size,
-            fill=self.fill,
+            fill=self.options.fill,
             n_faces=n_faces,
         )
 
@@ -288,7 +284,7 @@ class _Products:
         if ending == ".npz":
             return volume.volume_npz(self.volume)
         if ending == ".glb":
-            return mesh.mesh_glb(self.textured if self.texture else self.mesh, up)
+            return mesh.mesh_glb(self.textured if self.options.texture else self.mesh, up)
         if ending == ".points.ply":
             return mesh.points_ply(self.surface)
         return {".obj": mesh.mesh_obj, ".ply": mesh.mesh_ply}[ending](self.mesh)
