@@ -267,13 +267,10 @@ def field_header(field: Field) -> dict[str, Any]:
 
 def field_tensors(field: Field) -> dict[str, np.ndarray]:
     """The arrays of a field, by name: with its header, all that it renders with."""
-    tensors = field.storage.tensors()
-    if field.proposal is not None:
-        tensors[PARAMETER] = field.proposal.grid.tensors()["values"]
+    tensors, proposal = field.storage.tensors(), field.proposal
+    tensors |= {} if proposal is None else {PARAMETER: proposal.grid.tensors()["values"]}
     tensors["free_distance"] = field.free.distance.numpy().reshape(field.free.size)
-    if field.weights.size:
-        tensors["weights"] = field.weights.numpy()
-    return tensors
+    return tensors | ({"weights": field.weights.numpy()} if field.weights.size else {})
 
 
 def _optimiser_tensors(state: TrainingState) -> dict[str, np.ndarray]:
