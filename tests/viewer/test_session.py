@@ -281,7 +281,7 @@ def test_a_fault_of_the_page_does_not_end_a_training(
         def fail(*arguments: Any) -> None:
             raise RuntimeError("of viser's")
 
-        monkeypatch.setattr(session._painter, "paint", fail)
+        monkeypatch.setattr(session._painter, "look", fail)
         session._credit = 0.1
         with pytest.warns(UserWarning, match="the page failed .*of viser's.* training continues"):
             session.after_update()

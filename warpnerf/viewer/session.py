@@ -23,7 +23,7 @@ from warpnerf.media.camera_path import look_at
 from warpnerf.scenes.scene import Scene
 from warpnerf.viewer.painter import Painter, Settings, Subject
 from warpnerf.viewer.panel import Panel
-from warpnerf.viewer.screen import Pace, Screen
+from warpnerf.viewer.screen import Paces, Screen
 from warpnerf.viewer.server import address, close_server, open_server
 from warpnerf.viewer.stage import Pyramids, Stage
 from warpnerf.viewer.viewpoint import FirstLook, Viewpoint, World, first_look
@@ -93,7 +93,7 @@ class Session:
             InputError: viser is missing, or host and port cannot be listened at.
         """
         self._painter = Painter(subjects)
-        self._coarse, self._fine = Pace(), Pace()
+        self._paces = Paces()
         self._pages: dict[int, Page] = {}
         self._news = threading.Event()
         self._turns = 0
@@ -196,11 +196,13 @@ class Session:
 
     def _warm_up(self, viewpoint: Viewpoint, settings: Settings) -> None:
         """Compile, and measure, before anybody waits for it."""
+        pixels = math.prod(WARM_UP_SIZE)
         for _ in range(2):
             began = monotonic()
-            self._painter.paint(viewpoint, settings, WARM_UP_SIZE)
-        for pace in (self._coarse, self._fine):
-            pace.note(math.prod(WARM_UP_SIZE), monotonic() - began)
+            look = self._painter.look(viewpoint, settings, WARM_UP_SIZE)
+        for pace in (self._paces.coarse, self._paces.fine):
+            pace.note(pixels, monotonic() - began)
+        self._painter.reproject(look, viewpoint, pixels)
 
     def _next(self) -> tuple[Page | None, float]:
         """The page whose turn it is, and since or until when; none: infinity."""
@@ -230,7 +232,7 @@ class Session:
             if page.screen.fine:
                 page.pyramids.put_up()
 
-        screen = Screen(self._painter, show, self._coarse, self._fine)
+        screen = Screen(self._painter, show, self._paces)
         page = Page(client, screen, self._stage.welcome(client))
         self._pages[client.client_id] = page
         self._look(page)
