@@ -55,6 +55,8 @@ class Settings:
     """How far the near field reaches from the camera, scene units."""
     crop: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
     """Corners of the box outside of which nothing is shown, scene units."""
+    clip: float = 0.0
+    """Nothing is shown that is closer to the camera, scene units."""
     layout: Layout = "side by side"
     """How two fields share the page."""
     divider: float = 0.5
@@ -251,12 +253,7 @@ class Painter:
         Returns:
             Colours [..., 3] uint8 and distances [...] float32.
         """
-        field = self.subjects[index].field()
-        if settings.crop is not None:
-            field = replace(field, free=self._crop(index, field, settings.crop))
-        if settings.kind == "near field":
-            steps = replace(field.steps, far=settings.within, transmittance_min=0.0)
-            field = replace(field, steps=steps, proposal=None)
+        field = self._shown(index, settings)
         if isinstance(seen_by, Camera):
             seen = field.render(seen_by)
         else:
@@ -264,6 +261,37 @@ class Painter:
         some = np.maximum(seen.opacity, 1e-6)
         distance = np.where(seen.opacity > SOLID, seen.depth / some, np.inf).astype(np.float32)
         return to_bytes(_colours(seen, settings)), distance
+
+    def surface(
+        self, origin: np.ndarray, direction: np.ndarray, settings: Settings
+    ) -> np.ndarray | None:
+        """Ray casting: the surface point that a ray meets, at its expected depth.
+
+        Args:
+            origin: [3], scene units.
+            direction: [3] of unit length.
+            settings: What is shown: nothing is met that is cropped.
+
+        Returns:
+            [3] scene units; None: the field is not opaque along the ray.
+        """
+        field = self._shown(1 if settings.layout == "second" else 0, settings)
+        seen = field.render_rays(origin[None], direction[None])
+        if seen.opacity[0] <= SOLID:
+            return None
+        return origin + float(seen.depth[0] / seen.opacity[0]) * direction
+
+    def _shown(self, index: int, settings: Settings) -> Field:
+        """What is left of a subject to be shown."""
+        field = self.subjects[index].field()
+        if settings.crop is not None:
+            field = replace(field, free=self._crop(index, field, settings.crop))
+        if settings.clip > field.steps.near:
+            field = replace(field, steps=replace(field.steps, near=settings.clip))
+        if settings.kind == "near field":
+            steps = replace(field.steps, far=settings.within, transmittance_min=0.0)
+            field = replace(field, steps=steps, proposal=None)
+        return field
 
     def _crop(self, index: int, field: Field, crop: object) -> FreeCells:
         """Free cells with all outside of the box among them, kept as long as neither changes."""

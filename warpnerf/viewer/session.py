@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 import threading
 import warnings
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Callable, Sequence
 from time import monotonic
 from types import TracebackType
 from typing import Any
@@ -21,8 +22,10 @@ from warpnerf.checks import require_extra
 from warpnerf.evaluation.near_field import NEAR_SHARE
 from warpnerf.media.camera_path import look_at
 from warpnerf.scenes.scene import Scene
+from warpnerf.viewer.comparison import Comparison
 from warpnerf.viewer.painter import Painter, Settings, Subject
 from warpnerf.viewer.panel import Panel
+from warpnerf.viewer.ruler import Ruler
 from warpnerf.viewer.screen import Paces, Screen
 from warpnerf.viewer.server import address, close_server, open_server
 from warpnerf.viewer.stage import Pyramids, Stage
@@ -30,6 +33,8 @@ from warpnerf.viewer.viewpoint import FirstLook, Viewpoint, World, first_look
 
 WARM_UP_SIZE = (120, 90)
 """Pixels."""
+MOST_REQUESTS = 8
+"""That wait for the thread that renders."""
 MAX_DEBT = 0.5
 """Seconds that pictures may save up, or run ahead of their share."""
 
@@ -96,6 +101,7 @@ class Session:
         self._paces = Paces()
         self._pages: dict[int, Page] = {}
         self._news = threading.Event()
+        self._requests: deque[Callable[[], None]] = deque(maxlen=MOST_REQUESTS)
         self._turns = 0
         self._last = monotonic()
         self._credit = 0.0
@@ -124,6 +130,9 @@ class Session:
                 lambda client_id: getattr(self._pages.get(client_id), "viewpoint", None),
                 self._news.set,
             )
+            Ruler(self.server, world, self._painter, lambda: self._panel.settings, self._request)
+            if scene is not None:
+                Comparison(self.server, scene, self._painter, self._request)
         self.server.on_client_connect(self._welcome)
         self.server.on_client_disconnect(self._forget)
 
@@ -149,6 +158,7 @@ class Session:
         """Draw what pages request, until something is raised: by a signal, as a rule."""
         while True:
             self._news.clear()
+            self._answer()
             page, due = self._next()
             wait = due - monotonic()
             if page is not None and wait <= 0.0:
@@ -181,6 +191,9 @@ class Session:
     def _spend(self) -> None:
         """Draw as long as there is time to spend, and something to draw."""
         while self._credit > 0.0:
+            began = monotonic()
+            self._answer()
+            self._credit -= monotonic() - began
             page, due = self._next()
             began = monotonic()
             if page is None or due > began:
@@ -203,6 +216,16 @@ class Session:
         for pace in (self._paces.coarse, self._paces.fine):
             pace.note(pixels, monotonic() - began)
         self._painter.reproject(look, viewpoint, pixels)
+
+    def _request(self, work: Callable[[], None]) -> None:
+        """Have something done by the thread that renders; the oldest of too many is forgotten."""
+        self._requests.append(work)
+        self._news.set()
+
+    def _answer(self) -> None:
+        """Do what was requested."""
+        while self._requests:
+            self._requests.popleft()()
 
     def _next(self) -> tuple[Page | None, float]:
         """The page whose turn it is, and since or until when; none: infinity."""
