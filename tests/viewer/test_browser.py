@@ -172,7 +172,7 @@ def test_clicks_in_the_page_measure_what_is_under_them(
         page = opened(chromium, session)
         page.get_by_label("Show", exact=True).uncheck(force=True)
         page.get_by_text("Distance", exact=True).click()
-        page.get_by_label("Measure", exact=True).check(force=True)
+        page.get_by_label("Measure", exact=True).evaluate("box => box.click()")  # it still unfolds
         (looking,) = session._pages.values()
         camera, painter = looking.viewpoint.camera(WIDTH, HEIGHT), session._painter
         spots = np.array([[210, 420], [230, 480]])  # rows and columns
@@ -181,9 +181,10 @@ def test_clicks_in_the_page_measure_what_is_under_them(
             for origin, direction in zip(*pixel_rays(camera, *spots.T), strict=True)
         ]
         assert all(end is not None for end in ends)
-        for row, column in spots:
+        time.sleep(1.0)  # until the page knows that clicks are wanted
+        for number, (row, column) in enumerate(spots, 1):
             page.mouse.click(column + 0.5, row + 0.5)
-            time.sleep(0.3)
+            eventually(lambda n=number: len(session._ruler.points) == n, 20.0)
         page.get_by_text("scene units, from").wait_for()
         points = session._ruler.points
         np.testing.assert_allclose(points, ends, atol=0.02)

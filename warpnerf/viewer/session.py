@@ -130,7 +130,9 @@ class Session:
                 lambda client_id: getattr(self._pages.get(client_id), "viewpoint", None),
                 self._news.set,
             )
-            Ruler(self.server, world, self._painter, lambda: self._panel.settings, self._request)
+            self._ruler = Ruler(
+                self.server, world, self._painter, lambda: self._panel.settings, self._request
+            )
             if scene is not None:
                 Comparison(self.server, scene, self._painter, self._request)
         self.server.on_client_connect(self._welcome)
