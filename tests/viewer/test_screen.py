@@ -170,7 +170,7 @@ def test_a_machine_that_warps_slowly_gets_smaller_pictures(
     watched.screen.look_from(viewpoint())
     watched.run()
     assert drag(watched, 3.0) >= 15 * 3.0 * 0.8
-    assert watched.shown[-1].shape[1] == round(200 * module.STEP**3)
+    assert watched.shown[-1].shape[1] == round(200 * module.STEP**2)
 
 
 def test_at_rest_the_fine_picture_comes_within_a_second(watched: Watched) -> None:

@@ -210,10 +210,11 @@ class Painter:
         rows = np.minimum(edge * blocks[:, 0] + edge // 2, camera.height - 1)
         columns = np.minimum(edge * blocks[:, 1] + edge // 2, camera.width - 1)
         colours, _ = self._look(index, (camera, rows, columns), settings)
-        whole = np.zeros((-(-camera.height // edge), -(-camera.width // edge), 3), np.uint8)
-        whole[blocks[:, 0], blocks[:, 1]] = colours
-        row, column = np.nonzero(~seen)
-        picture[row, column] = whole[row // edge, column // edge]
+        filled = np.zeros((-(-camera.height // edge), -(-camera.width // edge), 3), np.uint8)
+        filled[blocks[:, 0], blocks[:, 1]] = colours
+        holes = np.flatnonzero(~seen)
+        row, column = np.divmod(holes, camera.width)
+        picture.reshape(-1, 3)[holes] = filled[row // edge, column // edge]
 
     def _strips(
         self, viewpoint: Viewpoint, settings: Settings, size: tuple[int, int], rows: range
@@ -344,16 +345,13 @@ def _blocks_with_holes(seen: np.ndarray, most: int) -> tuple[np.ndarray, int]:
         Their rows and columns, [n, 2] with n <= max(most, 1), and their edge in pixels: the
         smallest power of two from SMALLEST_BLOCK that needs no more blocks.
     """
-    edge = SMALLEST_BLOCK
-    high, wide = seen.shape
-    padded = np.ones((-(-high // edge) * edge, -(-wide // edge) * edge), bool)
-    padded[:high, :wide] = seen
-    holes = ~padded.reshape(len(padded) // edge, edge, -1, edge).all(axis=(1, 3))
-    blocks = np.argwhere(holes)
-    while len(blocks) > max(most, 1):
-        blocks = np.unique(blocks // 2, axis=0)
+    holes, edge = ~seen, 1
+    while edge < SMALLEST_BLOCK or np.count_nonzero(holes) > max(most, 1):
+        holes = np.pad(holes, [(0, size % 2) for size in holes.shape])
+        holes = holes[::2] | holes[1::2]
+        holes = holes[:, ::2] | holes[:, 1::2]
         edge *= 2
-    return blocks, edge
+    return np.argwhere(holes), edge
 
 
 def _window(camera: Camera, columns: range, rows: range) -> Camera:
