@@ -51,11 +51,11 @@ class Reprojector:
         warped, seen = np.zeros((*size, 3), np.uint8), np.empty(size, np.uint8)
         depth_buffer = _lent(depths, real)
         self._workers.launch(
-            kernels.splat_depths, distance.size, *views, distances, depth_buffer, cache=self._cache
+            kernels.splat_depths, source.height, *views, distances, depth_buffer, cache=self._cache
         )
         self._workers.launch(
             kernels.inverse_warp,
-            depths.size,
+            target.height,
             *(*views, pixels, distances, depth_buffer),
             *(_lent(warped, wp.uint8), _lent(seen, wp.uint8)),
             cache=self._cache,

@@ -41,30 +41,19 @@ class Pinhole:
 
 
 @wp.func
-def direction_of(view: Pinhole, u: real, v: real) -> vec3:
-    """The ray through image position (u, v) in world axes, 1 long along the camera's axis."""
-    x = (u - view.principal[0]) / view.focal[0]
-    y = (v - view.principal[1]) / view.focal[1]
-    return view.rotation * vec3(x, -y, real(-1.0))
-
-
-@wp.func
-def project(view: Pinhole, point: vec3) -> vec3:
-    """Image position of a point, in pixels, and its depth along the axis; not in front: <= 0."""
-    local = wp.transpose(view.rotation) * (point - view.position)
-    depth = -local[2]
-    inverse = real(1.0) / wp.max(depth, real(1.0e-12))
-    return vec3(
+def project(view: Pinhole, local: vec3) -> vec2:
+    """Image position of a point in the camera's axes, in front of it, in pixels."""
+    inverse = real(-1.0) / local[2]
+    return vec2(
         view.focal[0] * local[0] * inverse + view.principal[0],
         view.principal[1] - view.focal[1] * local[1] * inverse,
-        depth,
     )
 
 
 @wp.kernel
 def splat_depths(
     # launch
-    first: int,
+    first: int,  # an item is a row of the source
     # scene
     source: Pinhole,
     target: Pinhole,
@@ -73,44 +62,53 @@ def splat_depths(
     out_depths: wp.array(dtype=real),  # [h * w] of the target, along its axis; NOTHING before
 ):
     """The depth buffer of the target: each point of the source covers the four nearest pixels."""
-    i = first + wp.tid()
-    distance = distances[i]
-    if distance <= real(0.0):
-        return
-    ray = direction_of(
-        source, real(i % source.width) + real(0.5), real(i // source.width) + real(0.5)
-    )
-    at = project(target, source.position + distance * wp.normalize(ray))
-    if at[2] <= real(0.0):
-        return
-    if at[0] < real(-1.0) or at[0] > real(target.width) + real(1.0):
-        return
-    if at[1] < real(-1.0) or at[1] > real(target.height) + real(1.0):
-        return
-    column = int(wp.floor(at[0] - real(0.5)))
-    row = int(wp.floor(at[1] - real(0.5)))
-    for corner in range(4):
-        x = column + corner % 2
-        y = row + corner // 2
-        if x >= 0 and x < target.width and y >= 0 and y < target.height:
-            wp.atomic_min(out_depths, y * target.width + x, at[2])
+    row = first + wp.tid()
+    # In the target's axes: rays of this row, 1 long along the source's axis, and where they begin.
+    turn = wp.transpose(target.rotation) * source.rotation
+    shift = wp.transpose(target.rotation) * (source.position - target.position)
+    across = real(1.0) / source.focal[0]
+    y = (source.principal[1] - real(row) - real(0.5)) / source.focal[1]
+    for column in range(source.width):
+        distance = distances[row * source.width + column]
+        if distance > real(0.0):
+            x = (real(column) + real(0.5) - source.principal[0]) * across
+            along = distance / wp.sqrt(x * x + y * y + real(1.0))
+            local = along * (turn * vec3(x, y, real(-1.0))) + shift
+            if local[2] < real(0.0):
+                at = project(target, local)
+                if at[0] > real(-1.0) and at[0] < real(target.width + 1):
+                    if at[1] > real(-1.0) and at[1] < real(target.height + 1):
+                        # Rounded down: what is rounded towards 0 is made positive before.
+                        left = int(at[0] + real(1.5)) - 2
+                        above = int(at[1] + real(1.5)) - 2
+                        for corner in range(4):
+                            u = left + corner % 2
+                            v = above + corner // 2
+                            if u >= 0 and u < target.width and v >= 0 and v < target.height:
+                                wp.atomic_min(out_depths, v * target.width + u, -local[2])
 
 
 @wp.func
-def mixed(pixels: wp.array(dtype=wp.uint8), view: Pinhole, u: real, v: real, channel: int) -> real:
-    """A channel at image position (u, v), by bilinear interpolation, in [0, 255]."""
+def pixel_at(pixels: wp.array(dtype=wp.uint8), i: int) -> vec3:
+    """The colour of pixel i, in [0, 255]."""
+    return vec3(real(pixels[3 * i]), real(pixels[3 * i + 1]), real(pixels[3 * i + 2]))
+
+
+@wp.func
+def mixed(pixels: wp.array(dtype=wp.uint8), view: Pinhole, u: real, v: real) -> vec3:
+    """The colour at image position (u, v), by bilinear interpolation, in [0, 255]."""
     x = wp.clamp(u - real(0.5), real(0.0), real(view.width - 1))
     y = wp.clamp(v - real(0.5), real(0.0), real(view.height - 1))
-    column = wp.min(int(x), wp.max(view.width - 2, 0))
-    row = wp.min(int(y), wp.max(view.height - 2, 0))
-    right = wp.min(column + 1, view.width - 1)
-    below = wp.min(row + 1, view.height - 1)
+    column = int(x)
+    row = int(y)
+    right = wp.where(column + 1 < view.width, 1, 0)
+    below = wp.where(row + 1 < view.height, view.width, 0)
+    i = row * view.width + column
     a = x - real(column)
     b = y - real(row)
-    upper = (real(1.0) - a) * real(pixels[3 * (row * view.width + column) + channel])
-    upper += a * real(pixels[3 * (row * view.width + right) + channel])
-    lower = (real(1.0) - a) * real(pixels[3 * (below * view.width + column) + channel])
-    lower += a * real(pixels[3 * (below * view.width + right) + channel])
+    upper = (real(1.0) - a) * pixel_at(pixels, i) + a * pixel_at(pixels, i + right)
+    i += below
+    lower = (real(1.0) - a) * pixel_at(pixels, i) + a * pixel_at(pixels, i + right)
     return (real(1.0) - b) * upper + b * lower
 
 
@@ -153,7 +151,7 @@ def distances_around(distances: wp.array(dtype=real), view: Pinhole, u: real, v:
 @wp.kernel
 def inverse_warp(
     # launch
-    first: int,
+    first: int,  # an item is a row of the target
     # scene
     source: Pinhole,
     target: Pinhole,
@@ -165,38 +163,42 @@ def inverse_warp(
     out_seen: wp.array(dtype=wp.uint8),  # [h * w] 1: the source shows it; 0: it is made up
 ):
     """The target's pixels, read from the source where the surface of each is seen there."""
-    i = first + wp.tid()
-    out_seen[i] = wp.uint8(0)
-    depth = depths[i]
-    if depth >= real(wp.static(NOTHING)):
-        depth = depth_beside(depths, target, i)
+    row = first + wp.tid()
+    # In the source's axes: rays of this row, 1 long along the target's axis, and where they begin.
+    turn = wp.transpose(source.rotation) * target.rotation
+    shift = wp.transpose(source.rotation) * (target.position - source.position)
+    y = (target.principal[1] - real(row) - real(0.5)) / target.focal[1]
+    across = real(1.0) / target.focal[0]
+    for column in range(target.width):
+        i = row * target.width + column
+        seen = wp.uint8(0)
+        depth = depths[i]
         if depth >= real(wp.static(NOTHING)):
-            return
-    ray = direction_of(
-        target, real(i % target.width) + real(0.5), real(i // target.width) + real(0.5)
-    )
-    stretch = wp.length(ray)
-    ray = ray / stretch
-    t = depth * stretch
-    for _ in range(wp.static(TRIES)):
-        point = target.position + t * ray
-        at = project(source, point)
-        if at[2] <= real(0.0):
-            break
-        if at[0] < real(0.0) or at[0] >= real(source.width):
-            break
-        if at[1] < real(0.0) or at[1] >= real(source.height):
-            break
-        expected = wp.length(point - source.position)
-        between = distances_around(distances, source, at[0], at[1])
-        if between[0] <= real(0.0):
-            break
-        slack = real(wp.static(TOLERANCE)) * expected
-        if expected > between[0] - slack and expected < between[1] + slack:
-            for channel in range(3):
-                value = mixed(pixels, source, at[0], at[1], channel)
-                out_pixels[3 * i + channel] = wp.uint8(value + real(0.5))
-            out_seen[i] = wp.uint8(1)
-            break
-        there = distances[int(at[1]) * source.width + int(at[0])]
-        t = wp.max(t + there - expected, real(1.0e-6))
+            depth = depth_beside(depths, target, i)
+        if depth < real(wp.static(NOTHING)):
+            x = (real(column) + real(0.5) - target.principal[0]) * across
+            ray = turn * vec3(x, y, real(-1.0))
+            stretch = wp.sqrt(x * x + y * y + real(1.0))
+            for _ in range(wp.static(TRIES)):
+                point = depth * ray + shift
+                if point[2] >= real(0.0):
+                    break
+                at = project(source, point)
+                if at[0] < real(0.0) or at[0] >= real(source.width):
+                    break
+                if at[1] < real(0.0) or at[1] >= real(source.height):
+                    break
+                expected = wp.length(point)
+                between = distances_around(distances, source, at[0], at[1])
+                if between[0] <= real(0.0):
+                    break
+                slack = real(wp.static(TOLERANCE)) * expected
+                if expected > between[0] - slack and expected < between[1] + slack:
+                    colour = mixed(pixels, source, at[0], at[1])
+                    for channel in range(3):
+                        out_pixels[3 * i + channel] = wp.uint8(colour[channel] + real(0.5))
+                    seen = wp.uint8(1)
+                    break
+                there = distances[int(at[1]) * source.width + int(at[0])]
+                depth = wp.max(depth + (there - expected) / stretch, real(1.0e-6))
+        out_seen[i] = seen
