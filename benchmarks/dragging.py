@@ -27,8 +27,8 @@ from warpnerf.runtime.parallel import Workers
 
 WIDTH, HEIGHT = 640, 400
 MOVES_PER_SECOND = 60
-REST = 2.5
-"""Seconds after a drag, in which the fine picture comes."""
+REST = 2.0
+"""Seconds without a picture, after which the fine one was the last: unfinished ones come before it."""
 
 COUNTER = """
 window.pictures = [];
@@ -47,6 +47,9 @@ for (const kind of [WebGLRenderingContext, WebGL2RenderingContext])
 
 WHOLE = f"end => window.pictures.some(p => p[0] > end && p[1] == {WIDTH} && p[2] == {HEIGHT})"
 """Whether a picture of full size has come since."""
+
+QUIET = "rest => performance.now() - window.pictures.at(-1)[0] > rest"
+"""Whether none has come for so many milliseconds."""
 
 TICKS = os.sysconf("SC_CLK_TCK")
 
@@ -83,8 +86,8 @@ def dragged(port: int, rounds: int, seconds: float) -> dict[str, Any]:
             before = core_seconds()
             begin, end = _drag(page, seconds, 1 if number % 2 else -1)
             after = core_seconds()
-            time.sleep(REST)
             page.wait_for_function(WHOLE, arg=end)
+            page.wait_for_function(QUIET, arg=1e3 * REST)
             shown = [p for p in page.evaluate("window.pictures") if _of_the_view(*p[1:])]
             moving = [p for p in shown if begin <= p[0] <= end]
             whole = [p[0] for p in shown if p[0] > end and p[1:] == [WIDTH, HEIGHT]]
