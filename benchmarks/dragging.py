@@ -28,7 +28,7 @@ from warpnerf.runtime.parallel import Workers
 WIDTH, HEIGHT = 640, 400
 MOVES_PER_SECOND = 60
 REST = 2.0
-"""Seconds without a picture, after which the fine one was the last: unfinished ones come before it."""
+"""Seconds without a picture, after which the last one was the fine one."""
 
 COUNTER = """
 window.pictures = [];
