@@ -12,12 +12,7 @@ that looks, in turns. Writes benchmarks/results/viewer_<device>.json.
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,6 +21,7 @@ import numpy as np
 from chromium import browser, missing
 from measuring import machine, median_interval, options, show, write_record
 from page_client import PageClient
+from page_server import served
 
 import warpnerf as wn
 from warpnerf.runs.run import Run
@@ -92,22 +88,6 @@ def painting(field: wn.Field, run: Run, rounds: int) -> dict[str, Any]:
             f"{show(result[name]['core_seconds'], 2)} s"
         )
     return result
-
-
-@contextmanager
-def served(run: Path, device: str) -> Iterator[int]:
-    """The port at which the command serves a run."""
-    command = [sys.executable, "-m", "warpnerf", "view", str(run), "--port", "0"]
-    process = subprocess.Popen(
-        [*command, "--device", device], stdout=subprocess.PIPE, text=True, env=os.environ
-    )
-    try:
-        assert process.stdout is not None
-        address = next(line for line in process.stdout if line.startswith("look at"))
-        yield int(address.split(";")[0].rpartition(":")[2])
-    finally:
-        process.terminate()
-        process.wait()
 
 
 def measured(port: int, rounds: int, seconds: float) -> dict[str, Any]:

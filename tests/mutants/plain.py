@@ -10,6 +10,7 @@ TILES = "kernels/test_tiles.py"
 OCCUPANCY = "kernels/test_free_space.py"
 CAMERA = "kernels/test_camera_rays.py"
 COVERAGE = "kernels/test_coverage.py"
+REPROJECTION = "viewer/test_reprojection.py"
 RAYS = "rendering/test_rays.py"
 GRADSCALE = "kernels/test_gradscale.py"
 VALUES = "kernels/test_render.py::test_values_and_visited_samples"
@@ -348,6 +349,22 @@ MUTANTS = [
            "            cell[2] += real(1.0)\n", "", OCCUPANCY),
     Mutant("occupancy: a row's positions are alike", "sampling/occupancy.py",
            "            position += 1\n", "            position += 0\n", OCCUPANCY),
+    # reprojection.py
+    Mutant("reprojection: rows upside down", "space/reprojection.py",
+           "view.principal[1] - view.focal[1] * local[1]",
+           "view.principal[1] + view.focal[1] * local[1]", REPROJECTION),
+    Mutant("reprojection: the wrong axis", "space/reprojection.py",
+           "turn = wp.transpose(target.rotation) * source", "turn = target.rotation * source", REPROJECTION),
+    Mutant("reprojection: one pixel covered", "space/reprojection.py",
+           "for corner in range(4):", "for corner in range(1):", REPROJECTION),
+    Mutant("reprojection: depth for a distance", "space/reprojection.py",
+           "along = distance / wp.sqrt(x * x + y * y + real(1.0))", "along = distance", REPROJECTION),
+    Mutant("reprojection: whatever lies there", "space/reprojection.py",
+           "if expected > between[0] - slack and expected", "if expected", REPROJECTION),
+    Mutant("reprojection: half a pixel off", "space/reprojection.py",
+           "x = wp.clamp(u - real(0.5)", "x = wp.clamp(u", REPROJECTION),
+    Mutant("reprojection: pixels without a distance", "space/reprojection.py",
+           "                if between[0] <= real(0.0):\n                    break\n", "", REPROJECTION),
     # camera.py
     Mutant("camera: pixel corner", "space/camera.py",
            "view, real(i % view.width) + real(0.5)", "view, real(i % view.width)", CAMERA),

@@ -21,7 +21,7 @@ from tests.support.tiny_scenes import ring, tiny_scene
 from warpnerf.media.recorded_path import read_path
 from warpnerf.rendering.field import Field
 from warpnerf.scenes.scene import Scene
-from warpnerf.viewer.painter import Painter, Settings, Subject
+from warpnerf.viewer.painter import Painter, Settings, Subject, pixel_rays
 from warpnerf.viewer.session import Session
 from warpnerf.viewer.stage import stand_in
 
@@ -162,6 +162,44 @@ def test_a_training_camera_is_stood_in_by_a_click(
         page.mouse.click(x, y)
         eventually(lambda: np.abs(looking.viewpoint.c2w[:, 3] - target.position).max() < 1e-3, 20.0)
         np.testing.assert_allclose(looking.viewpoint.c2w, target.c2w, atol=1e-3)
+        page.close()
+
+
+def test_clicks_in_the_page_measure_what_is_under_them(
+    chromium: Any, field: Field, scene: Scene
+) -> None:
+    with serving(field, scene=scene) as session:
+        page = opened(chromium, session)
+        page.get_by_label("Show", exact=True).uncheck(force=True)
+        page.get_by_text("Distance", exact=True).click()
+        page.get_by_label("Measure", exact=True).evaluate("box => box.click()")  # it still unfolds
+        (looking,) = session._pages.values()
+        camera, painter = looking.viewpoint.camera(WIDTH, HEIGHT), session._painter
+        spots = np.array([[210, 420], [230, 480]])  # rows and columns
+        ends = [
+            painter.surface(origin, direction, session._panel.settings)
+            for origin, direction in zip(*pixel_rays(camera, *spots.T), strict=True)
+        ]
+        assert all(end is not None for end in ends)
+        time.sleep(1.0)  # until the page knows that clicks are wanted
+        for number, (row, column) in enumerate(spots, 1):
+            page.mouse.click(column + 0.5, row + 0.5)
+            eventually(lambda n=number: len(session._ruler.points) == n, 20.0)
+        page.get_by_text("scene units, from").wait_for()
+        points = session._ruler.points
+        np.testing.assert_allclose(points, ends, atol=0.02)
+        assert session._ruler.length == pytest.approx(np.linalg.norm(ends[1] - ends[0]), rel=0.05)
+        page.close()
+
+
+def test_a_photograph_is_compared_in_a_window(chromium: Any, field: Field, scene: Scene) -> None:
+    with serving(field, scene=scene) as session:
+        page = opened(chromium, session)
+        page.get_by_text("Compare with a photograph").click()
+        page.get_by_role("button", name="Show the difference").click()
+        page.get_by_text("PSNR:").wait_for()
+        page.get_by_role("button", name="Close", exact=True).click()
+        page.get_by_text("PSNR:").wait_for(state="hidden")
         page.close()
 
 

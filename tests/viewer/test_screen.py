@@ -1,4 +1,4 @@
-"""What a page is shown when: coarse while it moves, fine at rest, and nothing for nothing."""
+"""What a page is shown when: coarse or warped while it moves, fine at rest, nothing for nothing."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ import pytest
 
 from tests.support.tiny_scenes import ring
 from warpnerf.viewer import screen as module
-from warpnerf.viewer.painter import Settings
-from warpnerf.viewer.screen import REFRESH_SECONDS, REST_SECONDS, Pace, Screen, fine_size
+from warpnerf.viewer.painter import Look, Settings
+from warpnerf.viewer.screen import REFRESH_SECONDS, REST_SECONDS, Paces, Screen, fine_size
 from warpnerf.viewer.viewpoint import Viewpoint
 
 SETTINGS = Settings(near=0.0, far=1.0, within=0.1)
 PIXELS_PER_SECOND = 60_000.0
+WARPED_PER_SECOND = 3e6
 
 
 class Clock:
@@ -32,14 +33,26 @@ class Paints:
         self.clock = clock
         self.stamp = (0,)
         self.calls: list[tuple[tuple[int, int], int]] = []
+        self.warped: list[tuple[Look, Viewpoint, int]] = []
+        self.pixels_per_second = PIXELS_PER_SECOND
 
-    def paint(
+    def look(
         self, viewpoint: Viewpoint, settings: Settings, size: Any, rows: range | None = None
-    ) -> np.ndarray:
+    ) -> Look:
         rows = rows or range(size[1])
         self.calls.append((size, len(rows)))
-        self.clock.now += size[0] * len(rows) / PIXELS_PER_SECOND
-        return np.repeat(np.array(rows, np.uint8)[:, None, None], size[0], 1).repeat(3, 2)
+        self.clock.now += size[0] * len(rows) / self.pixels_per_second
+        picture = np.repeat(np.array(rows, np.uint8)[:, None, None], size[0], 1).repeat(3, 2)
+        distance = np.ones(picture.shape[:2], np.float32)
+        return Look(viewpoint=viewpoint, settings=settings, picture=picture, distance=distance)
+
+    def reproject(self, look: Look, viewpoint: Viewpoint, n_rays: int) -> Look:
+        self.warped.append((look, viewpoint, n_rays))
+        self.clock.now += look.distance.size / WARPED_PER_SECOND
+        return replace(look, viewpoint=viewpoint)
+
+    def divided(self, picture: np.ndarray, settings: Settings) -> np.ndarray:
+        return picture
 
 
 class Watched:
@@ -49,7 +62,7 @@ class Watched:
         self.painter = Paints(self.clock)
         self.shown: list[np.ndarray] = []
         show: Any = lambda picture, quality: self.shown.append(picture.copy())  # noqa: E731
-        self.screen = Screen(self.painter, show, Pace(), Pace())  # type: ignore[arg-type]
+        self.screen = Screen(self.painter, show, Paces())  # type: ignore[arg-type]
 
     def run(self, settings: Settings = SETTINGS, share: float = 1.0) -> None:
         """As long as something is due, waiting for it."""
@@ -91,9 +104,9 @@ def test_coarse_pictures_come_in_time(watched: Watched) -> None:
     """As many pixels as the machine makes in a fifteenth of a second, and of its share of it."""
     for share in (1.0, 0.25):
         for index in range(40):
-            watched.screen.look_from(viewpoint(index % 9))
+            watched.screen.look_from(viewpoint())
             began = watched.clock.now
-            watched.screen.advance(SETTINGS, share)
+            watched.screen.advance(replace(SETTINGS, within=1.0 + index), share)  # nothing to warp
             seconds = watched.clock.now - began
         assert seconds == pytest.approx(share * module.MOVING_SECONDS, rel=0.1)
 
@@ -102,6 +115,72 @@ def test_a_small_canvas_gets_no_more_than_it_has(watched: Watched) -> None:
     watched.screen.look_from(viewpoint(width=16, height=12))
     watched.run()
     assert {picture.shape for picture in watched.shown} == {(12, 16, 3)}
+
+
+def drag(watched: Watched, seconds: float, share: float = 1.0) -> int:
+    """Say fifty times a second that the camera has moved; the pictures that come."""
+    before, end, said = len(watched.shown), watched.clock.now + seconds, watched.clock.now
+    index = 0
+    while watched.clock.now < end:
+        while said <= watched.clock.now:
+            index, said = index + 1, said + 0.02
+            watched.screen.look_from(viewpoint(index % 9))
+        due = watched.screen.due(SETTINGS)
+        if due is None or due > watched.clock.now:
+            watched.clock.now = said
+            continue
+        watched.screen.advance(SETTINGS, share)
+    return len(watched.shown) - before
+
+
+@pytest.mark.parametrize("share", [1.0, 0.3])
+def test_a_drag_shows_the_last_whole_picture_warped(watched: Watched, share: float) -> None:
+    """In full resolution, fifteen times a second; the next whole ones come in between."""
+    watched.screen.look_from(viewpoint())
+    watched.run()
+    fine = watched.screen._whole
+    assert drag(watched, 4.0, share) >= 15 * 4.0
+    assert {picture.shape for picture in watched.shown[-50:]} == {(150, 200, 3)}
+    looks = [id(look) for look, _, _ in watched.painter.warped]
+    assert watched.painter.warped[0][0] is fine
+    assert 4 <= len(set(looks)) <= 30  # a new one to be warped twice a second or oftener
+    assert all(n >= 1 for _, _, n in watched.painter.warped)
+    last = watched.painter.warped[-1][0].viewpoint
+    assert fine is not None and last is not fine.viewpoint
+    watched.run()
+    assert watched.screen.fine and watched.screen._drawn == (watched.screen._wanted, SETTINGS)
+
+
+def test_a_machine_that_renders_in_no_time_warps_nothing(watched: Watched) -> None:
+    watched.painter.pixels_per_second = 1e8
+    watched.screen.look_from(viewpoint())
+    for _ in range(20):  # which is measured first
+        watched.screen.advance(SETTINGS)
+        watched.screen._drawn = None
+    watched.run()
+    watched.painter.warped.clear()
+    drag(watched, 1.0)
+    assert not watched.painter.warped and watched.shown[-1].shape == (150, 200, 3)
+
+
+def test_a_machine_that_warps_slowly_gets_smaller_pictures(
+    watched: Watched, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(globals(), "WARPED_PER_SECOND", 3e5)
+    watched.screen.look_from(viewpoint())
+    watched.run()
+    assert drag(watched, 3.0) >= 15 * 3.0 * 0.8
+    assert watched.shown[-1].shape[1] == round(200 * module.STEP**2)
+
+
+def test_at_rest_the_fine_picture_comes_within_a_second(watched: Watched) -> None:
+    watched.screen.look_from(viewpoint())
+    watched.run()
+    drag(watched, 1.0)
+    stopped = watched.clock.now
+    watched.run()
+    rendering = 200 * 150 / PIXELS_PER_SECOND
+    assert watched.clock.now - stopped < REST_SECONDS + rendering + 2.0 * module.MOVING_SECONDS
 
 
 def test_a_band_is_short_and_a_move_gives_the_rest_up(watched: Watched) -> None:
@@ -116,7 +195,7 @@ def test_a_band_is_short_and_a_move_gives_the_rest_up(watched: Watched) -> None:
     watched.screen.look_from(viewpoint(1))
     assert watched.screen.due(SETTINGS) == 0.0
     watched.screen.advance(SETTINGS)
-    assert watched.shown[-1].shape[1] < 200
+    assert watched.painter.warped[-1][1].c2w is watched.screen._wanted.c2w  # type: ignore[union-attr]
 
 
 def test_what_is_set_begins_anew(watched: Watched) -> None:

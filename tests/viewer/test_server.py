@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import importlib.util
 import socket
+import struct
 import sys
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
@@ -108,6 +110,45 @@ def test_garbage_ends_that_connection_only(
     with PageClient(server.get_port()) as page:
         page.wait(lambda page: page.messages)
     assert "Traceback" not in capfd.readouterr().err
+
+
+UPGRADE = (
+    b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n"
+)
+PAGE = b"Sec-WebSocket-Protocol: viser-v1.1.1\r\n\r\n"
+
+
+def test_a_port_scan_is_not_mentioned(server: Any, capfd: pytest.CaptureFixture[str]) -> None:
+    """Whatever it sends, and however it leaves; pages are served as before."""
+    said = [
+        b"",
+        b"\x16\x03\x01\x02\x00\x01\x00",
+        b"\xff" * 3000,
+        b"GET / HTTP/1.0\r\n\r\n",
+        b"OPTIONS * RTSP/1.0\r\n\r\n",
+        b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n",
+        b"GET /%00 HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n",
+        b"GET / HTTP/1.1\r\nHost: \xff\xfe\r\n\r\n",
+        UPGRADE[:60],
+        UPGRADE + b"\r\n",
+        UPGRADE + b"Sec-WebSocket-Protocol: chat\r\n\r\n",
+        UPGRADE + PAGE,
+        UPGRADE + PAGE + b"\x82\x05hello",
+    ]
+    reset = struct.pack("ii", 1, 0)  # leave without a farewell
+    for data in said:
+        for seconds in (0.0, 0.1):
+            for abruptly in (False, True):
+                with socket.create_connection(("127.0.0.1", server.get_port())) as scanner:
+                    scanner.sendall(data)
+                    time.sleep(seconds)
+                    if abruptly:
+                        scanner.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, reset)
+    with PageClient(server.get_port()) as page:
+        page.wait(lambda page: page.messages)
+    time.sleep(0.2)
+    assert capfd.readouterr() == ("", "")
 
 
 def test_no_page_can_have_the_world_served(server: Any, monkeypatch: pytest.MonkeyPatch) -> None:

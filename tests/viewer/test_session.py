@@ -172,6 +172,64 @@ def test_one_stands_in_a_camera_without_seeing_it(field: Field) -> None:
         page.wait(lambda page: visible(page) == {0, 2, 3})
         page.look_from(opencv(ring(5, radius=1.0)[2]))
         page.wait(lambda page: visible(page) == {0, 1, 2, 3})
+        step = session._stage.length / session._world.scale  # of the pyramids, scene units
+        beside = poses[1].copy()
+        for lengths, seen in ((1.8, {0, 2, 3}), (2.2, {0, 1, 2, 3})):
+            beside[:3, 3] = poses[1][:3, 3] + lengths * step * poses[1][:3, 2]  # behind it
+            page.look_from(opencv(beside))
+            page.wait(lambda page, seen=seen: visible(page) == seen)
+
+
+def test_photographs_are_shown_to_those_outside_of_the_cameras(field: Field) -> None:
+    """Not near a camera, and not in the middle of all of them."""
+    poses = ring(5)
+    with (
+        serving(field, scene=tiny_scene(poses)) as session,
+        PageClient(session.server.get_port()) as page,
+    ):
+        page.look_from(opencv(poses[1]))
+        page.wait(lambda page: len(page.messages.get("ImageMessage", [])) == 4)
+        far = ring(5, radius=40.0)
+        assert not photographs(page)
+        page.look_from(opencv(far[1]))
+        page.wait(photographs)
+        middle = poses[1].copy()
+        middle[:3, 3] = np.mean([pose[:3, 3] for pose in poses], axis=0)
+        page.look_from(opencv(middle))
+        page.wait(lambda page: not photographs(page))
+        page.look_from(opencv(far[2]))
+        page.wait(photographs)
+        session._stage.show_cameras(visible=False, scale=1.0)
+        page.wait(lambda page: not photographs(page))
+        session._stage.show_cameras(visible=True, scale=1.0)
+        page.wait(photographs)
+        session._stage.show_cameras(visible=True, scale=40.0)  # so large that one is among them
+        page.wait(lambda page: not photographs(page))
+
+
+def photographs(page: PageClient) -> bool:
+    """Whether a page shows photographs, by what it was told last."""
+    told = page.messages.get("SetSceneNodeVisibilityMessage", [])
+    return bool([m["visible"] for m in told if m["name"] == "/photographs"][-1:] == [True])
+
+
+def test_where_nothing_changes_a_move_tells_nothing_of_cameras(field: Field) -> None:
+    poses = ring(5)
+    with (
+        serving(field, scene=tiny_scene(poses)) as session,
+        PageClient(session.server.get_port()) as page,
+    ):
+        page.look_from(opencv(poses[1]))
+        page.wait(lambda page: len(page.messages.get("ImageMessage", [])) == 4)
+        before = sum(map(len, page.messages.values()))
+        pyramids = next(iter(session._stage._pages.values()))
+        for _ in range(20):
+            pyramids.stand_at(poses[1][:3, 3] + 1e-3)
+        n = len(page.pictures)
+        page.look_from(opencv(poses[1] + 1e-6 * np.eye(4)))
+        page.wait(lambda page: len(page.pictures) > n)
+        kinds = {k for k, m in page.messages.items() if k.startswith(("SetScene", "SceneNode"))}
+        assert sum(map(len, page.messages.values())) - before < 5, kinds
 
 
 def test_each_page_gets_its_cameras_after_its_picture(field: Field) -> None:
@@ -281,7 +339,7 @@ def test_a_fault_of_the_page_does_not_end_a_training(
         def fail(*arguments: Any) -> None:
             raise RuntimeError("of viser's")
 
-        monkeypatch.setattr(session._painter, "paint", fail)
+        monkeypatch.setattr(session._painter, "look", fail)
         session._credit = 0.1
         with pytest.warns(UserWarning, match="the page failed .*of viser's.* training continues"):
             session.after_update()

@@ -165,6 +165,13 @@ class Panel:
                 )
                 for axis, low, high in zip("xyz", *box, strict=True)
             ]
+            clip = gui.add_slider(
+                "Clip before", 0.0, 2.0, 0.02, 0.0, hint="what is nearer, in content distances"
+            )
+
+        @clip.on_update
+        def _(_: Any) -> None:
+            self._set(clip=_kept(clip.value, 0.0, 2.0) * self._content_distance)
 
         def crop(_: Any) -> None:
             ends = np.array([axis.value for axis in ranges]).reshape(3, 2)

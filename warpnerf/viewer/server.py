@@ -71,7 +71,8 @@ def open_server(host: str, port: int | None) -> viser.ViserServer:
     server.request_share_url = lambda verbose=True: None
     server.gui.configure_theme(show_share_button=False, show_logo=False)
     # Who sends garbage is disconnected. There is nothing to say about it.
-    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
+    for name in ("websockets", "websockets.server"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
     server.get_event_loop().set_exception_handler(lambda loop, context: None)
     return server
@@ -127,9 +128,22 @@ def _guard(host: str, inner: Callable[[Any, Any], Any]) -> Callable[[Any, Any], 
             return connection.respond(
                 HTTPStatus.FORBIDDEN, "Open this page by an address of the machine it is on.\n"
             )
+        if not _is_page(request.headers):
+            return connection.respond(HTTPStatus.BAD_REQUEST, "Open this page in a browser.\n")
         return inner(connection, request)
 
     return guard
+
+
+def _is_page(headers: Any) -> bool:
+    """Whether a request is for a file, or for a socket as viser's page requests it.
+
+    viser would print a line about each other one: a port scan has many.
+    """
+    if headers.get_all("Upgrade") == []:
+        return True
+    offered = ",".join(headers.get_all("Sec-WebSocket-Protocol")).split(",")
+    return any(protocol.strip().startswith("viser-v") for protocol in offered)
 
 
 def _is_address(name: str) -> bool:

@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 import threading
 import warnings
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Callable, Sequence
 from time import monotonic
 from types import TracebackType
 from typing import Any
@@ -21,15 +22,19 @@ from warpnerf.checks import require_extra
 from warpnerf.evaluation.near_field import NEAR_SHARE
 from warpnerf.media.camera_path import look_at
 from warpnerf.scenes.scene import Scene
+from warpnerf.viewer.comparison import Comparison
 from warpnerf.viewer.painter import Painter, Settings, Subject
 from warpnerf.viewer.panel import Panel
-from warpnerf.viewer.screen import Pace, Screen
+from warpnerf.viewer.ruler import Ruler
+from warpnerf.viewer.screen import Paces, Screen
 from warpnerf.viewer.server import address, close_server, open_server
 from warpnerf.viewer.stage import Pyramids, Stage
 from warpnerf.viewer.viewpoint import FirstLook, Viewpoint, World, first_look
 
 WARM_UP_SIZE = (120, 90)
 """Pixels."""
+MOST_REQUESTS = 8
+"""That wait for the thread that renders."""
 MAX_DEBT = 0.5
 """Seconds that pictures may save up, or run ahead of their share."""
 
@@ -93,9 +98,10 @@ class Session:
             InputError: viser is missing, or host and port cannot be listened at.
         """
         self._painter = Painter(subjects)
-        self._coarse, self._fine = Pace(), Pace()
+        self._paces = Paces()
         self._pages: dict[int, Page] = {}
         self._news = threading.Event()
+        self._requests: deque[Callable[[], None]] = deque(maxlen=MOST_REQUESTS)
         self._turns = 0
         self._last = monotonic()
         self._credit = 0.0
@@ -124,6 +130,11 @@ class Session:
                 lambda client_id: getattr(self._pages.get(client_id), "viewpoint", None),
                 self._news.set,
             )
+            self._ruler = Ruler(
+                self.server, world, self._painter, lambda: self._panel.settings, self._request
+            )
+            if scene is not None:
+                Comparison(self.server, scene, self._painter, self._request)
         self.server.on_client_connect(self._welcome)
         self.server.on_client_disconnect(self._forget)
 
@@ -149,6 +160,7 @@ class Session:
         """Draw what pages request, until something is raised: by a signal, as a rule."""
         while True:
             self._news.clear()
+            self._answer()
             page, due = self._next()
             wait = due - monotonic()
             if page is not None and wait <= 0.0:
@@ -181,6 +193,9 @@ class Session:
     def _spend(self) -> None:
         """Draw as long as there is time to spend, and something to draw."""
         while self._credit > 0.0:
+            began = monotonic()
+            self._answer()
+            self._credit -= monotonic() - began
             page, due = self._next()
             began = monotonic()
             if page is None or due > began:
@@ -196,11 +211,23 @@ class Session:
 
     def _warm_up(self, viewpoint: Viewpoint, settings: Settings) -> None:
         """Compile, and measure, before anybody waits for it."""
+        pixels = math.prod(WARM_UP_SIZE)
         for _ in range(2):
             began = monotonic()
-            self._painter.paint(viewpoint, settings, WARM_UP_SIZE)
-        for pace in (self._coarse, self._fine):
-            pace.note(math.prod(WARM_UP_SIZE), monotonic() - began)
+            look = self._painter.look(viewpoint, settings, WARM_UP_SIZE)
+        for pace in (self._paces.coarse, self._paces.fine):
+            pace.note(pixels, monotonic() - began)
+        self._painter.reproject(look, viewpoint, pixels)
+
+    def _request(self, work: Callable[[], None]) -> None:
+        """Have something done by the thread that renders; the oldest of too many is forgotten."""
+        self._requests.append(work)
+        self._news.set()
+
+    def _answer(self) -> None:
+        """Do what was requested."""
+        while self._requests:
+            self._requests.popleft()()
 
     def _next(self) -> tuple[Page | None, float]:
         """The page whose turn it is, and since or until when; none: infinity."""
@@ -230,7 +257,7 @@ class Session:
             if page.screen.fine:
                 page.pyramids.put_up()
 
-        screen = Screen(self._painter, show, self._coarse, self._fine)
+        screen = Screen(self._painter, show, self._paces)
         page = Page(client, screen, self._stage.welcome(client))
         self._pages[client.client_id] = page
         self._look(page)

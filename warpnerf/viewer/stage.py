@@ -27,6 +27,10 @@ MAX_CAMERAS = 200
 """That are shown; of more, so many evenly spread ones."""
 THUMBNAIL = 128
 """Pixels along the longer side of a photograph on its camera."""
+EYES = 2.0
+"""Lengths of a pyramid from its camera: whoever looks from within does not see it."""
+AMONG = 8.0
+"""Lengths of a pyramid from the nearest camera, within which one stands among them."""
 
 CAMERA_COLOUR = (235, 120, 30)
 BOX_COLOUR = (60, 140, 240)
@@ -84,9 +88,23 @@ class Stage:
             pyramids.refresh()
 
     def in_the_way(self, position: np.ndarray) -> frozenset[int]:
-        """The cameras that one stands in at a position [3], scene units."""
+        """The cameras in front of the eyes of whoever looks from a position [3], scene units."""
+        return frozenset(np.flatnonzero(self._lengths_from(position) < EYES).tolist())
+
+    def photographs_from(self, position: np.ndarray) -> bool:
+        """Whether cameras show their photographs from a position [3], scene units.
+
+        Not to whoever stands among them: between the outermost ones, or near one.
+        """
+        if not len(self._places):
+            return False
+        inside = (position >= self._places.min(axis=0)) & (position <= self._places.max(axis=0))
+        return not inside.all() and float(self._lengths_from(position).min()) >= AMONG
+
+    def _lengths_from(self, position: np.ndarray) -> np.ndarray:
+        """How far the cameras are from a position, in lengths of their pyramids as shown, [n]."""
         apart = self._world.scale * np.linalg.norm(self._places - position, axis=1)
-        return frozenset(np.flatnonzero(apart < self.scale * self.length).tolist())
+        return apart / (self.scale * self.length)
 
     def photograph(self, index: int) -> np.ndarray | None:
         """What a camera took, small; [h, w, 3] uint8, None: its file is not what it was."""
@@ -96,6 +114,13 @@ class Stage:
             except InputError:
                 self._photographs[index] = None
         return self._photographs[index]
+
+    def base(self, index: int) -> tuple[float, float, np.ndarray]:
+        """Width, height and middle [3] of the base of a pyramid, in viser's units."""
+        camera = self.cameras[self._views[index].name]
+        length = self.scale * self.length
+        middle = self._world.scale * camera.position + length * camera.forward
+        return length * camera.width / camera.fx, length * camera.height / camera.fy, middle
 
     def clicked(self, index: int, client: viser.ClientHandle) -> None:
         """Have a page stand in a camera."""
@@ -136,6 +161,9 @@ class Pyramids:
         self._client = client
         self._stage = stage
         self._handles: list[Any] = []
+        self._photographs: list[tuple[int, Any]] = []  # indices of cameras, and what shows them
+        self._folder: Any = None
+        self._hidden = frozenset(range(len(stage.pyramids)))
         self._position = np.full(3, np.inf)
         self._begun = False
         self._lock = threading.Lock()
@@ -158,26 +186,69 @@ class Pyramids:
                 )
                 handle.on_click(lambda event, index=index: self._stage.clicked(index, event.client))
                 self._handles.append(handle)
+            # All photographs are shown and hidden by one message.
+            self._folder = self._client.scene.add_frame(
+                "/photographs", show_axes=False, visible=False
+            )
         self.refresh()
-        for index, handle in enumerate(self._handles):
-            if self.gone:
-                break
+        for index in range(len(self._handles)):
             photograph = self._stage.photograph(index)
-            if photograph is not None:
-                handle.image = photograph
+            with self._lock:
+                if self.gone:
+                    break
+                if photograph is not None:
+                    self._add_photograph(index, photograph)
+
+    def _add_photograph(self, index: int, photograph: np.ndarray) -> None:
+        looks = self._stage.pyramids[index]
+        width, height, position = self._stage.base(index)
+        handle = self._client.scene.add_image(
+            f"/photographs/{index:04}",
+            photograph,
+            width,
+            height,
+            format="jpeg",
+            wxyz=looks["wxyz"],
+            position=position,
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+        handle.on_click(lambda event: self._stage.clicked(index, event.client))
+        self._photographs.append((index, handle))
 
     def stand_at(self, position: np.ndarray) -> None:
-        """Hide those that one stands in at a position [3], scene units, and no others."""
+        """Hide those in front of one's eyes at a position [3], scene units, and photographs there.
+
+        Photographs are shown to those who stand outside of all cameras.
+        """
         self._position = position
-        self.refresh()
+        self._hide()
 
     def refresh(self) -> None:
         """Show what is to be shown, as large as it is to be."""
-        inside = self._stage.in_the_way(self._position)
+        stage = self._stage
         with self._lock:
             for index, handle in enumerate(self._handles):
-                handle.visible = self._stage.visible and index not in inside
-                handle.scale = self._stage.scale * self._stage.pyramids[index]["scale"]
+                handle.scale = stage.scale * stage.pyramids[index]["scale"]
+            for index, handle in self._photographs:
+                handle.render_width, handle.render_height, handle.position = stage.base(index)
+        self._hide()
+
+    def _hide(self) -> None:
+        """Show or hide cameras and photographs: fifty times a second, so only what changes."""
+        stage = self._stage
+        hidden = (
+            stage.in_the_way(self._position)
+            if stage.visible
+            else frozenset(range(len(stage.pyramids)))
+        )
+        with self._lock:
+            if self._folder is None:
+                return
+            self._folder.visible = stage.visible and stage.photographs_from(self._position)
+            for index in hidden ^ self._hidden:
+                self._handles[index].visible = index not in hidden
+            self._hidden = hidden
 
 
 def stand_in(client: viser.ClientHandle, camera: Camera, world: World) -> None:
