@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol, overload
 
 import numpy as np
@@ -116,6 +116,18 @@ class View:
                 )
             if not mask.any():
                 raise InputError(f"{self.name}: its mask leaves no pixel; leave out the view.")
+
+    def posed(self, c2w: np.ndarray) -> View:
+        """The view with another pose.
+
+        Args:
+            c2w: [3, 4] camera to world, OpenGL axes, scene units.
+
+        Returns:
+            A view with the same photograph, which is not read.
+        """
+        kept = {name: self.__dict__[name] for name in ("name", "image", "depth", "mask")}
+        return View(camera=replace(self.camera, c2w=c2w), **kept)
 
     @property
     def channels(self) -> int:

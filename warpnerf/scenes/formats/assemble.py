@@ -15,6 +15,7 @@ from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.cameras.focus import estimate_extent
 from warpnerf.scenes.cameras.lens import Lens
 from warpnerf.scenes.cameras.undistort import seen_pixels
+from warpnerf.scenes.extent.conventions import hold_against_photographs
 from warpnerf.scenes.extent.points import Points, extent_by_points
 from warpnerf.scenes.files import by_number, exists
 from warpnerf.scenes.images.depths import Depth, DepthFile, read_depth
@@ -133,6 +134,8 @@ def assemble(
     indices = {
         split: tuple(sorted(index[name] for name in names)) for split, names in complete.items()
     }
+    views, points, told = hold_against_photographs(views, indices["train"], points, is_object)
+    warnings += told
     training = [views[i] for i in indices["train"]]
     unbounded = not is_object
     transparent = {view.name for view, see in zip(views, kept.see_through, strict=True) if see}
