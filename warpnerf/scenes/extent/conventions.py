@@ -31,8 +31,8 @@ ALMOST_ALL = 0.8
 """Share of references for which it must be."""
 
 SUPPORTED = 0.7
-"""Support of points that are believed, at least; those of captures have 0.83 to 1.3."""
-SURELY = 0.8
+"""Support of points that are believed, at least; those of captures have 0.78 to 1.26."""
+SURELY = 0.75
 """Support of points in other axes or units, for these to be the cameras'."""
 BETTER = 0.2
 """By how much that must be more than in their own, where these are in pictures as well."""
@@ -48,9 +48,9 @@ SEEN = 0.5
 UNSEEN = 0.1
 """Share below which points are not those of these cameras."""
 AS_FAR_AS = 100.0
-"""Points farther from the middle of the cameras than so many times what these are need support."""
 AS_NEAR_AS = 0.02
-"""The same for points in other units, which are not nearer than that, either."""
+"""Points farther from the cameras' middle than so many times what these are, or nearer, need
+support."""
 SCALES = (1.0, 1e-3, 1e3, 1e-2, 1e2)
 """Units that points may be in, in those of the cameras: metres, millimetres, centimetres."""
 
@@ -198,7 +198,7 @@ def _believed(
     """
     share = _share_seen(cameras, _sample(points))
     support = None if photographs is None else photographs.support(poses, points.positions)
-    near = _times_as_far(cameras, points.positions) <= AS_FAR_AS
+    near = AS_NEAR_AS <= _times_as_far(cameras, points.positions) <= AS_FAR_AS
     good = support is None or support >= SUPPORTED
     if share >= SEEN and good and near:
         return points, []

@@ -39,6 +39,8 @@ ANGLE = np.radians(30.0)
 APART = 0.15
 """A neighbour is at least so far off, where there are such: nearer ones see the same whatever the
 pose is."""
+FAR_APART = 0.5
+"""The same, where points are looked for: their depths must show."""
 
 PATCH = np.stack(np.meshgrid(*2 * [np.linspace(-3.0, 3.0, 5)]), axis=-1).reshape(-1, 2)
 """Where a patch is sampled, [25, 2] pixels from its middle."""
@@ -153,7 +155,7 @@ class PhotoConsistency:
         chosen = self.references[::every]
         for i in chosen:
             middles, away = self._foremost(poses[i], i, points)
-            near = neighbours(poses, i)
+            near = neighbours(poses, i, FAR_APART)
             sweep = np.tile(_inverse_depths(poses, i, near)[:, None], len(middles))
             inverse = np.concatenate([sweep, 1.0 / away[None]])
             match = self._correlations(poses, i, near, near, middles, inverse)
@@ -242,12 +244,13 @@ class PhotoConsistency:
         return self._pictures[i]
 
 
-def neighbours(poses: np.ndarray, i: int) -> list[int]:
+def neighbours(poses: np.ndarray, i: int, least: float = APART) -> list[int]:
     """Neighbours of a camera: those that stand and look nearly as it does, but not quite.
 
     Args:
         poses: [n, 3, 4] camera to world, at least FEWEST.
         i: Index of the camera.
+        least: How far off they are, at least, where there are such.
 
     Returns:
         NEIGHBOURS indices.
@@ -258,7 +261,7 @@ def neighbours(poses: np.ndarray, i: int) -> list[int]:
     spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean())
     off = angle / ANGLE + np.linalg.norm(centres - centres[i], axis=1) / max(spread, 1e-12)
     order = [int(k) for k in np.argsort(off, kind="stable") if k != i]
-    apart = [k for k in order if off[k] >= APART]
+    apart = [k for k in order if off[k] >= least]
     return (apart if len(apart) >= NEIGHBOURS else order[::-1])[:NEIGHBOURS]
 
 
