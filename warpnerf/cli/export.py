@@ -47,9 +47,10 @@ def export_command(
         threads: CPU threads; by default one per usable core.
     """
     from warpnerf.exporting.cameras import camera_model
-    from warpnerf.exporting.export import FORMATS, checked_ending, export
+    from warpnerf.exporting.export import CENTRED, FORMATS, checked_ending, export
     from warpnerf.runs.run import Run
     from warpnerf.runs.scene import load_run_scene
+    from warpnerf.scenes.formats.georeference import in_words
 
     run = Run(folder)
     config = run.read_config()
@@ -86,6 +87,11 @@ def export_command(
                 "room."
             ) from error
     print(f"wrote {file}")
+    if views.offset is not None and ending in CENTRED:
+        print(
+            f"note: its coordinates are those of the capture's file less {in_words(views.offset)}, "
+            "for single precision; .ply, .obj, .npz and a folder have the file's own"
+        )
     if ending == "" and any(camera_model(camera) != "PINHOLE" for camera in views.cameras):
         print(
             "note: the lenses have distortion, as in the photographs; 3DGS reads PINHOLE only: "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from warpnerf.checks import InputError, require_kind
@@ -31,6 +32,10 @@ FORMATS = {
 }
 """What files of these endings hold; without an ending it is a folder."""
 
+CENTRED = (".glb", ".splat.ply", ".html", ".nvdb")
+"""Files whose programs read positions in single precision: of a georeferenced scene they keep the
+coordinates of the training, less its offset, and the others have those of its file."""
+
 
 def export(
     field: Field,
@@ -50,6 +55,10 @@ def export(
     and colours. .splat.ply: Gaussian splats. .html: a page that shows these without a network;
     needs the extra ``viewer``. .nvdb, .npz: density, and colour in .npz, on a grid. No ending: a
     folder with photographs, cameras for nerfstudio and COLMAP, and points.
+
+    Coordinates are those of the scene's file, also where ``Scene.offset`` was subtracted from them;
+    only .glb, .splat.ply, .html and .nvdb, which are read in single precision, stay without it. A
+    .glb has it in its extras, a .splat.ply as a comment.
 
     Args:
         field: What to write.
@@ -93,24 +102,30 @@ def export(
     views = [] if scene is None else [scene.views[index] for index in scene.splits["train"]]
     visible = visibility(field, views, on_camera) if views else None
     up = None if scene is None else up_direction(scene.training_cameras)
+    offset = None if scene is None else scene.offset
     if ending in SPLATS:
         made = splats.splats_of(field, visible, unseen=unseen, crop=crop)
         if scene is not None and ending == ".html":
             pieces = page.splats_html(made, scene, field.background)
         else:
-            pieces = splats.splats_ply(made, up)
+            pieces = splats.splats_ply(made, up, offset)
     elif ending in VOLUMES:
         block = volume.volume_of(field, visible, unseen=unseen, crop=crop)
-        pieces = volume.volume_nvdb(block) if ending == ".nvdb" else volume.volume_npz(block)
+        if ending == ".nvdb":
+            pieces = volume.volume_nvdb(block)
+        else:
+            pieces = volume.volume_npz(block if offset is None else block.moved(offset))
     else:
         found = surface.extract_surface(
             field, visible, unseen=unseen, level=level, crop=crop, min_size=min_size
         )
+        if offset is not None and ending not in CENTRED:
+            found = replace(found, points=found.points + offset)
         if scene is not None and ending == "":
-            scenes.write_scene(path, scene, found)
+            scenes.write_scene(path, scene.at_offset(None), found)
             return path
         if ending == ".glb":
-            pieces = mesh.mesh_glb(found, up)
+            pieces = mesh.mesh_glb(found, up, offset)
         else:
             write = {".obj": mesh.mesh_obj, ".ply": mesh.mesh_ply, ".points.ply": mesh.points_ply}
             pieces = write[ending](found)

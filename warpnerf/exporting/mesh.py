@@ -30,8 +30,9 @@ def mesh_obj(surface: Surface) -> list[bytes]:
     """A mesh as OBJ in scene coordinates, with colours behind the coordinates of a vertex."""
     vertices = np.concatenate([surface.points, surface.rgb], axis=1)
     corners = np.repeat(surface.faces + 1, 2, axis=1)
+    number = "%.7g" if surface.points.dtype == np.float32 else "%.12g"
     parts = (
-        ("v %.7g %.7g %.7g %.4f %.4f %.4f\n", vertices),
+        (f"v {number} {number} {number} %.4f %.4f %.4f\n", vertices),
         ("vn %.4f %.4f %.4f\n", surface.normals),
         ("f %d//%d %d//%d %d//%d\n", corners),
     )
@@ -41,7 +42,9 @@ def mesh_obj(surface: Surface) -> list[bytes]:
     return texts
 
 
-def mesh_glb(surface: Surface, up: np.ndarray | None = None) -> list[bytes]:
+def mesh_glb(
+    surface: Surface, up: np.ndarray | None = None, offset: np.ndarray | None = None
+) -> list[bytes]:
     """A mesh as binary glTF 2.0.
 
     Vertices are in scene coordinates. As y points up in glTF, the mesh hangs on a node that turns
@@ -53,6 +56,8 @@ def mesh_glb(surface: Surface, up: np.ndarray | None = None) -> list[bytes]:
     Args:
         surface: The mesh.
         up: [3] unit vector; None: y.
+        offset: [3] what is missing to the coordinates of the scene's file, scene units, which go to
+            the asset's extras: vertices are in single precision. None: nothing.
     """
     arrays = (
         (surface.points.astype("<f4"), FLOAT32, "VEC3", ARRAY),
@@ -79,9 +84,10 @@ def mesh_glb(surface: Surface, up: np.ndarray | None = None) -> list[bytes]:
         "doubleSided": True,
         "extensions": {"KHR_materials_unlit": {}},
     }
+    extras = {} if offset is None else {"extras": {"offset": offset.tolist()}}
     attributes = {"POSITION": 0, "NORMAL": 1, "COLOR_0": 2}
     tree = {
-        "asset": {"version": "2.0", "generator": "warpnerf"},
+        "asset": {"version": "2.0", "generator": "warpnerf"} | extras,
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
         "scenes": [{"nodes": [0]}],

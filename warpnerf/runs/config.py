@@ -41,9 +41,12 @@ class RunConfig(msgspec.Struct, frozen=True):
     """File names of the pictures in test/; None in runs of the version before, which wrote all."""
     found: FoundExtent | None = None
     """In place of the scene's own extent, where the cameras did not tell."""
+    offset: tuple[float, float, float] | None = None
+    """What was subtracted from the coordinates of the scene's file, scene units; see ``Scene``."""
 
     def as_trained(self, scene: Scene) -> Scene:
-        """A scene, as it was read, with the extent that the run has found for it."""
+        """A scene, as it was read, with the run's coordinates and the extent that it has found."""
+        scene = scene.at_offset(None if self.offset is None else np.array(self.offset))
         if self.found is None:
             return scene
         return replace(
@@ -91,6 +94,8 @@ def describe(
         "pictures": pictures_of(scene),
         "train": config_to_json(config),
     }
+    if scene.offset is not None:
+        content["offset"] = scene.offset.tolist()
     if found:
         content["found"] = {"content_distance": scene.content_distance, **extent}
     return content

@@ -13,15 +13,15 @@ from warpnerf.checks import InputError
 from warpnerf.runtime.memory import usable_cores
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.cameras.focus import estimate_extent
-from warpnerf.scenes.cameras.lens import Lens
 from warpnerf.scenes.cameras.undistort import seen_pixels
 from warpnerf.scenes.extent.conventions import hold_against_photographs
 from warpnerf.scenes.extent.points import Points, extent_by_points
 from warpnerf.scenes.files import by_number, exists
-from warpnerf.scenes.images.depths import Depth, DepthFile, read_depth
+from warpnerf.scenes.formats.frame import Frame
+from warpnerf.scenes.formats.georeference import centred, in_words
+from warpnerf.scenes.images.depths import Depth, read_depth
 from warpnerf.scenes.images.images import exif_orientation, image_shape, read_image
 from warpnerf.scenes.images.masks import (
-    Mask,
     PackedMask,
     all_of_blocks,
     mask_beside,
@@ -45,27 +45,6 @@ POSED = "pose.json"
 
 HOLD_OUT = 8
 """Without a split in the file every 8th image is for testing, as in LLFF and Mip-NeRF 360."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Frame:
-    """One entry of a scene file, checked, its image found but not read."""
-
-    name: str
-    """The image's path relative to the scene's folder, with /."""
-    path: Path
-    """The image."""
-    c2w: np.ndarray
-    """[3, 4] float64, OpenGL axes, scene units."""
-    lens: Lens
-    mask: Mask | None = None
-    """Which pixels count; None: all."""
-    depth: DepthFile | None = None
-    """True depth; None: not known."""
-    image: np.ndarray | None = None
-    """As a view has it, where it was read already; None: it is in ``path``."""
-    bounds: tuple[float, float] | None = None
-    """Depth of the nearest and of the farthest content, scene units; None: not known."""
 
 
 def assemble(
@@ -106,6 +85,12 @@ def assemble(
         frames = [replace(frame, mask=mask) for frame, mask in zip(frames, found, strict=True)]
     else:
         frames = _with_masks_beside(frames)
+
+    frames, points, offset = centred(frames, points)
+    if offset is not None:
+        notes.append(
+            f"far from the origin, so all coordinates are those of the file less {in_words(offset)}"
+        )
 
     # Decoders release the interpreter lock. The first error cancels what is not yet read.
     with ThreadPoolExecutor(keeping.threads or usable_cores()) as pool:
@@ -161,6 +146,7 @@ def assemble(
         observations=None if observed is None else observed.observations,
         points=None if observed is None or points is None else points.sample,
         bounds=_bounds(frames, views),
+        offset=offset,
         notes=(*notes, *kept.notes, *extent.notes),
         warnings=(
             *(*warnings, *mask_warnings, *_diagnostics(views, complete, transparent)),

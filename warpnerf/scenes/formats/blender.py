@@ -10,7 +10,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from warpnerf.scenes.files import exists
-from warpnerf.scenes.formats.assemble import Frame, assemble
+from warpnerf.scenes.formats.assemble import assemble
+from warpnerf.scenes.formats.frame import Frame
 from warpnerf.scenes.formats.transforms import read_frames
 from warpnerf.scenes.images.photographs import KEEPING, Keeping
 from warpnerf.scenes.scene import Scene

@@ -27,7 +27,7 @@ from warpnerf.scenes.files import (
     printable,
     require_regular_file,
 )
-from warpnerf.scenes.formats.assemble import Frame, assemble
+from warpnerf.scenes.formats.assemble import assemble
 from warpnerf.scenes.formats.colmap_files import (
     PARAMETERS,
     ModelCamera,
@@ -39,6 +39,7 @@ from warpnerf.scenes.formats.colmap_files import (
     stated_images,
 )
 from warpnerf.scenes.formats.colmap_points import read_points
+from warpnerf.scenes.formats.frame import Frame
 from warpnerf.scenes.formats.llff import ENDINGS
 from warpnerf.scenes.formats.split_lists import read_split_lists
 from warpnerf.scenes.images.images import image_size

@@ -16,7 +16,8 @@ from warpnerf.checks import InputError
 from warpnerf.scenes.cameras.lens import Lens
 from warpnerf.scenes.cameras.poses import check_pose
 from warpnerf.scenes.files import photograph_folder
-from warpnerf.scenes.formats.assemble import Frame, assemble
+from warpnerf.scenes.formats.assemble import assemble
+from warpnerf.scenes.formats.frame import Frame
 from warpnerf.scenes.images.arrays import read_npy
 from warpnerf.scenes.images.photographs import KEEPING, Keeping
 from warpnerf.scenes.scene import Scene

@@ -21,7 +21,8 @@ from warpnerf.runtime.memory import usable_memory
 from warpnerf.scenes.cameras.lens import Lens
 from warpnerf.scenes.cameras.poses import check_pose
 from warpnerf.scenes.files import printable, require_regular_file
-from warpnerf.scenes.formats.assemble import Frame, assemble
+from warpnerf.scenes.formats.assemble import assemble
+from warpnerf.scenes.formats.frame import Frame
 from warpnerf.scenes.images.arrays import Header, read_header, read_numbers
 from warpnerf.scenes.images.images import MAX_PIXELS
 from warpnerf.scenes.images.photographs import KEEPING, Keeping

@@ -17,8 +17,9 @@ from warpnerf.scenes.cameras.lens import LensFields, read_lens
 from warpnerf.scenes.cameras.poses import check_pose
 from warpnerf.scenes.extent.points import Points, usable
 from warpnerf.scenes.files import exists, find_image, printable, read_json, resolve_inside
-from warpnerf.scenes.formats.assemble import Frame, assemble
+from warpnerf.scenes.formats.assemble import assemble
 from warpnerf.scenes.formats.colmap import points_beside
+from warpnerf.scenes.formats.frame import Frame
 from warpnerf.scenes.formats.frame_images import find_images
 from warpnerf.scenes.formats.ply import read_ply
 from warpnerf.scenes.images.depths import DEFAULT_UNIT, DepthFile
