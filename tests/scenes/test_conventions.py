@@ -16,7 +16,7 @@ from tests.scenes.test_points import write_ply
 from tests.support.tiny_scenes import DATA, camera_at, look_at, needs_capture, picture, ring
 from warpnerf.scenes.builtin.room import first_hit, photograph
 from warpnerf.scenes.cameras.camera import Camera
-from warpnerf.scenes.extent.conventions import hold_against_photographs
+from warpnerf.scenes.extent.conventions import check_against_photographs
 from warpnerf.scenes.extent.photo_consistency import FEWEST, PhotoConsistency, neighbours
 from warpnerf.scenes.extent.points import Points
 from warpnerf.scenes.formats.load import load_scene
@@ -84,7 +84,7 @@ def misread(views: list[View], as_written: Callable[[np.ndarray], np.ndarray]) -
 
 
 def held(views: list[View], points: Points | None = None) -> tuple[list[View], Points | None, str]:
-    found, left, said = hold_against_photographs(views, range(len(views)), points, False)
+    found, left, said = check_against_photographs(views, range(len(views)), points, False)
     return found, left, "; ".join(said)
 
 

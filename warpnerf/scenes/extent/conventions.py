@@ -1,4 +1,4 @@
-"""Coordinate conventions of poses and points, held against the photographs.
+"""Coordinate conventions of poses and points, checked against the photographs.
 
 Files do not say which way a camera's axes point, nor whether a matrix is camera to world or its
 inverse, nor in which axes and units points are. Photographs do: see ``photo_consistency``.
@@ -85,7 +85,7 @@ READINGS: dict[str, Poses] = {
 """Other ways to read poses, by their names; OpenCV's is by far the commonest."""
 
 
-def hold_against_photographs(
+def check_against_photographs(
     views: Sequence[View], training: Sequence[int], points: Points | None, is_object: bool
 ) -> tuple[list[View], Points | None, list[str]]:
     """Detect the coordinate conventions of poses and points, by what the photographs show.

@@ -87,7 +87,7 @@ class _Picture:
 
 
 class PhotoConsistency:
-    """Photographs of a scene, held against poses and against points."""
+    """Photographs of a scene, checked against poses and against points."""
 
     def __init__(self, views: Sequence[View]) -> None:
         """Choose photographs; each is read when it is first looked at.

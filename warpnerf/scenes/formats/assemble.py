@@ -14,7 +14,7 @@ from warpnerf.runtime.memory import usable_cores
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.cameras.focus import estimate_extent
 from warpnerf.scenes.cameras.undistort import seen_pixels
-from warpnerf.scenes.extent.conventions import hold_against_photographs
+from warpnerf.scenes.extent.conventions import check_against_photographs
 from warpnerf.scenes.extent.points import Points, extent_by_points
 from warpnerf.scenes.files import by_number, exists
 from warpnerf.scenes.formats.frame import Frame
@@ -119,7 +119,7 @@ def assemble(
     indices = {
         split: tuple(sorted(index[name] for name in names)) for split, names in complete.items()
     }
-    views, points, told = hold_against_photographs(views, indices["train"], points, is_object)
+    views, points, told = check_against_photographs(views, indices["train"], points, is_object)
     warnings += told
     training = [views[i] for i in indices["train"]]
     unbounded = not is_object
