@@ -14,6 +14,8 @@ CIRCLE = "scenes/test_overlap.py::test_cameras_around_a_thing_all_see_it"
 AXES = "scenes/test_focus.py::test_focus_minimises_squared_distance_to_the_axes"
 OBJECT_BOX = "scenes/test_focus.py::test_box_of_an_object_is_what_the_larger_field_of_view_spans"
 OUTWARD = "scenes/test_focus.py::test_cameras_that_look_outward_fall_back_to_their_spread"
+PARALLEL = "scenes/test_focus.py::test_nearly_parallel_axes_have_no_focus"
+MEETING = "scenes/test_focus.py::test_axes_that_point_anywhere_far_from_the_origin_have_no_focus"
 UP = "scenes/test_focus.py::test_up_is_found_in_upright_photographs_that_all_look_down"
 AIMED = "scenes/test_focus.py::test_share_of_cameras_aimed_at_a_point"
 NDC = "scenes/test_frustum.py::test_coordinates_and_back"
@@ -93,6 +95,8 @@ MUTANTS = [
     of_host("in picture: a fisheye as a plane", OVERLAP, "np.arctan2(aside, -z) / aside", "-1.0 / z", WIDE),
     of_host("content behind", OVERLAP, "return camera.position + distance *", "return camera.position - distance *", CIRCLE),
     of_host("focus: along the axes", FOCUS, "np.eye(3) - axes[:, :, None]", "np.eye(3) + axes[:, :, None]", AXES),
+    of_host("focus: nearly parallel", FOCUS, "least < NEARLY_PARALLEL", "least < 0.0", PARALLEL),
+    of_host("focus: spread", FOCUS, "centres - centres.mean(axis=0), mean", "centres, mean", MEETING),
     of_host("focus: behind cameras", FOCUS, "if np.mean(depths > 0.0) >= MIN_SHARE_IN_FRONT:", "if True:", OUTWARD),
     of_host("box: the smaller field of view", FOCUS, "max(camera.width / camera.fx, camera.height / camera.fy) / 2",
             "min(camera.width / camera.fx, camera.height / camera.fy) / 2", OBJECT_BOX),

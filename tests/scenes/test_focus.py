@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -104,6 +106,74 @@ def test_parallel_cameras_fall_back_to_their_spread() -> None:
     assert focus.distance == pytest.approx(2.0)
     np.testing.assert_allclose(focus.point, [3.0, 0.0, -2.0])
     assert "parallel" in focus.how
+
+
+def strip(n: int, aim: Callable[[float], tuple[float, float]]) -> list[Camera]:
+    """Along y, looking at a wall 3 away, each as far aside and upward as it is told."""
+    poses = []
+    for y in np.linspace(-1.9, 1.9, n):
+        aside, up = aim(float(y))
+        poses.append(look_at((3.0, y, 1.3), (0.0, y + aside, 1.0 + up)))
+    return cameras_at(poses)
+
+
+def at_random(seed: int, sway: float) -> Callable[[float], tuple[float, float]]:
+    draw = np.random.default_rng(seed).uniform
+    return lambda _: (draw(-sway, sway), draw(-sway, sway))
+
+
+@pytest.mark.parametrize("degrees", [0.7, 1.0, 2.0, 5.0, 10.0])
+def test_nearly_parallel_axes_have_no_focus(degrees: float) -> None:
+    """Least squares finds one where every camera has it in the middle of its image: far off."""
+    sway = 3.0 * np.tan(np.radians(degrees))
+    wavy = find_focus(strip(35, lambda y: (sway * np.sin(3.0 * y), 0.0)))
+    assert wavy.guessed and "parallel directions" in wavy.how
+    for seed in range(20):
+        focus = find_focus(strip(35, at_random(seed, sway)))
+        assert focus.guessed and "parallel directions" in focus.how
+        assert focus.distance == pytest.approx(0.98, abs=0.02)  # the cameras' spread
+
+
+def test_axes_that_point_anywhere_far_from_the_origin_have_no_focus() -> None:
+    cameras = strip(35, lambda y: (0.1 * np.sin(3.0 * y), 0.0))
+    for camera in cameras:
+        camera.c2w[:, 3] += [500.0, 900.0, 70.0]
+    assert find_focus(cameras).guessed
+
+
+def test_a_survey_of_nadir_photographs_has_no_focus() -> None:
+    """A grid of cameras that look down, tilted by some degrees as drones are."""
+    for seed in range(20):
+        random = np.random.default_rng(seed)
+        poses = []
+        for x in np.linspace(-40.0, 40.0, 6):
+            for y in np.linspace(-60.0, 60.0, 9):
+                lean = random.normal(0.0, 3.0, 2)
+                poses.append(look_at((x, y, 50.0), (x + lean[0], y + lean[1], 0.0)))
+        assert find_focus(cameras_at(poses)).guessed
+
+
+def test_cameras_behind_each_other_have_no_focus() -> None:
+    random = np.random.default_rng(0)
+    poses = []
+    for y in np.linspace(0.0, 20.0, 30):
+        x, z = random.normal(0.0, 0.1, 2)
+        poses.append(look_at((x, y, z), (x + random.normal(0.0, 0.3), y + 9.0, z)))
+    assert find_focus(cameras_at(poses)).guessed
+
+
+@pytest.mark.parametrize("away", [5.0, 12.0])
+def test_axes_that_do_meet_are_believed_at_small_angles(away: float) -> None:
+    """By hand, a tenth of the spread off."""
+    random = np.random.default_rng(0)
+    poses = []
+    for x in np.linspace(-1.0, 1.0, 5):
+        for z in np.linspace(-1.0, 1.0, 4):
+            off = random.normal(0.0, 0.1, 2)
+            poses.append(look_at((x, -away, z), (off[0], 0.0, off[1])))
+    focus = find_focus(cameras_at(poses))
+    assert not focus.guessed
+    assert focus.distance == pytest.approx(away, rel=0.1)
 
 
 def test_notes_say_how() -> None:

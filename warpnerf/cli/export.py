@@ -69,9 +69,16 @@ def export_command(
         threads: CPU threads; by default one per usable core.
     """
     from warpnerf.exporting.cameras import camera_model
-    from warpnerf.exporting.export import FORMATS, ExportOptions, checked_ending, export_all
+    from warpnerf.exporting.export import (
+        CENTRED,
+        FORMATS,
+        ExportOptions,
+        checked_ending,
+        export_all,
+    )
     from warpnerf.runs.run import Run
     from warpnerf.runs.scene import load_run_scene
+    from warpnerf.scenes.formats.georeference import in_words
 
     run = Run(folder)
     config = run.read_config()
@@ -117,6 +124,12 @@ def export_command(
             ) from error
     for file in files:
         print(f"wrote {file}")
+    if views.offset is not None and {*endings} & {*CENTRED}:
+        print(
+            f"note: coordinates in {', '.join(e for e in CENTRED if e in endings)} are those of the "
+            f"capture's file less {in_words(views.offset)}, for single precision; .ply, .obj, .npz "
+            "and a folder have the file's own"
+        )
     bent = any(camera_model(camera) != "PINHOLE" for camera in views.cameras)
     if "" in endings and bent and not options.pinhole:
         print(

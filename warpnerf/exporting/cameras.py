@@ -111,8 +111,9 @@ def colmap_text(scene: Scene, files: dict[str, str], points: Surface) -> dict[st
     cameras = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMETERS"]
     cameras += [f"{number} {lens}" for lens, number in lenses.items()]
     colour = np.round(255.0 * points.rgb).astype(int)
+    digits = ".7g" if points.points.dtype == np.float32 else ".12g"
     rows = [
-        f"{number} {x:.7g} {y:.7g} {z:.7g} {r} {g} {b} 0"
+        f"{number} {x:{digits}} {y:{digits}} {z:{digits}} {r} {g} {b} 0"
         for number, ((x, y, z), (r, g, b)) in enumerate(
             zip(points.points.tolist(), colour.tolist(), strict=True), 1
         )

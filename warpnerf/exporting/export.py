@@ -6,8 +6,10 @@ import functools
 import logging
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+
+import numpy as np
 
 from warpnerf.checks import InputError, require_kind
 from warpnerf.exporting import atlas, mesh, page, splats, spz, surface, volume
@@ -49,6 +51,10 @@ FORMATS = {
 }
 """What files of these endings hold; without an ending it is a folder."""
 
+CENTRED = (".glb", ".splat.ply", ".spz", ".html", ".nvdb")
+"""Files whose programs read positions in single precision: of a georeferenced scene they keep the
+coordinates of the training, less its offset, and the others have those of its file."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ExportOptions:
@@ -83,6 +89,10 @@ def export(
     and colours. .splat.ply, .spz: Gaussian splats. .html: a page that shows these without a
     network; needs the extra ``viewer``. .nvdb, .npz: density, and colour in .npz, on a grid. No
     ending: a folder with photographs, cameras for nerfstudio and COLMAP, and points.
+
+    Coordinates are those of the scene's file, also where ``Scene.offset`` was subtracted from them;
+    only .glb, .splat.ply, .spz, .html and .nvdb, which are read in single precision, stay without
+    it. A .glb has it in its extras, a .splat.ply as a comment.
 
     Args:
         field: What to write.
@@ -205,7 +215,9 @@ def export_all(
         for path, ending in zip(targets, endings, strict=True):
             if scene is not None and ending == "":
                 shown = pinhole_scene(scene) if given.pinhole else scene
-                write = functools.partial(scenes.write_scene, scene=shown, surface=products.surface)
+                found = products.in_the_files_coordinates(products.surface)
+                shown = shown.at_offset(None)
+                write = functools.partial(scenes.write_scene, scene=shown, surface=found)
                 staged.add_folder(path, write)
             else:
                 staged.add(path, *products.pieces(ending))
@@ -256,6 +268,14 @@ class _Products:
         )
 
     @property
+    def offset(self) -> np.ndarray | None:
+        return None if self.scene is None else self.scene.offset
+
+    def in_the_files_coordinates(self, made: Surface) -> Surface:
+        """A surface where the scene's file has it."""
+        return made if self.offset is None else replace(made, points=made.points + self.offset)
+
+    @property
     def textured(self) -> atlas.Textured:
         texel = float(self.field.lattice.voxel_size.mean()) / TEXELS
         bake = functools.partial(colours, self.field, self.visible)
@@ -276,18 +296,21 @@ class _Products:
             begin = widest_view(self.field, self.scene.training_cameras)
             return page.splats_html(self.splats, self.scene, self.field.background, begin)
         if ending == ".splat.ply":
-            return splats.splats_ply(self.splats, up)
+            return splats.splats_ply(self.splats, up, self.offset)
         if ending == ".spz":
             return spz.splats_spz(self.splats, up)
         if ending == ".nvdb":
             return volume.volume_nvdb(self.volume)
         if ending == ".npz":
-            return volume.volume_npz(self.volume)
+            block = self.volume if self.offset is None else self.volume.moved(self.offset)
+            return volume.volume_npz(block)
         if ending == ".glb":
-            return mesh.mesh_glb(self.textured if self.options.texture else self.mesh, up)
+            made = self.textured if self.options.texture else self.mesh
+            return mesh.mesh_glb(made, up, self.offset)
         if ending == ".points.ply":
-            return mesh.points_ply(self.surface)
-        return {".obj": mesh.mesh_obj, ".ply": mesh.mesh_ply}[ending](self.mesh)
+            return mesh.points_ply(self.in_the_files_coordinates(self.surface))
+        write = {".obj": mesh.mesh_obj, ".ply": mesh.mesh_ply}[ending]
+        return write(self.in_the_files_coordinates(self.mesh))
 
 
 def checked_ending(path: str | Path) -> str:

@@ -34,8 +34,9 @@ def mesh_obj(surface: Surface) -> list[bytes]:
     """A mesh as OBJ in scene coordinates, with colours behind the coordinates of a vertex."""
     vertices = np.concatenate([surface.points, surface.rgb], axis=1)
     corners = np.repeat(surface.faces + 1, 2, axis=1)
+    number = "%.7g" if surface.points.dtype == np.float32 else "%.12g"
     parts = (
-        ("v %.7g %.7g %.7g %.4f %.4f %.4f\n", vertices),
+        (f"v {number} {number} {number} %.4f %.4f %.4f\n", vertices),
         ("vn %.4f %.4f %.4f\n", surface.normals),
         ("f %d//%d %d//%d %d//%d\n", corners),
     )
@@ -45,7 +46,11 @@ def mesh_obj(surface: Surface) -> list[bytes]:
     return texts
 
 
-def mesh_glb(surface: Surface | Textured, up: np.ndarray | None = None) -> list[bytes]:
+def mesh_glb(
+    surface: Surface | Textured,
+    up: np.ndarray | None = None,
+    offset: np.ndarray | None = None,
+) -> list[bytes]:
     """A mesh as binary glTF 2.0, with vertex colours, or with a texture.
 
     Vertices are in scene coordinates. As y points up in glTF, the mesh hangs on a node that turns
@@ -59,6 +64,8 @@ def mesh_glb(surface: Surface | Textured, up: np.ndarray | None = None) -> list[
     Args:
         surface: The mesh.
         up: [3] unit vector; None: y.
+        offset: [3] what is missing to the coordinates of the scene's file, scene units, which go to
+            the asset's extras: vertices are in single precision. None: nothing.
     """
     image = surface.texture if isinstance(surface, Textured) else None
     uv = surface.uv if isinstance(surface, Textured) else None
@@ -114,10 +121,11 @@ def mesh_glb(surface: Surface | Textured, up: np.ndarray | None = None) -> list[
         "doubleSided": True,
         "extensions": {"KHR_materials_unlit": {}},
     }
+    extras = {} if offset is None else {"extras": {"offset": offset.tolist()}}
     attributes = {name: index for index, name in enumerate(named)}
     primitive = {"attributes": attributes, "indices": len(named), "material": 0}
     tree = {
-        "asset": {"version": "2.0", "generator": "warpnerf"},
+        "asset": {"version": "2.0", "generator": "warpnerf"} | extras,
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
         "scenes": [{"nodes": [0]}],

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-KINDS = {"f4": "float", "u1": "uchar"}
+KINDS = {"f4": "float", "f8": "double", "u1": "uchar"}
 """PLY's names of numbers, by numpy's."""
 
 
@@ -18,7 +18,8 @@ def ply(
     """The pieces of a PLY file.
 
     Args:
-        columns: A vertex's properties in the order of the file, [n_vertices] float32 or uint8 each.
+        columns: A vertex's properties in the order of the file, each [n_vertices] float32, float64
+            or uint8.
         faces: [n_faces, 3] of vertices; None: the file has only vertices.
         comments: Lines of the header, besides the one that names the program.
 
@@ -49,13 +50,13 @@ def surface_columns(points: np.ndarray, normals: np.ndarray, rgb: np.ndarray) ->
     """Columns of coloured points with normals, under the names that readers expect.
 
     Args:
-        points: [n, 3] scene units.
+        points: [n, 3] float32, or float64 of georeferenced scenes, scene units.
         normals: [n, 3] unit vectors.
         rgb: [n, 3] in [0, 1].
     """
     colour = np.round(255.0 * rgb).astype(np.uint8)
     named = (
-        (("x", "y", "z"), points.astype(np.float32)),
+        (("x", "y", "z"), points),
         (("nx", "ny", "nz"), normals.astype(np.float32)),
         (("red", "green", "blue"), colour),
     )

@@ -128,7 +128,9 @@ def splats_of(
     )
 
 
-def splats_ply(splats: Splats, up: np.ndarray | None = None) -> list[bytes]:
+def splats_ply(
+    splats: Splats, up: np.ndarray | None = None, offset: np.ndarray | None = None
+) -> list[bytes]:
     """The PLY file that 3DGS writes, with harmonics of degree 0.
 
     Opacities are logits, scales logarithms, and colours coefficients: rgb = 1/2 + 0.282 f_dc.
@@ -137,6 +139,8 @@ def splats_ply(splats: Splats, up: np.ndarray | None = None) -> list[bytes]:
         splats: To write, in the scene's coordinates.
         up: Direction in which the cameras stand upright, [3] unit vector; None: not known. If it is
             near an axis, the header names that as the vertical axis, as nerfstudio and Brush do.
+        offset: [3] what is missing to the coordinates of the scene's file, scene units, which the
+            header names; None: nothing.
 
     Returns:
         The pieces of the file.
@@ -156,7 +160,8 @@ def splats_ply(splats: Splats, up: np.ndarray | None = None) -> list[bytes]:
         for names, values in named
         for k, name in enumerate(names)
     }
-    return ply(columns, comments=_vertical_axis(up))
+    missing = [] if offset is None else ["offset " + " ".join(f"{x:.12g}" for x in offset)]
+    return ply(columns, comments=[*_vertical_axis(up), *missing])
 
 
 def _vertical_axis(up: np.ndarray | None) -> list[str]:

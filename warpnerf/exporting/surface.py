@@ -37,7 +37,7 @@ class Surface:
     """A triangle mesh with normals and colours at its vertices."""
 
     points: np.ndarray
-    """[n_vertices, 3] float32, scene units."""
+    """[n_vertices, 3] float32, scene units; float64 in the coordinates of a georeferenced file."""
     faces: np.ndarray
     """[n_faces, 3] int32, counter-clockwise as seen from outside."""
     normals: np.ndarray

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +32,10 @@ class Volume:
     """[3] float64, the first node, scene units."""
     box_max: np.ndarray
     """[3] float64, the last node."""
+
+    def moved(self, by: np.ndarray) -> Volume:
+        """The volume elsewhere, by [3] scene units."""
+        return replace(self, box_min=self.box_min + by, box_max=self.box_max + by)
 
 
 def volume_of(

@@ -48,9 +48,12 @@ class RunConfig(msgspec.Struct, frozen=True):
     """What is kept of the training once it has finished: its field alone, or checkpoints too."""
     split: Literal["all", "sector"] | int | list[str] | None = None
     """What is withheld for testing, see ``load_scene``; None: what the scene says."""
+    offset: tuple[float, float, float] | None = None
+    """What was subtracted from the coordinates of the scene's file, scene units; see ``Scene``."""
 
     def as_trained(self, scene: Scene) -> Scene:
-        """A scene, as it was read, with the extent that the run has found for it."""
+        """A scene, as it was read, with the run's coordinates and the extent that it has found."""
+        scene = scene.at_offset(None if self.offset is None else np.array(self.offset))
         if self.found is None:
             return scene
         return replace(
@@ -104,6 +107,8 @@ def describe(
         "pictures": pictures_of(scene),
         "train": config_to_json(config),
     }
+    if scene.offset is not None:
+        content["offset"] = scene.offset.tolist()
     if found:
         content["found"] = {"content_distance": scene.content_distance, **extent}
     return content

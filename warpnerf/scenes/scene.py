@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol, overload
 
 import numpy as np
@@ -117,6 +117,18 @@ class View:
             if not mask.any():
                 raise InputError(f"{self.name}: its mask leaves no pixel; leave out the view.")
 
+    def posed(self, c2w: np.ndarray) -> View:
+        """The view with another pose.
+
+        Args:
+            c2w: [3, 4] camera to world, OpenGL axes, scene units.
+
+        Returns:
+            A view with the same photograph, which is not read.
+        """
+        kept = {name: self.__dict__[name] for name in ("name", "image", "depth", "mask")}
+        return View(camera=replace(self.camera, c2w=c2w), **kept)
+
     @property
     def channels(self) -> int:
         """Image channels: 3, or 4 with alpha."""
@@ -158,6 +170,9 @@ class Scene:
     bounds: np.ndarray | None = None
     """[n_views, 2] float64, depth of the nearest and of the farthest content that each camera sees,
     scene units, as the file gives them: not checked. None where it gives none."""
+    offset: np.ndarray | None = None
+    """[3] float64, scene units: what was subtracted from the coordinates of a georeferenced file,
+    for single precision to resolve them; exports add it again. None: nothing was."""
     notes: tuple[str, ...] = field(default=())
     """How the scene was understood: its split, what was estimated; a line each."""
     warnings: tuple[str, ...] = field(default=())
@@ -200,6 +215,33 @@ class Scene:
                 )
         if not self.splits.get("train"):
             raise InputError(f"{self.name}: splits['train'] must name at least one view.")
+
+    def at_offset(self, offset: np.ndarray | None) -> Scene:
+        """The scene in other coordinates.
+
+        Args:
+            offset: [3] what is subtracted from those of its file, scene units; None: nothing is.
+
+        Returns:
+            The same scene, moved; photographs are not read.
+        """
+        none = np.zeros(3)
+        by = (none if self.offset is None else self.offset) - (none if offset is None else offset)
+        if not by.any():
+            return self
+        seen = self.observations
+        return replace(
+            self,
+            views=[
+                view.posed(np.column_stack([view.camera.c2w[:, :3], view.camera.position + by]))
+                for view in self.views
+            ],
+            box_min=self.box_min + by,
+            box_max=self.box_max + by,
+            points=None if self.points is None else self.points + by,
+            observations=None if seen is None else replace(seen, positions=seen.positions + by),
+            offset=offset,
+        )
 
     @property
     def cameras(self) -> list[Camera]:

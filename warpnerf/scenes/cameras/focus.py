@@ -18,6 +18,14 @@ UNBOUNDED_BOX_SHARE = 0.75
 MIN_AXIS_SPREAD = 1e-4
 """Mean squared sine of the axes to their mean, below which they count as parallel: 0.6 degrees."""
 
+NEARLY_PARALLEL = 0.1
+"""The same, below which axes meet at small angles, 18 degrees: whether they do is looked into."""
+
+MIN_CONVERGENCE = 0.75
+"""Share of the cameras' spread across nearly parallel axes that must be gone where these meet. With
+a share c, the distance lies between that of least squares and 1 / c of it: what axes point to at
+random draws it nearer (errors in variables)."""
+
 MIN_LEVEL_SPREAD = 0.02
 """Mean squared sine of the horizontal axes to their main direction, for their plane to be known."""
 
@@ -71,8 +79,9 @@ def find_focus(cameras: Sequence[Camera]) -> Focus:
     point = argmin_p sum_i |(I - d_i d_i^T)(p - o_i)|^2, with centres o_i and unit axes d_i, so
     sum_i (I - d_i d_i^T) p = sum_i (I - d_i d_i^T) o_i;  distance = median_i d_i . (point - o_i)
 
-    Where the axes are parallel, or the point lies behind many cameras because they look outward,
-    distance = mean_i |o_i - mean o| and point = mean o + distance * mean d, and ``how`` says so.
+    Where the axes are parallel, or nearly and do not meet, or the point lies behind
+    many cameras because they look outward, distance = mean_i |o_i - mean o| and
+    point = mean o + distance * mean d, and ``how`` says so.
     Where they look in and out, few have the point in the middle of their image: see ``guessed``.
 
     Args:
@@ -94,20 +103,24 @@ def find_focus(cameras: Sequence[Camera]) -> Focus:
 
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # removes what lies along an axis
     system = across.mean(axis=0)
-    if np.linalg.eigvalsh(system)[0] < MIN_AXIS_SPREAD:
+    least = float(np.linalg.eigvalsh(system)[0])
+    if least < MIN_AXIS_SPREAD:
         reason = "the training cameras look in parallel directions"
     else:
         # Relative to the middle, so that a far origin costs no digits.
         right = np.einsum("nij,nj->i", across, centres - middle) / len(cameras)
         point = middle + np.linalg.solve(system, right)
         depths = np.einsum("ni,ni->n", axes, point - centres)
-        if np.mean(depths > 0.0) >= MIN_SHARE_IN_FRONT:
+        if least < NEARLY_PARALLEL and _convergence(centres, axes, point) < MIN_CONVERGENCE:
+            reason = "the training cameras look in nearly parallel directions that do not meet"
+        elif np.mean(depths > 0.0) >= MIN_SHARE_IN_FRONT:
             how = "median depth of the point that the training cameras look at"
             few = share_aimed_at(cameras, point) < MIN_SHARE_AIMED
             if few:
                 how += ", though few of them have it in the middle of their image"
             return Focus(point=point, distance=float(np.median(depths)), how=how, guessed=few)
-        reason = "the training cameras look outward"
+        else:
+            reason = "the training cameras look outward"
     return Focus(
         point=middle + spread * axes.mean(axis=0),
         distance=spread,
@@ -115,6 +128,31 @@ def find_focus(cameras: Sequence[Camera]) -> Focus:
         "set the content distance if you know it",
         guessed=True,
     )
+
+
+def _convergence(centres: np.ndarray, axes: np.ndarray, point: np.ndarray) -> float:
+    """Convergence of nearly parallel axes: which share of their spread is gone at a point.
+
+    1 - sum_i |miss of axis i at the point|^2 / sum_i |centre i across the mean axis|^2, the
+    coefficient of determination R^2 of the axes' meeting there.
+
+    Args:
+        centres: [n, 3] scene units.
+        axes: [n, 3] unit vectors.
+        point: [3] nearest to all axes, scene units.
+
+    Returns:
+        1 where all meet there, about 0 where they point anywhere.
+    """
+    mean = axes.mean(axis=0) / np.linalg.norm(axes.mean(axis=0))
+    misses = _reject(point - centres, axes)
+    spread = _reject(centres - centres.mean(axis=0), mean[None])
+    return 1.0 - float((misses**2).sum() / max((spread**2).sum(), 1e-300))
+
+
+def _reject(vectors: np.ndarray, axes: np.ndarray) -> np.ndarray:
+    """Vectors [n, 3] without what lies along unit axes [n or 1, 3]."""
+    return vectors - (vectors * axes).sum(axis=1, keepdims=True) * axes
 
 
 def _check_spread(spread: float, farthest: float) -> None:

@@ -14,9 +14,11 @@ from warpnerf.runtime.memory import usable_cores
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.cameras.focus import estimate_extent
 from warpnerf.scenes.cameras.undistort import seen_pixels
+from warpnerf.scenes.extent.conventions import check_against_photographs
 from warpnerf.scenes.extent.points import Points, extent_by_points
 from warpnerf.scenes.files import by_number, exists
 from warpnerf.scenes.formats.frame import Frame, lens_notes
+from warpnerf.scenes.formats.georeference import centred, in_words
 from warpnerf.scenes.formats.reduced import with_reduced
 from warpnerf.scenes.images.depths import Depth, read_depth
 from warpnerf.scenes.images.images import exif_orientation, image_shape, read_image
@@ -95,6 +97,12 @@ def assemble(
     else:
         frames = _with_masks_beside(frames)
 
+    frames, points, offset = centred(frames, points)
+    if offset is not None:
+        notes.append(
+            f"far from the origin, so all coordinates are those of the file less {in_words(offset)}"
+        )
+
     # Decoders release the interpreter lock. The first error cancels what is not yet read.
     with ThreadPoolExecutor(keeping.threads or usable_cores()) as pool:
         trained = [frame for frame in frames if frame.name in complete["train"]]
@@ -123,6 +131,8 @@ def assemble(
     indices = {
         split: tuple(sorted(index[name] for name in names)) for split, names in complete.items()
     }
+    views, points, told = check_against_photographs(views, indices["train"], points, is_object)
+    warnings += told
     training = [views[i] for i in indices["train"]]
     unbounded = not is_object
     transparent = {view.name for view, see in zip(views, kept.see_through, strict=True) if see}
@@ -148,6 +158,7 @@ def assemble(
         observations=None if observed is None else observed.observations,
         points=None if observed is None or points is None else points.sample,
         bounds=_bounds(frames, views),
+        offset=offset,
         notes=(*notes, *kept.notes, *extent.notes),
         warnings=(
             *(*warnings, *mask_warnings, *_diagnostics(views, complete, transparent)),

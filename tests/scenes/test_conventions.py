@@ -1,0 +1,261 @@
+"""Axes of poses, and axes and units of points, by what photographs of a room show."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.scenes.test_points import write_ply
+from tests.support.tiny_scenes import DATA, camera_at, look_at, needs_capture, picture, ring
+from warpnerf.scenes.builtin.room import first_hit, photograph
+from warpnerf.scenes.cameras.camera import Camera
+from warpnerf.scenes.extent.conventions import check_against_photographs
+from warpnerf.scenes.extent.photo_consistency import FEWEST, PhotoConsistency, neighbours
+from warpnerf.scenes.extent.points import Points
+from warpnerf.scenes.formats.load import load_scene
+from warpnerf.scenes.scene import View
+
+SIZE = {"width": 96, "height": 72, "fx": 75.0, "fy": 75.0, "cx": 48.0, "cy": 36.0}
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def outward(n: int) -> list[Camera]:
+    """From the middle of the room to all sides."""
+    cameras = []
+    for k in range(n):
+        a = 2.0 * np.pi * k / n + 0.2
+        eye = np.array([0.15 + 0.45 * np.cos(a), 0.5 * np.sin(a), 1.35 + 0.15 * np.sin(3.0 * a)])
+        target = eye + np.array([np.cos(a), np.sin(a), (-0.3, 0.1)[k % 2]])
+        cameras.append(camera_at(look_at(tuple(eye), tuple(target)), **SIZE))
+    return cameras
+
+
+def along_a_wall(n: int) -> list[Camera]:
+    """Nearly parallel: two degrees to and fro."""
+    return [
+        camera_at(look_at((1.3, y, 1.3), (-1.5, y + 0.1 * np.sin(3.0 * y), 0.7)), **SIZE)
+        for y in np.linspace(-1.9, 1.9, n)
+    ]
+
+
+def photographed(cameras: list[Camera]) -> list[View]:
+    return [
+        View(name=f"{k:03d}", camera=camera, image=photograph(camera, 1)[0])
+        for k, camera in enumerate(cameras)
+    ]
+
+
+def surface(cameras: list[Camera], each: int = 40) -> Points:
+    """Where rays of random pixels meet the room."""
+    rng = np.random.default_rng(0)
+    found = []
+    for c in cameras:
+        x, y = rng.uniform(-0.6, 0.6, each), rng.uniform(-0.45, 0.45, each)
+        rays = np.stack([x, y, -np.ones(each)], axis=1) @ c.c2w[:, :3].T
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        far = first_hit(np.repeat(c.position[None], each, 0), rays)
+        found.append(c.position + far[:, None] * rays)
+    return Points(positions=np.concatenate(found), tracks=None, source="points.ply")
+
+
+@pytest.fixture(scope="module")
+def room() -> list[View]:
+    return photographed(outward(20))
+
+
+@pytest.fixture(scope="module")
+def wall() -> list[View]:
+    return photographed(along_a_wall(24))
+
+
+def misread(views: list[View], as_written: Callable[[np.ndarray], np.ndarray]) -> list[View]:
+    """Views whose poses [4, 4] stand otherwise in their file."""
+    return [
+        view.posed(as_written(np.concatenate([view.camera.c2w, [[0.0, 0.0, 0.0, 1.0]]]))[:3])
+        for view in views
+    ]
+
+
+def held(views: list[View], points: Points | None = None) -> tuple[list[View], Points | None, str]:
+    found, left, said = check_against_photographs(views, range(len(views)), points, False)
+    return found, left, "; ".join(said)
+
+
+WRITTEN = {
+    "camera to world in OpenCV": lambda m: m @ FLIP,
+    "world to camera in OpenCV": lambda m: np.linalg.inv(m @ FLIP),
+    "world to camera in OpenGL": np.linalg.inv,
+    "PyTorch3D's": lambda m: m @ np.diag([-1.0, 1.0, -1.0, 1.0]),
+    "x left, y down, looking along -z": lambda m: m @ np.diag([-1.0, -1.0, 1.0, 1.0]),
+    "LLFF's": lambda m: m[:, [1, 0, 2, 3]] * [-1.0, 1.0, 1.0, 1.0],
+    "x up, y left": lambda m: m[:, [1, 0, 2, 3]] * [1.0, -1.0, 1.0, 1.0],
+}
+
+
+def test_poses_that_fit_stay(room: list[View], wall: list[View]) -> None:
+    for views in (room, wall):
+        found, points, said = held(views)
+        assert said == "" and points is None
+        assert all(a is b for a, b in zip(found, views, strict=True))
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_poses_in_other_axes_are_read_as_the_photographs_show(name: str, room: list[View]) -> None:
+    found, _, said = held(misread(room, WRITTEN[name]))
+    assert said.startswith("poses are read as ") and name in said and "photographs fit" in said
+    for view, right in zip(found, room, strict=True):
+        np.testing.assert_allclose(view.camera.c2w, right.camera.c2w, atol=1e-12)
+
+
+def test_opencv_axes_along_a_wall_are_told_by_photographs_alone(wall: list[View]) -> None:
+    """Pairs of nearly parallel cameras fit in either axes; what depths they tell does not."""
+    found, _, said = held(misread(wall, WRITTEN["camera to world in OpenCV"]))
+    assert "camera to world in OpenCV axes" in said
+    np.testing.assert_allclose(found[3].camera.c2w, wall[3].camera.c2w, atol=1e-12)
+
+
+def test_points_tell_axes_where_photographs_are_too_small() -> None:
+    views = [
+        View(name=str(k), camera=camera_at(pose @ FLIP), image=picture(k))
+        for k, pose in enumerate(ring(8))
+    ]
+    ball = np.random.default_rng(0).normal(size=(300, 3))
+    ball = 0.3 * ball / np.linalg.norm(ball, axis=1, keepdims=True)
+    found, points, said = held(views, Points(positions=ball, tracks=None, source=""))
+    assert "OpenCV axes" in said and "points fit" in said and points is not None
+    np.testing.assert_allclose(found[1].camera.c2w, ring(8)[1][:3], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("written", "read"),
+    [
+        (lambda p: p, ""),
+        (lambda p: p * [1.0, 1.0, -1.0], "(x, y, -z)"),
+        (lambda p: p[:, [0, 2, 1]] * [1.0, 1.0, -1.0], "(x, -z, y)"),
+        (lambda p: p[:, [1, 0, 2]] * [1.0, 1.0, -1.0], "(y, x, -z)"),
+        (lambda p: 1000.0 * p, "0.001 (x, y, z)"),
+        (lambda p: 100.0 * p[:, [0, 2, 1]] * [1.0, 1.0, -1.0], "0.01 (x, -z, y)"),
+    ],
+)
+def test_points_in_other_axes_or_units_come_to_the_cameras(
+    written: Callable[[np.ndarray], np.ndarray], read: str, room: list[View]
+) -> None:
+    right = surface([view.camera for view in room])
+    found, points, said = held(room, replace(right, positions=written(right.positions)))
+    assert found[0] is room[0] and points is not None
+    assert (f"points of points.ply are read as {read}: " in said) if read else said == ""
+    np.testing.assert_allclose(points.positions, right.positions, atol=1e-9)
+
+
+TURN = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        lambda p: 1.4 * p,
+        lambda p: 0.3 * p,
+        lambda p: 1e-5 * p,
+        lambda p: p @ TURN,
+        lambda p: p + np.array([2.0, 1.0, 0.5]),
+        lambda p: p + np.array([500.0, 900.0, 0.0]),
+        lambda p: p.mean(axis=0) + p.std(axis=0) * np.random.default_rng(1).normal(size=p.shape),
+    ],
+)
+def test_points_that_fit_in_no_way_are_left_out(
+    wrong: Callable[[np.ndarray], np.ndarray], room: list[View]
+) -> None:
+    right = surface([view.camera for view in room])
+    _, points, said = held(room, replace(right, positions=wrong(right.positions)))
+    assert points is None
+    assert "points.ply are not used" in said and "export them together with the poses" in said
+
+
+def test_poses_and_points_may_both_be_in_other_axes(room: list[View]) -> None:
+    right = surface([view.camera for view in room])
+    views = misread(room, WRITTEN["world to camera in OpenCV"])
+    found, points, said = held(views, replace(right, positions=1000.0 * right.positions))
+    assert "world to camera in OpenCV" in said and "0.001 (x, y, z)" in said
+    assert points is not None
+    np.testing.assert_allclose(points.positions, right.positions, atol=1e-9)
+    np.testing.assert_allclose(found[5].camera.c2w, room[5].camera.c2w, atol=1e-12)
+
+
+@pytest.mark.parametrize("bent", [{"k1": -0.2, "p1": 0.01}, {"k1": 0.05, "fisheye": True}])
+def test_lenses_are_undone(bent: dict[str, Any], room: list[View]) -> None:
+    """Photographs of such lenses, resampled from the pinhole's."""
+    views = []
+    for view in room:
+        camera = replace(view.camera, **bent)
+        u, v = np.meshgrid(np.arange(96) + 0.5, np.arange(72) + 0.5)
+        straight = np.stack([u.ravel() - 48.0, v.ravel() - 36.0], axis=1) / 75.0
+        pixels = np.floor(camera.distort(straight)[0] * 75.0 + [48.0, 36.0]).astype(int)
+        image = np.zeros((72, 96, 3), np.uint8)
+        inside = ((pixels >= 0) & (pixels < [96, 72])).all(axis=1)
+        image[pixels[inside, 1], pixels[inside, 0]] = view.image.reshape(-1, 3)[inside]
+        views.append(View(name=view.name, camera=camera, image=image))
+    agreement = [PhotoConsistency(v).agreement(PhotoConsistency(v).poses) for v in (views, room)]
+    undone = [replace(v, camera=replace(v.camera, k1=0.0, p1=0.0, fisheye=False)) for v in views]
+    without = PhotoConsistency(undone)
+    assert agreement[0].gain.mean() > 0.6 * agreement[1].gain.mean()
+    assert agreement[0].found.mean() > without.agreement(without.poses).found.mean() + 0.03
+
+
+def test_noise_and_few_or_small_photographs_tell_nothing() -> None:
+    for n, scale in ((12, 6), (FEWEST - 1, 6), (12, 3)):
+        size = {"width": 8 * scale, "height": 6 * scale}
+        lens = {"fx": 10.0 * scale, "fy": 10.0 * scale, "cx": 4.0 * scale, "cy": 3.0 * scale}
+        views = [
+            View(
+                name=str(k), camera=camera_at(pose @ FLIP, **size, **lens), image=picture(k, **size)
+            )
+            for k, pose in enumerate(ring(n))
+        ]
+        found, _, said = held(views)
+        assert said == "" and found[0] is views[0]
+
+
+def test_neighbours_stand_and_look_alike_but_not_quite() -> None:
+    poses = np.array([pose[:3] for pose in ring(240)])
+    assert set(neighbours(poses, 0)) <= {2, 3, 237, 238}  # 3 degrees and more
+    assert set(neighbours(poses, 0, 0.5)) <= {7, 8, 232, 233}
+    assert len(neighbours(np.repeat(poses[:1], 6, axis=0), 2)) == 3
+
+
+def test_a_scene_file_is_read_in_the_right_axes(tmp_path: Path, room: list[View]) -> None:
+    """transforms.json with OpenCV's axes and points in millimetres, against the right one."""
+    right = surface([view.camera for view in room])
+    found = []
+    for turn, scale in ((np.eye(4), 1.0), (FLIP, 1000.0)):
+        frames = []
+        for view in room:
+            Image.fromarray(view.image).save(tmp_path / f"{view.name}.png")
+            pose = np.concatenate([view.camera.c2w, [[0.0, 0.0, 0.0, 1.0]]]) @ turn
+            frames.append({"file_path": f"{view.name}.png", "transform_matrix": pose.tolist()})
+        lens = {"w": 96, "h": 72, "fl_x": 75.0, "fl_y": 75.0, "cx": 48.0, "cy": 36.0}
+        content = {**lens, "ply_file_path": "points.ply", "frames": frames}
+        (tmp_path / "transforms.json").write_text(json.dumps(content))
+        write_ply(tmp_path / "points.ply", scale * right.positions)
+        found.append(load_scene(tmp_path))
+    assert not found[0].warnings and len(found[1].warnings) == 2
+    assert found[1].content_distance == pytest.approx(found[0].content_distance, rel=1e-6)
+    np.testing.assert_allclose(found[1].box_min, found[0].box_min, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=needs_capture(name))
+        for name in ("cup_colmap", "fox_q", "stitch", "lund_door", "fern_llff")
+    ],
+)
+def test_captures_are_read_as_they_stand(name: str) -> None:
+    scene = load_scene(DATA / name, images="files")
+    assert not any("read as" in warning or "not used" in warning for warning in scene.warnings)

@@ -1,0 +1,289 @@
+"""Coordinate conventions of poses and points, checked against the photographs.
+
+Files do not say which way a camera's axes point, nor whether a matrix is camera to world or its
+inverse, nor in which axes and units points are. Photographs do: see ``photo_consistency``.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from warpnerf.checks import InputError
+from warpnerf.scenes.cameras.camera import Camera
+from warpnerf.scenes.cameras.focus import find_focus
+from warpnerf.scenes.cameras.overlap import in_picture
+from warpnerf.scenes.extent.photo_consistency import Agreement, PhotoConsistency
+from warpnerf.scenes.extent.points import Points
+from warpnerf.scenes.scene import View
+
+TELLING = 0.1
+"""Mean gain of photographs that fit their poses, at least; captures have 0.15 to 0.4."""
+MOST = 0.7
+"""Share of references that must be found better than by chance by NOTABLY."""
+NOTABLY = 0.05
+CLEARLY = 0.02
+"""By how much a reading of the poses must be better than another, in mean gain and found."""
+ALMOST_ALL = 0.8
+"""Share of references for which it must be."""
+
+SUPPORTED = 0.7
+"""Support of points that are believed, at least; those of captures have 0.78 to 1.26."""
+SURELY = 0.75
+"""Support of points in other axes or units, for these to be the cameras'."""
+BETTER = 0.2
+"""By how much that must be more than in their own, where these are in pictures as well."""
+RUNNER_UP = 0.9
+"""Share of it that no other axes and units may reach."""
+EVERY = 3
+"""Of many axes and units, those are chosen that have the most support of every third reference."""
+
+LOOKED_AT = 600
+"""Points, at most, of which is counted in how many pictures they fall."""
+SEEN = 0.5
+"""Share of the points that two pictures show, from which on nothing is odd."""
+UNSEEN = 0.1
+"""Share below which points are not those of these cameras."""
+AS_FAR_AS = 100.0
+AS_NEAR_AS = 0.02
+"""Points farther from the cameras' middle than so many times what these are, or nearer, need
+support."""
+SCALES = (1.0, 1e-3, 1e3, 1e-2, 1e2)
+"""Units that points may be in, in those of the cameras: metres, millimetres, centimetres."""
+
+FLIP = np.array([1.0, -1.0, -1.0, 1.0])
+"""From OpenCV's axes to OpenGL's, of the columns of a pose."""
+
+Poses = Callable[[np.ndarray], np.ndarray]
+"""From poses as they stand to camera to world in OpenGL axes, [n, 3, 4] both."""
+
+
+def _inverted(poses: np.ndarray) -> np.ndarray:
+    turned = poses[:, :, :3].transpose(0, 2, 1)
+    return np.concatenate([turned, -turned @ poses[:, :, 3:]], axis=2)
+
+
+def _columns(*order: int) -> Poses:
+    """Axes x, y, z taken from columns 1, 2, 3, with signs."""
+    at, signs = [abs(k) - 1 for k in order], np.sign(order)
+    return lambda poses: np.concatenate([poses[:, :, at] * signs, poses[:, :, 3:]], axis=2)
+
+
+OPENCV = "camera to world in OpenCV axes (x right, y down, looking along +z)"
+READINGS: dict[str, Poses] = {
+    OPENCV: lambda poses: poses * FLIP,
+    "world to camera in OpenCV axes": lambda poses: _inverted(poses) * FLIP,
+    "world to camera in OpenGL axes": _inverted,
+    "camera to world in PyTorch3D's axes (x left, y up, looking along +z)": _columns(-1, 2, -3),
+    "camera to world in axes x left, y down, looking along -z": _columns(-1, -2, 3),
+    "camera to world in LLFF's axes (x down, y right, looking along -z)": _columns(2, -1, 3),
+    "camera to world in axes x up, y left, looking along -z": _columns(-2, 1, 3),
+}
+"""Other ways to read poses, by their names; OpenCV's is by far the commonest."""
+
+
+def check_against_photographs(
+    views: Sequence[View], training: Sequence[int], points: Points | None, is_object: bool
+) -> tuple[list[View], Points | None, list[str]]:
+    """Detect the coordinate conventions of poses and points, by what the photographs show.
+
+    What stands in the files is changed only where the photographs refute it and agree with another
+    convention; points that fit no convention are left out.
+
+    Args:
+        views: All, with poses as camera to world in OpenGL axes, as the files say.
+        training: Indices of those that are looked at.
+        points: Of the scene, if it has some.
+        is_object: Whether it is one: if the cameras look at it, and there are no points, there is
+            nothing to ask.
+
+    Returns:
+        The views and points that fit, and warnings of what was changed or left out.
+    """
+    if is_object and points is None and _look_at_one_thing([views[i].camera for i in training]):
+        return list(views), None, []
+    photographs = PhotoConsistency([views[i] for i in training])
+    poses = photographs.poses
+    if points is not None and not len(points.positions):
+        points = None
+    agreement = photographs.agreement(poses) if photographs.can_tell else None
+    name = _reading(photographs, agreement, points)
+    warnings = []
+    if name is not None:
+        read = READINGS[name]
+        every = read(np.array([view.camera.c2w for view in views]))
+        views = [view.posed(pose) for view, pose in zip(views, every, strict=True)]
+        poses = read(poses)
+        evidence = "points" if agreement is None else "photographs"
+        warnings.append(
+            f"poses are read as {name}: so the {evidence} fit each other, and not as camera to "
+            "world in OpenGL axes; convert them, if other programs shall read them"
+        )
+        agreement = None if agreement is None else photographs.agreement(poses)
+    if points is not None:
+        told = photographs if agreement is not None and _fits(agreement) else None
+        points, why = _believed(told, poses, _posed(photographs.cameras, poses), points)
+        warnings += why
+    return list(views), points, warnings
+
+
+def _look_at_one_thing(cameras: Sequence[Camera]) -> bool:
+    try:
+        return not find_focus(cameras).guessed
+    except InputError:
+        return False
+
+
+def _reading(
+    photographs: PhotoConsistency, agreement: Agreement | None, points: Points | None
+) -> str | None:
+    """The other way to read poses that photographs, or else points, prove; None: as they stand.
+
+    Where photographs fit as the poses stand, only OpenCV's axes are tried: for cameras that move
+    along a line nearly parallel to each other, these fit nearly as well.
+    """
+    poses, cameras = photographs.poses, photographs.cameras
+    shares = {}
+    if points is not None:
+        sample = _sample(points)
+        shares = {
+            name: _share_seen(_posed(cameras, read(poses)), sample)
+            for name, read in {"": lambda given: given, **READINGS}.items()
+        }
+    if agreement is None:
+        found = max(READINGS, key=lambda name: shares.get(name, 0.0))
+        told = bool(shares) and shares[""] < UNSEEN and shares[found] > SEEN
+        return found if told else None
+    better = {}
+    for name in (OPENCV,) if _fits(agreement) else READINGS:
+        other = photographs.agreement(READINGS[name](poses))
+        refuted = bool(shares) and shares[name] < 0.5 * shares[""]
+        if not refuted and _is_better(other, agreement):
+            better[name] = float(other.gain.mean())
+    return max(better, key=lambda name: better[name]) if better else None
+
+
+def _fits(agreement: Agreement) -> bool:
+    """Whether photographs fit poses."""
+    gain = agreement.gain
+    if len(gain) < 2:
+        return False
+    return bool(gain.mean() >= TELLING and np.mean(gain > NOTABLY) >= MOST)
+
+
+def _is_better(other: Agreement, given: Agreement) -> bool:
+    """Whether photographs fit another reading of their poses, and that beyond doubt better."""
+    found = other.found - given.found
+    gain = other.gain - given.gain
+    better = min(found.mean(), gain.mean()) >= CLEARLY
+    return _fits(other) and bool(better and np.mean(found > 0.0) >= ALMOST_ALL)
+
+
+def _believed(
+    photographs: PhotoConsistency | None,
+    poses: np.ndarray,
+    cameras: Sequence[Camera],
+    points: Points,
+) -> tuple[Points | None, list[str]]:
+    """Points in the cameras' axes and units, if there are such, and what to say of them.
+
+    Args:
+        photographs: That fit their poses; None: they tell nothing.
+        poses: [n, 3, 4] of the cameras that are looked at.
+        cameras: These.
+        points: As they stand.
+    """
+    share = _share_seen(cameras, _sample(points))
+    support = None if photographs is None else photographs.support(poses, points.positions)
+    near = AS_NEAR_AS <= _times_as_far(cameras, points.positions) <= AS_FAR_AS
+    good = support is None or support >= SUPPORTED
+    if share >= SEEN and good and near:
+        return points, []
+    if photographs is not None:
+        moved = _moved(photographs, poses, cameras, points.positions, share, support or 0.0)
+        if moved is not None:
+            how, positions = moved
+            return replace(points, positions=positions), [
+                f"points of {points.source} are read as {how}: so they fit the photographs, and "
+                "not as they stand; bring them into the axes and units of the poses, or leave them "
+                "out"
+            ]
+    if good and share >= UNSEEN and (near or support is not None):
+        return points, []
+    return None, [
+        f"points of {points.source} are not used: they are not what these cameras photographed, so "
+        "their axes, units or scale are likely others than those of the poses; export them "
+        "together with the poses, or leave them out"
+    ]
+
+
+def _moved(
+    photographs: PhotoConsistency,
+    poses: np.ndarray,
+    cameras: Sequence[Camera],
+    positions: np.ndarray,
+    share: float,
+    support: float,
+) -> tuple[str, np.ndarray] | None:
+    """Points with axes exchanged, mirrored and scaled so that they surely fit; None: in no way."""
+    sample = positions[:: max(1, -(-len(positions) // LOOKED_AT))]
+    for scale in SCALES:
+        if not AS_NEAR_AS <= _times_as_far(cameras, scale * sample) <= AS_FAR_AS:
+            continue
+        rated = []
+        for order, signs in _orders():
+            if scale == 1.0 and order == (0, 1, 2) and min(signs) > 0.0:
+                continue
+            seen = _share_seen(cameras, scale * sample[:, order] * signs)
+            if seen >= max(SEEN, ALMOST_ALL * share):
+                fit = photographs.support(poses, scale * sample[:, order] * signs, EVERY)
+                rated.append((seen * (fit or 0.0), seen, order, signs))
+        rated.sort(key=lambda entry: -entry[0])
+        if not rated:
+            continue
+        _, seen, order, signs = rated[0]
+        found = scale * positions[:, order] * signs
+        fit = photographs.support(poses, found) or 0.0
+        enough = BETTER if share >= SEEN else 0.0
+        rival = rated[1][0] if len(rated) > 1 else 0.0
+        if fit >= max(SURELY, support + enough) and rival < RUNNER_UP * rated[0][0]:
+            return _in_words(scale, order, signs), found
+    return None
+
+
+def _orders() -> Iterator[tuple[tuple[int, ...], tuple[float, ...]]]:
+    """All orders of three axes with all signs."""
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            yield order, signs
+
+
+def _in_words(scale: float, order: Sequence[int], signs: Sequence[float]) -> str:
+    axes = ", ".join(
+        f"{'-' if s < 0.0 else ''}{'xyz'[k]}" for k, s in zip(order, signs, strict=True)
+    )
+    return f"({axes})" if scale == 1.0 else f"{scale:g} ({axes})"
+
+
+def _posed(cameras: Sequence[Camera], poses: np.ndarray) -> list[Camera]:
+    return [replace(camera, c2w=pose) for camera, pose in zip(cameras, poses, strict=True)]
+
+
+def _sample(points: Points) -> np.ndarray:
+    return points.positions[:: max(1, -(-len(points.positions) // LOOKED_AT))]
+
+
+def _share_seen(cameras: Sequence[Camera], positions: np.ndarray) -> float:
+    """Share of positions [n, 3] that two of the cameras have in their pictures."""
+    return float(np.mean(np.sum([in_picture(c, positions) for c in cameras], axis=0) >= 2))
+
+
+def _times_as_far(cameras: Sequence[Camera], positions: np.ndarray) -> float:
+    """How many times as far from the cameras' middle positions are, by the median."""
+    places = np.array([camera.position for camera in cameras])
+    middle = places.mean(axis=0)
+    spread = float(np.linalg.norm(places - middle, axis=1).mean())
+    return float(np.median(np.linalg.norm(positions - middle, axis=1))) / max(spread, 1e-300)

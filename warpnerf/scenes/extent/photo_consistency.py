@@ -1,0 +1,342 @@
+"""Photo-consistency: whether photographs show the same where their poses say that they do.
+
+A plane sweep, as in multi-view stereo: patches of a photograph are looked for in those of its
+neighbours at many depths, and compared by normalised cross-correlation. Poses that are right find
+each patch again at one depth, wrong ones by chance. Photographs are small, gray, and without
+distortion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from warpnerf.scenes.cameras.camera import Camera
+from warpnerf.scenes.scene import View
+
+VIEWS = 64
+"""That are looked at, at most, spread evenly."""
+REFERENCES = 12
+"""Of these whose patches are looked for, at most."""
+NEIGHBOURS = 3
+"""In which they are looked for."""
+FEWEST = NEIGHBOURS + 2
+"""Views, at least: a reference, its neighbours, and one that is none."""
+
+SIDE = 96
+"""Pixels of a photograph's longer side, about."""
+LEAST_SIDE = 24
+"""Pixels of the shorter one; smaller photographs tell nothing."""
+
+DEPTHS = 24
+"""From NEAREST baselines to infinity, evenly spaced in 1 / depth."""
+NEAREST = 1.5
+
+ANGLE = np.radians(30.0)
+"""Of rotation, which sets a neighbour as far off as a spread of all cameras does."""
+APART = 0.15
+"""A neighbour is at least so far off, where there are such: nearer ones see the same whatever the
+pose is."""
+FAR_APART = 0.5
+"""The same, where points are looked for: their depths must show."""
+
+PATCH = np.stack(np.meshgrid(*2 * [np.linspace(-3.0, 3.0, 5)]), axis=-1).reshape(-1, 2)
+"""Where a patch is sampled, [25, 2] pixels from its middle."""
+RIM = 4.0
+"""Pixels that a patch's middle keeps from the edges."""
+PATCHES = 9, 7
+"""Along a photograph's width and height."""
+TEXTURE = 3.0
+"""Standard deviation of a patch's gray values, of 255, from which on it can be recognised."""
+
+CELL = 4
+"""Pixels of the edges of cells, of whose points only the nearest is looked at: it hides others."""
+MOST_POINTS = 60
+"""Of a reference."""
+FEWEST_POINTS = 4
+"""That tell something of a reference."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Agreement:
+    """How well patches are found again: for each reference, the mean of their correlations."""
+
+    found: np.ndarray
+    """[n] in [0, 1]; what no neighbour sees counts as 0."""
+    by_chance: np.ndarray
+    """[n], the same in photographs of other places, under the same geometry."""
+
+    @property
+    def gain(self) -> np.ndarray:
+        """[n], by how much they are found better than by chance."""
+        return self.found - self.by_chance
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Picture:
+    """A photograph as of a pinhole camera."""
+
+    gray: np.ndarray
+    """[H, W] float32 in [0, 255]; NaN where the lens sees nothing."""
+    focal: np.ndarray
+    """[2] pixels."""
+    centre: np.ndarray
+    """[2] principal point, pixels."""
+
+
+class PhotoConsistency:
+    """Photographs of a scene, checked against poses and against points."""
+
+    def __init__(self, views: Sequence[View]) -> None:
+        """Choose photographs; each is read when it is first looked at.
+
+        Args:
+            views: Of the training.
+        """
+        self._views = list(views[:: max(1, -(-len(views) // VIEWS))])
+        self._pictures: dict[int, _Picture] = {}
+        every = max(1, -(-len(self._views) // REFERENCES))
+        self.references = range(0, len(self._views), every)
+        """Indices of the chosen views whose patches are looked for."""
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """Of the chosen views."""
+        return [view.camera for view in self._views]
+
+    @property
+    def poses(self) -> np.ndarray:
+        """[n, 3, 4] of the chosen views, camera to world in OpenGL axes, scene units."""
+        return np.array([view.camera.c2w for view in self._views])
+
+    @property
+    def can_tell(self) -> bool:
+        """Whether there are photographs enough, and large enough."""
+        sides = [min(camera.width, camera.height) for camera in self.cameras]
+        return len(sides) >= FEWEST and min(sides) >= LEAST_SIDE
+
+    def agreement(self, poses: np.ndarray) -> Agreement:
+        """How well patches of all references are found again, had the cameras other poses.
+
+        Args:
+            poses: [n, 3, 4] of the chosen views.
+
+        Returns:
+            For references that have texture.
+        """
+        found: list[float] = []
+        by_chance: list[float] = []
+        for i in self.references:
+            middles = self._textured(i, _grid(self._picture(i).gray.shape))
+            if not len(middles):
+                continue
+            near = neighbours(poses, i)
+            inverse = np.tile(_inverse_depths(poses, i, near)[:, None], len(middles))
+            for shown, means in ((near, found), (self._strangers(i, near), by_chance)):
+                match = self._correlations(poses, i, near, shown, middles, inverse)
+                means.append(float(np.maximum(match.max(axis=0), 0.0).mean()))
+        return Agreement(found=np.array(found), by_chance=np.array(by_chance))
+
+    def support(self, poses: np.ndarray, points: np.ndarray, every: int = 1) -> float | None:
+        """How well patches around points are found again at these, against their best depths.
+
+        Args:
+            poses: [n, 3, 4] of the chosen views.
+            points: [m, 3] scene units.
+            every: Every which reference is looked at.
+
+        Returns:
+            Their correlation as a share of that at the best depths of the sweep: about 1 for points
+            on surfaces, about 0 for points anywhere. None where too few can be recognised.
+        """
+        own, best = [], []
+        chosen = self.references[::every]
+        for i in chosen:
+            middles, away = self._foremost(poses[i], i, points)
+            near = neighbours(poses, i, FAR_APART)
+            sweep = np.tile(_inverse_depths(poses, i, near)[:, None], len(middles))
+            inverse = np.concatenate([sweep, 1.0 / away[None]])
+            match = self._correlations(poses, i, near, near, middles, inverse)
+            seen = match[-1] > -1.0
+            if seen.sum() >= FEWEST_POINTS:
+                own.append(float(match[-1, seen].mean()))
+                best.append(float(match[:-1, seen].max(axis=0).mean()))
+        if len(own) < max(2, len(chosen) // 3) or np.mean(best) <= 0.0:
+            return None
+        return max(0.0, float(np.mean(own) / np.mean(best)))
+
+    def _foremost(
+        self, pose: np.ndarray, i: int, points: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Where a reference sees points with texture that others do not hide, and how far away."""
+        picture = self._picture(i)
+        local = (points - pose[:, 3]) @ pose[:, :3]
+        pixels, front = _project(picture, local)
+        height, width = picture.gray.shape
+        inside = (pixels > RIM) & (pixels < np.array([width, height]) - RIM)
+        there = front & inside.all(axis=1)
+        pixels, away = pixels[there], np.linalg.norm(local[there], axis=1)
+        cell = (pixels // CELL).astype(np.int64) @ [1, width]
+        order = np.lexsort((away, cell))
+        first = order[np.unique(cell[order], return_index=True)[1]]
+        first = first[:: max(1, -(-len(first) // MOST_POINTS))]
+        kept = first[self._has_texture(i, pixels[first])]
+        return pixels[kept], away[kept]
+
+    def _correlations(
+        self,
+        poses: np.ndarray,
+        i: int,
+        near: Sequence[int],
+        shown: Sequence[int],
+        middles: np.ndarray,
+        inverse: np.ndarray,
+    ) -> np.ndarray:
+        """Correlations of patches of a reference with what its neighbours show at depths.
+
+        Args:
+            poses: [n, 3, 4] of the chosen views.
+            i: The reference.
+            near: Its neighbours.
+            shown: Whose photographs these show: their own, or strangers'.
+            middles: [m, 2] of its patches, pixels.
+            inverse: [k, m] of 1 / distance from its centre.
+
+        Returns:
+            [k, m] mean over the neighbours that see the patch there, -1 where none does.
+        """
+        picture = self._picture(i)
+        pixels = middles[:, None] + PATCH
+        patch = _bilinear(picture.gray, pixels)
+        rays = np.ones((*pixels.shape[:2], 3))
+        rays[..., :2] = (pixels - picture.centre) / picture.focal
+        rays *= np.array([1.0, -1.0, -1.0]) / np.linalg.norm(rays, axis=-1, keepdims=True)
+        total, seen = np.zeros(inverse.shape), np.zeros(inverse.shape)
+        for j, other in zip(near, shown, strict=True):
+            turn = poses[i][:, :3].T @ poses[j][:, :3]
+            shift = (poses[i][:, 3] - poses[j][:, 3]) @ poses[j][:, :3]
+            there, front = _project(
+                self._picture(j), rays @ turn + inverse[:, :, None, None] * shift
+            )
+            match = _correlation(patch, _bilinear(self._picture(other).gray, there))
+            known = front.all(axis=-1) & np.isfinite(match)
+            total += np.where(known, match, 0.0)
+            seen += known
+        return np.where(seen > 0, total / np.maximum(seen, 1), -1.0)
+
+    def _strangers(self, i: int, near: Sequence[int]) -> list[int]:
+        """As many views as a reference has neighbours, spread evenly over those that are none."""
+        rest = [k for k in range(len(self._views)) if k != i and k not in near]
+        return [rest[(2 * k + 1) * len(rest) // (2 * len(near))] for k in range(len(near))]
+
+    def _textured(self, i: int, middles: np.ndarray) -> np.ndarray:
+        return middles[self._has_texture(i, middles)]
+
+    def _has_texture(self, i: int, middles: np.ndarray) -> np.ndarray:
+        patch = _bilinear(self._picture(i).gray, middles[:, None] + PATCH)
+        return np.asarray(patch.std(axis=1) > TEXTURE)  # not where it is NaN
+
+    def _picture(self, i: int) -> _Picture:
+        if i not in self._pictures:
+            self._pictures[i] = _reduced(self._views[i])
+        return self._pictures[i]
+
+
+def neighbours(poses: np.ndarray, i: int, least: float = APART) -> list[int]:
+    """Neighbours of a camera: those that stand and look nearly as it does, but not quite.
+
+    Args:
+        poses: [n, 3, 4] camera to world, at least FEWEST.
+        i: Index of the camera.
+        least: How far off they are, at least, where there are such.
+
+    Returns:
+        NEIGHBOURS indices.
+    """
+    turned = np.einsum("nij,ij->n", poses[:, :, :3], poses[i][:, :3])
+    angle = np.arccos(np.clip(0.5 * (turned - 1.0), -1.0, 1.0))
+    centres = poses[:, :, 3]
+    spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean())
+    off = angle / ANGLE + np.linalg.norm(centres - centres[i], axis=1) / max(spread, 1e-12)
+    order = [int(k) for k in np.argsort(off, kind="stable") if k != i]
+    apart = [k for k in order if off[k] >= least]
+    return (apart if len(apart) >= NEIGHBOURS else order[::-1])[:NEIGHBOURS]
+
+
+def _inverse_depths(poses: np.ndarray, i: int, near: Sequence[int]) -> np.ndarray:
+    """1 / distance from a reference, [DEPTHS], from 0 to that of NEAREST baselines."""
+    baselines = np.linalg.norm(poses[list(near), :, 3] - poses[i][:, 3], axis=1)
+    return np.linspace(0.0, 1.0 / (NEAREST * max(float(np.median(baselines)), 1e-12)), DEPTHS)
+
+
+def _reduced(view: View) -> _Picture:
+    """A photograph, reduced by averaging, in gray, and as of a pinhole camera."""
+    whole = view.camera
+    factor = max(1, min(round(max(whole.width, whole.height) / SIDE), *_most(whole)))
+    camera = whole.downscaled(factor)
+    image = view.image[: camera.height * factor, : camera.width * factor]
+    # By rows, so that no copy of a large photograph in floats is made.
+    rows = image.reshape(camera.height, factor, -1)
+    gray = np.stack([_gray(row, camera.width, factor, image.shape[2]) for row in rows])
+    focal, centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
+    bent = (camera.k1, camera.k2, camera.k3, camera.p1, camera.p2, camera.rational, camera.fisheye)
+    if any(bent):
+        u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+        straight = (np.stack([u.ravel(), v.ravel()], axis=1) - centre) / focal
+        pixels = camera.distort(straight)[0] * focal + centre
+        gray = _bilinear(gray, pixels).reshape(gray.shape)
+    return _Picture(gray=gray, focal=focal, centre=centre)
+
+
+def _most(camera: Camera) -> tuple[int, int]:
+    """By how much a photograph may be reduced."""
+    return camera.width // LEAST_SIDE, camera.height // LEAST_SIDE
+
+
+def _gray(rows: np.ndarray, width: int, factor: int, channels: int) -> np.ndarray:
+    """One reduced row [width] of rows [factor, width * factor * channels]."""
+    mean = rows.reshape(factor, width, factor, channels).mean(axis=(0, 2), dtype=np.float32)
+    gray = mean[:, :3].mean(axis=1)
+    return gray * mean[:, 3] / np.float32(255.0) if channels == 4 else gray
+
+
+def _grid(shape: tuple[int, ...]) -> np.ndarray:
+    """Middles of patches, spread over a photograph [H, W], [n, 2]."""
+    across, along = PATCHES
+    u, v = np.meshgrid(
+        np.linspace(RIM, shape[1] - RIM, across), np.linspace(RIM, shape[0] - RIM, along)
+    )
+    return np.stack([u.ravel(), v.ravel()], axis=1)
+
+
+def _project(picture: _Picture, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels [..., 2] of places [..., 3] in a camera's OpenGL axes, and which lie before it."""
+    depth = -places[..., 2]
+    front = depth > 0.0
+    depth = np.where(front, np.maximum(depth, 1e-300), 1.0)
+    straight = np.stack([places[..., 0], -places[..., 1]], axis=-1) / depth[..., None]
+    return straight * picture.focal + picture.centre, front
+
+
+def _bilinear(gray: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Gray values at pixels [..., 2], float32; NaN outside."""
+    height, width = gray.shape
+    x, y = pixels[..., 0] - 0.5, pixels[..., 1] - 0.5
+    inside = (x >= 0.0) & (y >= 0.0) & (x <= width - 1) & (y <= height - 1)
+    x, y = np.where(inside, x, 0.0).astype(np.float32), np.where(inside, y, 0.0).astype(np.float32)
+    column = np.minimum(x.astype(np.int32), width - 2)
+    row = np.minimum(y.astype(np.int32), height - 2)
+    x, y, at, flat = x - column, y - row, row * width + column, gray.ravel()
+    above = flat[at] + x * (flat[at + 1] - flat[at])
+    below = flat[at + width] + x * (flat[at + width + 1] - flat[at + width])
+    return np.where(inside, above + y * (below - above), np.float32(np.nan))
+
+
+def _correlation(patch: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Normalised cross-correlation along the last axis; NaN where a value is."""
+    a = patch - patch.mean(axis=-1, keepdims=True)
+    b = other - other.mean(axis=-1, keepdims=True)
+    norm = np.sqrt((a * a).sum(axis=-1) * (b * b).sum(axis=-1) + np.float32(1e-3))
+    return np.asarray((a * b).sum(axis=-1) / norm)
