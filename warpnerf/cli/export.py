@@ -124,11 +124,12 @@ def export_command(
             ) from error
     for file in files:
         print(f"wrote {file}")
-    if views.offset is not None and {*endings} & {*CENTRED}:
+    centred = ", ".join(ending for ending in CENTRED if ending in endings)
+    if views.offset is not None and centred:
         print(
-            f"note: coordinates in {', '.join(e for e in CENTRED if e in endings)} are those of the "
-            f"capture's file less {in_words(views.offset)}, for single precision; .ply, .obj, .npz "
-            "and a folder have the file's own"
+            f"note: coordinates in {centred} are those of the capture's file less "
+            f"{in_words(views.offset)}, for single precision; .ply, .obj, .npz and a folder have "
+            "the file's own"
         )
     bent = any(camera_model(camera) != "PINHOLE" for camera in views.cameras)
     if "" in endings and bent and not options.pinhole:
