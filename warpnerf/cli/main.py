@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import io
 import logging
 import os
@@ -11,6 +12,7 @@ import sys
 import warnings
 from collections.abc import Callable, Sequence
 from itertools import pairwise
+from typing import Any
 
 import tyro
 
@@ -25,6 +27,7 @@ from warpnerf.cli.given import near_to
 from warpnerf.cli.inspect import inspect_command
 from warpnerf.cli.machine import FAILED, check_command, warmup_command
 from warpnerf.cli.pose import pose_command
+from warpnerf.cli.refused import read_words
 from warpnerf.cli.render import render_command
 from warpnerf.cli.runs import runs_command
 from warpnerf.cli.train import train_command
@@ -35,6 +38,9 @@ from warpnerf.runtime.signals import Stopped, raise_when_asked
 from warpnerf.runtime.terminal import UntilClosed
 
 BAD_INPUT = 2
+
+Call = Callable[[], int]
+"""A subcommand with its options."""
 
 COMMANDS: dict[str, Callable[..., int]] = {
     "demo": demo_command,
@@ -132,11 +138,11 @@ def _parsed(words: list[str]) -> int:
         _require_known(name, words[1:])
         words = ["--help" if word == HELP_ALL else word for word in words]
 
-    def shown(command: Callable[..., int]) -> Callable[..., int]:
+    def shown(command: Callable[..., int]) -> Callable[..., Call]:
         if command is COMMANDS.get(name or ""):
-            return with_help(command, begin, everything)
+            return _later(with_help(command, begin, everything))
 
-        def named() -> int:
+        def named() -> Call:
             raise AssertionError("it is only listed")
 
         named.__doc__ = (command.__doc__ or "").partition("\n\n")[0]
@@ -145,12 +151,28 @@ def _parsed(words: list[str]) -> int:
     if shutil.get_terminal_size().columns < NARROWEST:
         os.environ["COLUMNS"] = str(NARROWEST)
     with registry:
-        return tyro.extras.subcommand_cli_from_dict(
-            {name: shown(command) for name, command in COMMANDS.items()},
-            prog="warpnerf",
-            description="Voxel-grid radiance fields from photographs, with fewer floaters.",
-            args=words,
+        commands = {name: shown(command) for name, command in COMMANDS.items()}
+        call: Call = read_words(
+            lambda: tyro.extras.subcommand_cli_from_dict(
+                commands,
+                prog="warpnerf",
+                description="Voxel-grid radiance fields from photographs, with fewer floaters.",
+                args=words,
+            ),
+            name,
         )
+    return call()
+
+
+def _later(command: Callable[..., int]) -> Callable[..., Call]:
+    """A subcommand that is called once all words are read."""
+
+    @functools.wraps(command)
+    def bound(*arguments: Any, **options: Any) -> Call:
+        return functools.partial(command, *arguments, **options)
+
+    bound.__annotations__ = {**command.__annotations__, "return": Call}
+    return bound
 
 
 def _said(error: Exception) -> str:
