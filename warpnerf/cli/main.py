@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import functools
 import io
 import logging
@@ -67,6 +68,9 @@ NARROWEST = 24
 
 HELP_ALL = "--help-all"
 """Lists all options of a subcommand, --help those that are used often."""
+
+NO_NAMES = (errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL)
+"""What the system says of names that cannot be those of files."""
 
 OUT_OF_MEMORY = re.compile("failed to allocate|can't start new thread", re.IGNORECASE)
 """What Warp and the standard library say in a RuntimeError where a MemoryError is meant."""
@@ -222,7 +226,7 @@ def main(arguments: list[str] | None = None) -> int:
         return BAD_INPUT
     except (OSError, FloatingPointError) as error:
         print(f"warpnerf: error: {_said(error)}", file=sys.stderr)
-        return FAILED
+        return BAD_INPUT if getattr(error, "errno", None) in NO_NAMES else FAILED
     except Stopped as stopped:
         print("stopped", file=sys.stderr)
         return stopped.exit_code

@@ -6,7 +6,8 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from warpnerf.checks import InputError, require_kind
+from warpnerf.checked import checked_arguments
+from warpnerf.checks import InputError
 from warpnerf.exporting import cameras as scenes
 from warpnerf.exporting import mesh, page, splats, surface, volume
 from warpnerf.exporting.visibility import visibility
@@ -32,6 +33,7 @@ FORMATS = {
 """What files of these endings hold; without an ending it is a folder."""
 
 
+@checked_arguments
 def export(
     field: Field,
     path: str | Path,
@@ -72,9 +74,6 @@ def export(
             format, a missing scene or package, or nothing to write.
         OSError: It cannot be written; what was there before is left as it was.
     """
-    require_kind(field, Field, "export wants a field", "load_field reads that of a run")
-    if scene is not None:
-        require_kind(scene, Scene, "export wants a scene", "load_scene gives that of a folder")
     path = Path(path)
     ending = checked_ending(path)
     for name, value in (("level", level), ("min_size", min_size)):

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from warpnerf.checked import checked_arguments
 from warpnerf.checks import InputError, require_at_least, require_positive
 from warpnerf.exporting.colour import colours
 from warpnerf.exporting.visibility import SEEN, Visibility
@@ -41,6 +42,7 @@ class Surface:
 
 
 @renamed_argument("sight", "visibility")
+@checked_arguments
 def extract_surface(
     field: Field,
     visibility: Visibility | None = None,

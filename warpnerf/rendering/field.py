@@ -9,6 +9,7 @@ import warp as wp
 from warpnerf_kernels.base.types import real, vec3
 from warpnerf_kernels.launch import assembly
 
+from warpnerf.checked import checked_arguments
 from warpnerf.checks import require_rays
 from warpnerf.fields.lattice import Lattice
 from warpnerf.fields.occupancy import FreeCells
@@ -83,6 +84,7 @@ class Field:
             proposal=None if self.proposal is None else self.proposal.copied_to(device),
         )
 
+    @checked_arguments
     def render(self, camera: Camera) -> Rendering:
         """Render a camera's image: colour, opacity and depth by volume rendering.
 
@@ -100,6 +102,7 @@ class Field:
         seen = self._render(*rays, places=camera.position[None])
         return self._rendering(seen, (camera.height, camera.width))
 
+    @checked_arguments
     def render_rays(self, origins: np.ndarray, directions: np.ndarray) -> Rendering:
         """Render rays: colour, opacity and depth by volume rendering.
 

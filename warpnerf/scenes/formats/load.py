@@ -7,6 +7,7 @@ import shlex
 from pathlib import Path
 from typing import get_args
 
+from warpnerf.checked import checked_arguments
 from warpnerf.checks import InputError, require_one_of
 from warpnerf.runtime.memory import require_threads
 from warpnerf.scenes.files import exists
@@ -25,6 +26,7 @@ BUILTIN = "builtin:"
 BUILTIN_NAMES = ("room", "room-sparse")
 
 
+@checked_arguments
 def load_scene(
     path: str | Path,
     *,
