@@ -124,7 +124,7 @@ class _Names(dict[str, Any]):
         self._package = package
 
     def __missing__(self, name: str) -> Any:
-        if name not in self._package.__all__:
+        if name not in getattr(self._package, "__all__", ()):
             raise KeyError(name)
         return getattr(self._package, name)
 
