@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import math
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -130,6 +131,8 @@ class _Names(dict[str, Any]):
 
 
 def _plain(value: Any) -> Any:
+    if value is np.ma.masked:
+        return math.nan
     if isinstance(value, np.generic):
         return value.item()
     if type(value) is tuple and any(isinstance(one, np.generic) for one in value):
@@ -172,6 +175,8 @@ def fits(value: object, hint: Any) -> bool:
     if origin in (list, Sequence):
         whole = Sequence if origin is Sequence else list
         if isinstance(value, str | bytes) or not isinstance(value, whole | np.ndarray):
+            return False
+        if isinstance(value, np.ndarray) and not value.ndim:
             return False
         return len(value) > MANY or all(fits(one, inner[0]) for one in value)
     if origin in (dict, Mapping):

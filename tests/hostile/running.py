@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import resource
 import shutil
@@ -76,17 +77,23 @@ def outcome(case: Case, folder: Path, limit: float = LIMIT) -> str | None:
     """
     (folder / "tmp").mkdir(exist_ok=True)
     before = _listing(folder, case.written)
-    with tempfile.TemporaryDirectory(prefix="streams-") as streams:
-        out, err = Path(streams, "out"), Path(streams, "err")
-        sys.stdout.flush()
-        sys.stderr.flush()
-        begin = time.monotonic()
-        child = os.fork()
-        if not child:
-            _in_child(case, folder, str(out), str(err))
-        code = code_of(child, limit)
-        seconds = time.monotonic() - begin
-        told = [p.read_text(errors="replace") if p.exists() else "" for p in (out, err)]
+    pipes = [os.pipe(), os.pipe()]  # a limit of files' sizes is none of theirs
+    for end, _ in pipes:
+        fcntl.fcntl(end, fcntl.F_SETPIPE_SZ, 1 << 20)
+        os.set_blocking(end, False)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    begin = time.monotonic()
+    child = os.fork()
+    if not child:
+        _in_child(case, folder, *(f"/proc/self/fd/{write}" for _, write in pipes))
+    code = code_of(child, limit)
+    seconds = time.monotonic() - begin
+    told = []
+    for end, write in pipes:
+        os.close(write)
+        with os.fdopen(end, errors="replace") as stream:
+            told.append(stream.read())
     after = _listing(folder, case.written)
     if code is None:
         return f"hangs: not ended after {seconds:.0f} s"
@@ -109,7 +116,8 @@ def judged(code: int, out: str, err: str, codes: tuple[int, ...] = (2,)) -> str 
     if len(refusals) != 1:
         return f"{len(refusals)} lines for a sentence: {err[:300]!r}"
     (sentence,) = refusals
-    if not sentence.startswith("warpnerf: error: ") or not sentence.endswith((".", "`")):
+    ends = sentence.endswith((".", "`")) or " with: warpnerf train --resume " in sentence
+    if not sentence.startswith("warpnerf: error: ") or not ends:
         return f"no sentence: {sentence[:300]!r}"
     if len(sentence) > LONGEST or not sentence.isprintable():
         return f"{len(sentence)} characters, or such as steer a terminal: {sentence[:120]!r}"

@@ -164,6 +164,7 @@ def _parsed(words: list[str]) -> int:
                 args=words,
             ),
             name,
+            shows_help=bool({"--help", "-h"} & {*words}),
         )
     return call()
 

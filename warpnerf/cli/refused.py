@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import re
 from collections.abc import Callable
 from contextlib import redirect_stderr
@@ -22,12 +23,17 @@ SEVERAL = re.compile(r"Could not parse arguments \[(.*)\] into")
 PARSED = re.compile(r"Error parsing (\S+?)(?: \(.*?\))?: (.*)")
 
 
-def read_words(read: Callable[[], Result], name: str | None) -> Result:
+WIDE = 10_000
+"""Columns in which the parser breaks no line of a message."""
+
+
+def read_words(read: Callable[[], Result], name: str | None, shows_help: bool) -> Result:
     """Read the words of a command line.
 
     Args:
         read: Reads them by tyro, which prints what is wrong in a box and exits.
         name: Of the subcommand; None: there is none.
+        shows_help: Whether help is asked for, which is laid out for the terminal.
 
     Returns:
         What ``read`` returns.
@@ -35,7 +41,9 @@ def read_words(read: Callable[[], Result], name: str | None) -> Result:
     Raises:
         InputError: Words cannot be read.
     """
-    told = io.StringIO()
+    told, columns = io.StringIO(), os.environ.get("COLUMNS")
+    if not shows_help:
+        os.environ["COLUMNS"] = str(WIDE)
     try:
         with redirect_stderr(told):
             return read()
@@ -43,6 +51,11 @@ def read_words(read: Callable[[], Result], name: str | None) -> Result:
         if not stop.code or not told.getvalue().strip():
             raise
         raise InputError(sentence(told.getvalue(), name)) from None
+    finally:
+        if columns is not None:
+            os.environ["COLUMNS"] = columns
+        else:
+            os.environ.pop("COLUMNS", None)
 
 
 def sentence(box: str, name: str | None) -> str:
