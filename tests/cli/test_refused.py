@@ -1,7 +1,10 @@
 """Words that the parser cannot read are refused in one sentence, as everything else is."""
 
+import errno
+
 import pytest
 
+from warpnerf.cli import main as command
 from warpnerf.cli.main import BAD_INPUT, main
 from warpnerf.cli.refused import sentence
 
@@ -43,3 +46,36 @@ def test_what_is_not_foreseen_is_a_sentence_too() -> None:
     assert sentence(box, "train") == (
         "Something else happened; warpnerf train --help lists all options."
     )
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        RuntimeError("Failed to load the shared library '/x/warp.so'"),
+        ImportError("/x/_core.so: failed to map segment from shared object"),
+    ],
+)
+def test_a_library_that_cannot_be_loaded(
+    error: Exception, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As where the process may have too little memory."""
+
+    def fail(words: list[str]) -> int:
+        raise error
+
+    monkeypatch.setattr(command, "_parsed", fail)
+    assert main(["runs"]) == BAD_INPUT
+    said = capsys.readouterr().err
+    assert said.startswith("warpnerf: error: a library cannot be loaded (") and "ulimit -v" in said
+
+
+@pytest.mark.parametrize(("number", "code"), [(errno.ENAMETOOLONG, 2), (errno.EIO, 1)])
+def test_names_that_cannot_be_those_of_files(
+    number: int, code: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(words: list[str]) -> int:
+        raise OSError(number, "so", "x")
+
+    monkeypatch.setattr(command, "_parsed", fail)
+    assert main(["runs"]) == code
+    assert capsys.readouterr().err.startswith("warpnerf: error: x: so; ")

@@ -72,6 +72,9 @@ HELP_ALL = "--help-all"
 NO_NAMES = (errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL)
 """What the system says of names that cannot be those of files."""
 
+NOT_LOADED = re.compile("load the shared library|map segment|shared object|many open files")
+"""What Warp and Python say where a library cannot be loaded."""
+
 OUT_OF_MEMORY = re.compile("failed to allocate|can't start new thread", re.IGNORECASE)
 """What Warp and the standard library say in a RuntimeError where a MemoryError is meant."""
 
@@ -180,6 +183,15 @@ def _later(command: Callable[..., int]) -> Callable[..., Call]:
     return bound
 
 
+def _not_loaded(error: Exception) -> str:
+    """That a library cannot be loaded, as a sentence."""
+    why = " ".join(str(error).split())[:200].rstrip(".")
+    return (
+        f"a library cannot be loaded ({why}); give the process more memory and more open files "
+        "(ulimit -v, ulimit -n), or install warpnerf again."
+    )
+
+
 def _said(error: Exception) -> str:
     """An error of the system as a sentence."""
     if isinstance(error, OSError) and error.strerror:
@@ -216,7 +228,10 @@ def main(arguments: list[str] | None = None) -> int:
     except InputError as error:
         print(f"warpnerf: error: {error}", file=sys.stderr)
         return BAD_INPUT
-    except (MemoryError, RuntimeError) as error:
+    except (MemoryError, RuntimeError, ImportError) as error:
+        if NOT_LOADED.search(str(error)):
+            print(f"warpnerf: error: {_not_loaded(error)}", file=sys.stderr)
+            return BAD_INPUT
         if not isinstance(error, MemoryError) and not OUT_OF_MEMORY.search(str(error)):
             raise
         why = f" ({error})" if str(error) else ""
