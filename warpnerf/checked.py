@@ -201,7 +201,7 @@ def in_words(hint: Any) -> str:
     if origin in (Union, UnionType):
         return " or ".join(in_words(one) for one in inner)
     if origin is Literal:
-        return " or ".join(map(str, inner))
+        return f"one of {', '.join(map(str, inner))}" if len(inner) > 1 else str(inner[0])
     if origin is tuple:
         count = "" if inner[1:] == (...,) else f"{len(inner)} "
         return f"a list of {count}values, each {in_words(inner[0])}"

@@ -110,7 +110,7 @@ def mutated(rng: random.Random, content: Any) -> Any:
 
 def _mutate(rng: random.Random, content: Any) -> Any:
     places: list[tuple[Any, Any]] = []
-    open_ones = [content]
+    open_ones = [content] if isinstance(content, dict | list) else []
     while open_ones:
         one = open_ones.pop()
         keys = list(one) if isinstance(one, dict) else list(range(len(one)))

@@ -58,7 +58,7 @@ def test_what_fits_is_passed_on() -> None:
             "example: size must be a list of 2 values, each a whole number",
         ),
         ({"size": 3}, "not 3."),
-        ({"kind": "c"}, "example: kind must be a or b, not 'c'."),
+        ({"kind": "c"}, "example: kind must be one of a, b, not 'c'."),
         ({"names": {"a": "b"}}, "example: names must be a dictionary, each value a number or None"),
         ({"names": {1: 1}}, "example: names must be a dictionary"),
         ({"weights": "12"}, "example: weights must be a list, each a number, not '12'."),
