@@ -9,7 +9,6 @@ from typing import NamedTuple, get_args
 import numpy as np
 import torch
 
-from warpnerf.checked import checked_arguments
 from warpnerf.checks import InputError, require_at_least, require_one_of, require_positive
 from warpnerf.config import Scaling
 from warpnerf.model.interface import Model
@@ -42,7 +41,6 @@ class RenderedRays(NamedTuple):
 
 
 @accept_old_spelling
-@checked_arguments
 def render_rays(
     raw: torch.Tensor,
     origins: torch.Tensor,
