@@ -1,9 +1,14 @@
-"""Dataclasses that refuse values of other types than their fields have, in one sentence."""
+"""Dataclasses and functions that refuse values of other types than their fields and arguments have,
+in one sentence."""
 
 from __future__ import annotations
 
+import importlib
+import inspect
+import math
 import os
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from functools import cache, wraps
 from numbers import Integral, Real
@@ -16,6 +21,10 @@ import numpy as np
 from warpnerf.checks import InputError, said
 
 Checked = TypeVar("Checked", bound=type[Any])
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+MANY = 10_000
+"""Elements of a sequence whose types are looked at."""
 
 
 def checked(part: str) -> Callable[[Checked], Checked]:
@@ -51,7 +60,79 @@ def checked(part: str) -> Callable[[Checked], Checked]:
     return decorate
 
 
+def checked_arguments(function: Function) -> Function:
+    """Check the types of a function's arguments, as its annotations have them, when it is called.
+
+    What annotations name need not be known where the function is: public names of the package are
+    looked up. Arguments whose annotations are not understood are not checked.
+    """
+    signature = inspect.signature(function)
+
+    @wraps(function)
+    def called(*args: Any, **kwargs: Any) -> Any:
+        given = signature.bind(*args, **kwargs).arguments
+        hints = _argument_hints(function)
+        for name, value in given.items():
+            if name not in hints:
+                continue
+            several = signature.parameters[name].kind is inspect.Parameter.VAR_POSITIONAL
+            for one in value if several else (value,):
+                _require_argument(f"{function.__name__}: {name}", one, hints[name])
+        return function(*args, **kwargs)
+
+    return called  # type: ignore[return-value]
+
+
+WAYS = {
+    "a Scene": "load_scene gives that of a folder",
+    "a Field": "load_field reads that of a run",
+    "a TrainConfig": 'those of names are in PRESETS, as in train(scene, PRESETS["fast"])',
+    "a TrainingState": "load_checkpoint reads one",
+    "an Inspection": "inspect makes one",
+}
+"""How to come by what is wanted."""
+
+
+def _require_argument(what: str, value: Any, hint: Any) -> None:
+    listed = value.tolist() if isinstance(value, np.ndarray) and value.ndim else value
+    if not (fits(value, hint) or fits(listed, hint)):
+        way_out = next((f"; {WAYS[name]}" for name in WAYS if name in in_words(hint)), "")
+        raise InputError(f"{what} must be {in_words(hint)}, not {said(value)}{way_out}.")
+    if isinstance(value, str | os.PathLike) and "\0" in os.fsdecode(value):
+        raise InputError(f"{what} has a character of code 0, which no name has; leave it out.")
+
+
+@cache
+def _argument_hints(function: Callable[..., Any]) -> dict[str, Any]:
+    """Types of arguments, without those that cannot be known."""
+    package = importlib.import_module(function.__module__.partition(".")[0])
+    names = _Names(vars(sys.modules[function.__module__]), package)
+    hints = {}
+    for name, parameter in inspect.signature(function).parameters.items():
+        try:
+            if isinstance(parameter.annotation, str):
+                hints[name] = eval(parameter.annotation, {}, names)
+        except (NameError, AttributeError, TypeError):
+            continue
+    return hints
+
+
+class _Names(dict[str, Any]):
+    """What a module knows, and the public names of its package."""
+
+    def __init__(self, known: Mapping[str, Any], package: Any) -> None:
+        super().__init__(known)
+        self._package = package
+
+    def __missing__(self, name: str) -> Any:
+        if name not in getattr(self._package, "__all__", ()):
+            raise KeyError(name)
+        return getattr(self._package, name)
+
+
 def _plain(value: Any) -> Any:
+    if value is np.ma.masked:
+        return math.nan
     if isinstance(value, np.generic):
         return value.item()
     if type(value) is tuple and any(isinstance(one, np.generic) for one in value):
@@ -91,6 +172,19 @@ def fits(value: object, hint: Any) -> bool:
         if inner[1:] == (...,):
             return all(fits(one, inner[0]) for one in value)
         return len(value) == len(inner) and all(map(fits, value, inner))
+    if origin in (list, Sequence):
+        whole = Sequence if origin is Sequence else list
+        if isinstance(value, str | bytes) or not isinstance(value, whole | np.ndarray):
+            return False
+        if isinstance(value, np.ndarray) and not value.ndim:
+            return False
+        return len(value) > MANY or all(fits(one, inner[0]) for one in value)
+    if origin in (dict, Mapping):
+        return isinstance(value, Mapping) and all(
+            fits(key, inner[0]) and fits(one, inner[1]) for key, one in value.items()
+        )
+    if origin is Callable or hint is Callable:
+        return callable(value)
     if hint in (int, float):
         number = Integral if hint is int else Real
         return isinstance(value, number) and not isinstance(value, bool | np.bool_)
@@ -107,10 +201,17 @@ def in_words(hint: Any) -> str:
     if origin in (Union, UnionType):
         return " or ".join(in_words(one) for one in inner)
     if origin is Literal:
-        return " or ".join(map(str, inner))
+        return f"one of {', '.join(map(str, inner))}" if len(inner) > 1 else str(inner[0])
     if origin is tuple:
         count = "" if inner[1:] == (...,) else f"{len(inner)} "
         return f"a list of {count}values, each {in_words(inner[0])}"
+    if origin in (list, Sequence):
+        return f"a list, each {in_words(inner[0])}"
+    if origin in (dict, Mapping):
+        return f"a dictionary, each value {in_words(inner[1])}"
+    if origin is Callable or hint is Callable:
+        return "a function"
     words = {int: "a whole number (int)", float: "a number", bool: "True or False", str: "text"}
     words |= {NoneType: "None", Path: "a path", np.ndarray: "an array"}
-    return words.get(hint, f"a {getattr(hint, '__name__', hint)}")
+    name = str(getattr(hint, "__name__", hint))
+    return words.get(hint, f"{'an' if name[0] in 'AEIO' else 'a'} {name}")

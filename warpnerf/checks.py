@@ -41,15 +41,17 @@ LONGEST = 60
 
 
 def said(value: object) -> str:
-    """A value as sentences quote it: its beginning where it is long, its type where that is in
-    lines."""
+    """A value as sentences quote it: its beginning and its last character where it is long, its
+    type where it is described in lines, by an address, or not at all."""
     try:
         text = repr(value.item() if isinstance(value, np.generic) else value)
-    except ValueError:  # a whole number of more digits than Python writes
+    except Exception:  # a whole number of more digits than Python writes; an object of its own mind
         text = "\n"
-    if "\n" in text:
+    if "\n" in text or " at 0x" in text:
         return f"a value of type {type(value).__name__}"
-    return text if len(text) <= LONGEST else text[: LONGEST - 3] + "..."
+    if len(text) > LONGEST and text.lstrip("-").isdigit():
+        return f"a number of {len(text.lstrip('-'))} digits"
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 4]}...{text[-1]}"
 
 
 def _is_finite(value: object) -> bool:

@@ -57,7 +57,7 @@ def test_the_command_keeps_what_it_found(tmp_path: Path) -> None:
     done = command("train", scene, "--output", "run", *FEW, folder=tmp_path, limit=None)
     assert done.code == 0, done.err
     looking, _, rest = done.out.partition("found by a short training")
-    assert "step 25" in looking.partition("looking for how far the cameras see")[2] and rest
+    assert "step 25" in looking.partition("estimating the extent of the scene")[2] and rest
     config = Run(done.run).read_config()
     assert config.found is not None
     assert config.found.content_distance == config.content_distance

@@ -197,7 +197,7 @@ def test_through_a_fisheye_a_path_sees_ninety_degrees_at_most(angle: float, seen
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ({"kind": "spiral"}, "the path must be one of orbit, through, back"),
+        ({"kind": "spiral"}, "kind must be one of orbit, through, back"),
         ({"n_frames": 0}, "number of frames"),
         ({"size": (0, 5)}, "the width"),
         ({"size": (5, 90000)}, "at most 8000"),

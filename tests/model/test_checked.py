@@ -100,7 +100,7 @@ def test_values_are_checked_against_types() -> None:
 
 def test_long_values_are_named_by_their_type() -> None:
     assert said("short") == "'short'" and said(3) == "3"
-    assert said(list(range(100))) == "[0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16..."
+    assert said(list(range(100))) == "[0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 1...]"
     assert said(10**5000) == "a value of type int"
     assert said(np.eye(3)) == "a value of type ndarray"
     assert said("two\nlines") == "'two\\nlines'"

@@ -37,6 +37,9 @@ PROSE: dict[str, str] = {
     r"put through": "process",
     r"worked out": "compute",
     r"passed over": "skip",
+    r"how far the cameras see": "the extent of the scene",
+    r"whose turn": "next, scheduled",
+    r"odd nothing": "warnings none",
 }
 """In docstrings, comments, strings and documents; what to write instead."""
 

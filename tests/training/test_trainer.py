@@ -383,15 +383,15 @@ def test_what_is_not_finite_is_never_saved(where: str) -> None:
 
 def test_what_is_given_in_place_of_a_scene_a_field_or_a_configuration_is_refused() -> None:
     what: Any = wn
-    with pytest.raises(InputError, match=r"train wants a scene, not 'photos'.*load_scene"):
+    with pytest.raises(InputError, match=r"train: scene must be a Scene, not 'photos'; load_scene"):
         what.train("photos")
-    with pytest.raises(InputError, match=r"train wants a configuration, not 'fast'; .* PRESETS"):
+    with pytest.raises(InputError, match=r"train: config must be a TrainConfig or None, .*PRESETS"):
         what.train(tiny_scene(ring(4)), "fast")
     for part in ("grid", "march", "optim", "loss"):
         with pytest.raises(InputError, match=rf"{part} must be a \w+Config, not \{{"):
             wn.TrainConfig(**{part: {}})  # type: ignore[arg-type]
     for function in (what.evaluate, what.export):
-        with pytest.raises(InputError, match=r"wants a field, not 'runs/a'; load_field"):
+        with pytest.raises(InputError, match=r"field must be a Field, not 'runs/a'; load_field"):
             function("runs/a", tiny_scene(ring(4)))
-    with pytest.raises(InputError, match=r"evaluate wants a scene, not 'photos'"):
+    with pytest.raises(InputError, match=r"evaluate: scene must be a Scene, not 'photos'"):
         what.evaluate(ball_field(), "photos")

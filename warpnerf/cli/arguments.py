@@ -15,6 +15,7 @@ from typing import Annotated, Any, Union
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec, PrimitiveTypeInfo
 
+from warpnerf.checks import said
 from warpnerf.cli.config_options import field_docs, given_in, given_type, options
 from warpnerf.cli.given import SHORT, flag_of
 from warpnerf.cli.values import READERS, WANTED
@@ -54,7 +55,7 @@ def number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
         try:
             return READERS[of_type](words[0])
         except ValueError:
-            raise ValueError(f"must be {WANTED[of_type]}, not {words[0]!r}.") from None
+            raise ValueError(f"must be {WANTED[of_type]}, not {said(words[0])}.") from None
 
     return PrimitiveConstructorSpec(
         nargs=1,
@@ -91,7 +92,7 @@ def alternatives(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
             except ValueError:
                 if len(specs) == 1:
                     raise
-        raise ValueError(f"must be {metavar}, not {words[0]!r}.")
+        raise ValueError(f"must be {metavar}, not {said(words[0])}.")
 
     def written(value: Any) -> list[str]:
         fitting = [spec for spec in specs if value is not None and spec.is_instance(value)]

@@ -8,7 +8,7 @@ from difflib import get_close_matches
 from types import MappingProxyType
 from typing import Any, get_type_hints
 
-from warpnerf.checks import InputError
+from warpnerf.checks import InputError, said
 from warpnerf.cli.values import read_value, text_of
 
 Given = Mapping[str, tuple[str, ...]]
@@ -53,11 +53,11 @@ def values_of(flag: str, otherwise: str, begin: Any, options: Sequence[str]) -> 
         field, equals, text = option.partition("=")
         if not equals and field not in known:
             raise InputError(
-                f"{flag}: {option!r} is no NAME=VALUE; {flag} takes all words up to the next "
+                f"{flag}: {said(option)} is no NAME=VALUE; {flag} takes all words up to the next "
                 "option, so what does not belong to it goes before it."
             )
         if not equals or field not in known:
-            raise InputError(f"{flag}: {option!r} is {otherwise} {_listed(known)}.")
+            raise InputError(f"{flag}: {said(option)} is {otherwise} {_listed(known)}.")
         if field in given:
             raise InputError(f"{flag}: {field} is given twice; keep one of them.")
         given[field] = read_value(f"{flag}: {field}", kinds[field], (text,))

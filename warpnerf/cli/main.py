@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import functools
 import io
 import logging
 import os
@@ -11,6 +13,7 @@ import sys
 import warnings
 from collections.abc import Callable, Sequence
 from itertools import pairwise
+from typing import Any
 
 import tyro
 
@@ -25,6 +28,7 @@ from warpnerf.cli.given import near_to
 from warpnerf.cli.inspect import inspect_command
 from warpnerf.cli.machine import FAILED, check_command, warmup_command
 from warpnerf.cli.pose import pose_command
+from warpnerf.cli.refused import read_words
 from warpnerf.cli.render import render_command
 from warpnerf.cli.runs import runs_command
 from warpnerf.cli.train import train_command
@@ -35,6 +39,9 @@ from warpnerf.runtime.signals import Stopped, raise_when_asked
 from warpnerf.runtime.terminal import UntilClosed
 
 BAD_INPUT = 2
+
+Call = Callable[[], int]
+"""A subcommand with its options."""
 
 COMMANDS: dict[str, Callable[..., int]] = {
     "demo": demo_command,
@@ -61,6 +68,12 @@ NARROWEST = 24
 
 HELP_ALL = "--help-all"
 """Lists all options of a subcommand, --help those that are used often."""
+
+NO_NAMES = (errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL)
+"""What the system says of names that cannot be those of files."""
+
+NOT_LOADED = re.compile("load the shared library|map segment|shared object|many open files")
+"""What Warp and Python say where a library cannot be loaded."""
 
 OUT_OF_MEMORY = re.compile("failed to allocate|can't start new thread", re.IGNORECASE)
 """What Warp and the standard library say in a RuntimeError where a MemoryError is meant."""
@@ -132,11 +145,11 @@ def _parsed(words: list[str]) -> int:
         _require_known(name, words[1:])
         words = ["--help" if word == HELP_ALL else word for word in words]
 
-    def shown(command: Callable[..., int]) -> Callable[..., int]:
+    def shown(command: Callable[..., int]) -> Callable[..., Call]:
         if command is COMMANDS.get(name or ""):
-            return with_help(command, begin, everything)
+            return _later(with_help(command, begin, everything))
 
-        def named() -> int:
+        def named() -> Call:
             raise AssertionError("it is only listed")
 
         named.__doc__ = (command.__doc__ or "").partition("\n\n")[0]
@@ -145,12 +158,38 @@ def _parsed(words: list[str]) -> int:
     if shutil.get_terminal_size().columns < NARROWEST:
         os.environ["COLUMNS"] = str(NARROWEST)
     with registry:
-        return tyro.extras.subcommand_cli_from_dict(
-            {name: shown(command) for name, command in COMMANDS.items()},
-            prog="warpnerf",
-            description="Voxel-grid radiance fields from photographs, with fewer floaters.",
-            args=words,
+        commands = {name: shown(command) for name, command in COMMANDS.items()}
+        call: Call = read_words(
+            lambda: tyro.extras.subcommand_cli_from_dict(
+                commands,
+                prog="warpnerf",
+                description="Voxel-grid radiance fields from photographs, with fewer floaters.",
+                args=words,
+            ),
+            name,
+            shows_help=bool({"--help", "-h"} & {*words}),
         )
+    return call()
+
+
+def _later(command: Callable[..., int]) -> Callable[..., Call]:
+    """A subcommand that is called once all words are read."""
+
+    @functools.wraps(command)
+    def bound(*arguments: Any, **options: Any) -> Call:
+        return functools.partial(command, *arguments, **options)
+
+    bound.__annotations__ = {**command.__annotations__, "return": Call}
+    return bound
+
+
+def _not_loaded(error: Exception) -> str:
+    """That a library cannot be loaded, as a sentence."""
+    why = " ".join(str(error).split())[:200].rstrip(".")
+    return (
+        f"a library cannot be loaded ({why}); give the process more memory and more open files "
+        "(ulimit -v, ulimit -n), or install warpnerf again."
+    )
 
 
 def _said(error: Exception) -> str:
@@ -189,7 +228,10 @@ def main(arguments: list[str] | None = None) -> int:
     except InputError as error:
         print(f"warpnerf: error: {error}", file=sys.stderr)
         return BAD_INPUT
-    except (MemoryError, RuntimeError) as error:
+    except (MemoryError, RuntimeError, ImportError) as error:
+        if NOT_LOADED.search(str(error)):
+            print(f"warpnerf: error: {_not_loaded(error)}", file=sys.stderr)
+            return BAD_INPUT
         if not isinstance(error, MemoryError) and not OUT_OF_MEMORY.search(str(error)):
             raise
         why = f" ({error})" if str(error) else ""
@@ -200,7 +242,7 @@ def main(arguments: list[str] | None = None) -> int:
         return BAD_INPUT
     except (OSError, FloatingPointError) as error:
         print(f"warpnerf: error: {_said(error)}", file=sys.stderr)
-        return FAILED
+        return BAD_INPUT if getattr(error, "errno", None) in NO_NAMES else FAILED
     except Stopped as stopped:
         print("stopped", file=sys.stderr)
         return stopped.exit_code

@@ -134,7 +134,7 @@ def _begin_alone(source: str, output: Path, options: TrainOptions, config: Train
 
     plan = resolve(scene, config)
     if plan.looks_first:
-        print("looking for how far the cameras see", flush=True)
+        print("estimating the extent of the scene", flush=True)
         with ProgressBar("first step") as bar:
             trainer = prepare_trainer(
                 scene, plan, on_progress=lambda found: bar.report(found.fraction, str(found))

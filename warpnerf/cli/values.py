@@ -8,7 +8,7 @@ from decimal import Decimal
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin
 
-from warpnerf.checks import InputError
+from warpnerf.checks import InputError, said
 
 WANTED = {bool: "true or false", int: "a whole number", float: "a number", str: "a word"}
 """What a value has to be, in words."""
@@ -76,7 +76,7 @@ def read_value(what: str, kind: Any, words: Sequence[str]) -> Any:
         except ValueError:
             continue
     listed = " or ".join([*chosen, *(_wanted(member) for member in others)])
-    raise InputError(f"{what} must be {listed}, not {' '.join(words)!r}.")
+    raise InputError(f"{what} must be {listed}, not {said(' '.join(words))}.")
 
 
 def _read(member: Any, words: Sequence[str]) -> Any:

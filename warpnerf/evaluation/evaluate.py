@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from warpnerf.checks import InputError, require_kind
+from warpnerf.checked import checked_arguments
+from warpnerf.checks import InputError
 from warpnerf.evaluation.metrics import (
     SSIM_WINDOW,
     alike_where_masked,
@@ -127,6 +128,7 @@ class Evaluation:
         ]
 
 
+@checked_arguments
 def evaluate(
     field: Field,
     scene: Scene,
@@ -152,10 +154,7 @@ def evaluate(
     Raises:
         InputError: Field or scene is none, or the scene has no such split.
     """
-    from warpnerf.rendering.field import Field
 
-    require_kind(field, Field, "evaluate wants a field", "load_field reads that of a run")
-    require_kind(scene, Scene, "evaluate wants a scene", "load_scene gives that of a folder")
     images = []
     within = NEAR_SHARE * scene.content_distance
     views = [scene.views[index] for index in require_split(scene, split)]

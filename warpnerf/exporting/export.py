@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from warpnerf.checks import InputError, require_kind
+from warpnerf.checked import checked_arguments
+from warpnerf.checks import InputError
 from warpnerf.exporting import atlas, mesh, page, splats, spz, surface, volume
 from warpnerf.exporting import cameras as scenes
 from warpnerf.exporting.colour import colours
@@ -70,6 +71,7 @@ class ExportOptions:
     """Undistort the photographs of a folder; see ``pinhole_scene``."""
 
 
+@checked_arguments
 def export(
     field: Field,
     path: str | Path,
@@ -130,6 +132,7 @@ def export(
     return written
 
 
+@checked_arguments
 def export_all(
     field: Field,
     paths: Sequence[str | Path],
@@ -167,9 +170,6 @@ def export_all(
         InputError: As ``export``, or no path, or one that is given twice.
         OSError: One cannot be written; what was there before is left as it was.
     """
-    require_kind(field, Field, "export wants a field", "load_field reads that of a run")
-    if scene is not None:
-        require_kind(scene, Scene, "export wants a scene", "load_scene gives that of a folder")
     given = ExportOptions() if options is None else options
     targets = [Path(path) for path in paths]
     if not targets:

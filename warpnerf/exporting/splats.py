@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from warpnerf.checked import checked_arguments
 from warpnerf.checks import InputError
 from warpnerf.exporting.colour import colours
 from warpnerf.exporting.ply import ply
@@ -70,6 +71,7 @@ class Splats:
 
 
 @renamed_argument("sight", "visibility")
+@checked_arguments
 def splats_of(
     field: Field,
     visibility: Visibility | None = None,

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from warpnerf.checked import checked_arguments
 from warpnerf.checks import InputError, require_at_least, require_positive, require_whole
 from warpnerf.exporting.colour import colours
 from warpnerf.exporting.decimation import decimated
@@ -49,6 +50,7 @@ class Surface:
 
 
 @renamed_argument("sight", "visibility")
+@checked_arguments
 def extract_surface(
     field: Field,
     visibility: Visibility | None = None,

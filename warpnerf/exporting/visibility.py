@@ -14,6 +14,7 @@ import numpy as np
 import warp as wp
 from warpnerf_kernels.base.types import real, vec3, vector
 
+from warpnerf.checked import checked_arguments
 from warpnerf.checks import InputError
 from warpnerf.fields.dense import DenseGrid
 from warpnerf.fields.nodes import values_at
@@ -61,6 +62,7 @@ class Visibility:
         return rgb.clip(0.0, 1.0).astype(np.float32), light > SEEN
 
 
+@checked_arguments
 def visibility(
     field: Field,
     views: Sequence[View | Camera],

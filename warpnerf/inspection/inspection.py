@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from warpnerf.checked import checked_arguments
 from warpnerf.checks import InputError, require_at_least, require_positive
 from warpnerf.config import TrainConfig
 from warpnerf.inspection.diagnostics import common_focus, diagnostics
@@ -203,6 +204,7 @@ class Inspection:
         return "\n".join([scene.name, *(f"  {name:17} {text}" for name, text in rows)])
 
 
+@checked_arguments
 def inspect(
     path: str | Path,
     *,

@@ -9,7 +9,8 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from warpnerf.checks import InputError, require_one_of, require_positive, require_whole
+from warpnerf.checked import checked_arguments
+from warpnerf.checks import InputError, require_one_of, require_positive, require_whole, said
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.cameras.fisheye import angle_of
 from warpnerf.scenes.cameras.focus import MIN_SHARE_AIMED, find_focus, share_aimed_at, up_direction
@@ -41,6 +42,18 @@ def natural_path(scene: Scene) -> PathKind:
     return "orbit" if aimed >= MIN_SHARE_AIMED else "through"
 
 
+MAX_FRAMES = 1_000_000
+"""Of a path: nine hours of film."""
+
+
+def require_frames(n: int) -> None:
+    """Raise InputError unless a film can have so many frames."""
+    require_whole("the number of frames", n, 1)
+    if n > MAX_FRAMES:
+        raise InputError(f"the number of frames must be at most {MAX_FRAMES}, not {said(n)}.")
+
+
+@checked_arguments
 def camera_path(
     scene: Scene,
     kind: PathKind | None = None,
@@ -72,7 +85,7 @@ def camera_path(
     """
     kind = natural_path(scene) if kind is None else kind
     require_one_of("the path", kind, get_args(PathKind))
-    require_whole("the number of frames", n_frames, 1)
+    require_frames(n_frames)
     if distance is not None:
         require_positive("the distance of the path", distance)
     cameras = scene.training_cameras

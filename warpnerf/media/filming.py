@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from warpnerf.checked import checked_arguments
 from warpnerf.checks import InputError
 from warpnerf.media.camera_path import path_lens
 from warpnerf.media.panels import USUAL, Output, Panels
@@ -23,6 +24,7 @@ LOOK_SIZE = 96
 """Pixels along the longer side of such a look."""
 
 
+@checked_arguments
 def render_video(
     field: Field,
     cameras: Sequence[Camera],
@@ -70,6 +72,7 @@ def render_video(
     return write_video(path, frames(), fps)
 
 
+@checked_arguments
 def render_stills(
     field: Field,
     cameras: dict[str, Camera],

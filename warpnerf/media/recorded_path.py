@@ -21,8 +21,9 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from warpnerf.checked import checked_arguments
 from warpnerf.checks import InputError
-from warpnerf.media.camera_path import MAX_SIDE, spline
+from warpnerf.media.camera_path import MAX_SIDE, require_frames, spline
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.files import read_json
 
@@ -69,6 +70,7 @@ class RecordedPath(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         """The camera path as JSON, the content of its file."""
         return msgspec.json.format(msgspec.json.encode(self), indent=1) + b"\n"
 
+    @checked_arguments
     def cameras(self, n_frames: int, size: tuple[int, int] | None = None) -> list[Camera]:
         """Cameras along a smooth path through the keys, at times evenly spread.
 
@@ -80,8 +82,10 @@ class RecordedPath(msgspec.Struct, frozen=True, kw_only=True, eq=False):
             n_frames cameras; a single key stands still.
 
         Raises:
-            InputError: A width or height is not from 1 to MAX_SIDE.
+            InputError: A width or height is not from 1 to MAX_SIDE, or n_frames not from 1 to
+                MAX_FRAMES.
         """
+        require_frames(n_frames)
         width, height = size or (self.width, self.height)
         for name, side in (("width", width), ("height", height)):
             if not 1 <= side <= MAX_SIDE:
@@ -111,6 +115,7 @@ class RecordedPath(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         return cameras
 
 
+@checked_arguments
 def read_path(path: str | Path) -> RecordedPath:
     """Read a camera path from its file.
 

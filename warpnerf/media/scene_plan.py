@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image, ImageDraw
 
+from warpnerf.checked import checked_arguments
 from warpnerf.inspection.inspection import Inspection
 from warpnerf.media.pictures import FAINT, INK, font
 from warpnerf.scenes.cameras.camera import Camera
@@ -35,6 +36,7 @@ _FRUSTUM = 0.035
 Colour = tuple[int, int, int]
 
 
+@checked_arguments
 def plan_picture(inspection: Inspection) -> np.ndarray:
     """Plot a scene: cameras as pyramids, how far content is, the box, and points if there are any.
 

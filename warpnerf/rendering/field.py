@@ -10,6 +10,7 @@ import warp as wp
 from warpnerf_kernels.base.types import real, vec3
 from warpnerf_kernels.launch import assembly
 
+from warpnerf.checked import checked_arguments
 from warpnerf.checks import InputError, require_rays
 from warpnerf.fields.lattice import Lattice
 from warpnerf.fields.nodes import cells_within
@@ -85,6 +86,7 @@ class Field:
             proposal=None if self.proposal is None else self.proposal.copied_to(device),
         )
 
+    @checked_arguments
     def cropped(self, low: Sequence[float], high: Sequence[float]) -> Field:
         """Crop a field to a box: rays see nothing outside of it.
 
@@ -111,6 +113,7 @@ class Field:
             )
         return replace(self, free=self.free.cropped(self.lattice, inside, self.workers))
 
+    @checked_arguments
     def render(self, camera: Camera) -> Rendering:
         """Render a camera's image: colour, opacity and depth by volume rendering.
 
@@ -128,6 +131,7 @@ class Field:
         seen = self._render(*rays, places=camera.position[None])
         return self._rendering(seen, (camera.height, camera.width))
 
+    @checked_arguments
     def render_rays(self, origins: np.ndarray, directions: np.ndarray) -> Rendering:
         """Render rays: colour, opacity and depth by volume rendering.
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
+from warpnerf.checked import checked_arguments
 from warpnerf.checks import InputError, cannot_write, require_whole
 from warpnerf.config import LossConfig, Scaling, TrainConfig
 from warpnerf.evaluation.evaluate import evaluate
@@ -85,6 +86,7 @@ class Demo:
         return "\n".join(lines)
 
 
+@checked_arguments
 def demo(
     output: str | Path,
     *,

@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 import warp as wp
 
+from warpnerf.checked import checked_arguments
 from warpnerf.checks import InputError, require_one_of
 from warpnerf.config import GROW_AT, Contraction, TrainConfig
 from warpnerf.config_json import config_to_json
@@ -58,6 +59,7 @@ WITHOUT_PLAN = "warpnerf-training-7"
 """What is written of a training that was read from such a file, and has not gone on."""
 
 
+@checked_arguments
 def save_field(path: str | Path, field: Field, precision: Precision = "float32") -> None:
     """Save a radiance field as a safetensors file, replacing an older one in a single step.
 
@@ -77,6 +79,7 @@ def save_field(path: str | Path, field: Field, precision: Precision = "float32")
     write_tensors(path, {"format": kind} | field_header(field), tensors)
 
 
+@checked_arguments
 def save_checkpoint(path: str | Path, state: TrainingState) -> None:
     """Save a checkpoint: all that a training needs to resume, replacing an older one at once.
 
@@ -103,6 +106,7 @@ def save_checkpoint(path: str | Path, state: TrainingState) -> None:
     write_tensors(path, header, _optimiser_tensors(state) | field_tensors(state.field))
 
 
+@checked_arguments
 def load_field(path: str | Path, device: str = "cpu", threads: int | None = None) -> Field:
     """Load a trained radiance field that ``save_field`` or ``save_checkpoint`` wrote.
 
@@ -122,6 +126,7 @@ def load_field(path: str | Path, device: str = "cpu", threads: int | None = None
     return _field(header, tensors, path, Workers(device, threads))
 
 
+@checked_arguments
 def load_checkpoint(path: str | Path) -> TrainingState:
     """Load a checkpoint, a training that ``save_checkpoint`` wrote, into memory.
 

@@ -8,7 +8,8 @@ from typing import Protocol, overload
 
 import numpy as np
 
-from warpnerf.checks import InputError, require_positive
+from warpnerf.checked import checked
+from warpnerf.checks import InputError, require_kind, require_positive, said
 from warpnerf.optim_config import SceneKind
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.cameras.observations import Observations
@@ -93,8 +94,15 @@ class View:
         Raises:
             InputError: Shapes or types do not fit.
         """
+        if not isinstance(self.name, str):
+            raise InputError(f"View.name must be text, not {said(self.name)}.")
+        require_kind(self.camera, Camera, f"{self.name}: its camera must be a Camera", "make one")
         size = (self.camera.height, self.camera.width)
         image = self.__dict__["image"]
+        for part in ("image", "depth", "mask"):
+            kept = self.__dict__[part]
+            if not (hasattr(kept, "shape") or (kept is None and part != "image")):
+                raise InputError(f"{self.name}: {part} must be an array, not {said(kept)}.")
         dtype = image.dtype if isinstance(image, np.ndarray) else np.dtype(np.uint8)
         if dtype != np.uint8 or image.shape[:2] != size or image.shape[2:] not in ((3,), (4,)):
             raise InputError(
@@ -135,6 +143,7 @@ class View:
         return int(self.__dict__["image"].shape[2])
 
 
+@checked("Scene")
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Scene:
     """A scene: posed photographs, their train/test split, and the extent estimated from their

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from warpnerf.checked import checked
-from warpnerf.checks import InputError, require_one_of, require_whole
+from warpnerf.checks import InputError, require_one_of, require_whole, said
 
 CameraModel = Literal[
     "auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"
@@ -15,6 +15,10 @@ CameraModel = Literal[
 Matching = Literal["auto", "exhaustive", "sequential"]
 Mapper = Literal["incremental", "global"]
 Lenses = Literal["auto", "one", "each"]
+
+
+MAX_SIZE = 100_000
+"""Pixels of a photograph's longer side."""
 
 
 @checked("")
@@ -60,6 +64,10 @@ class PoseConfig:
             require_one_of(name, getattr(self, name), get_args(kind))
         require_whole("frames", self.frames, 3)
         require_whole("max_image_size", self.max_image_size, 100)
+        if self.max_image_size > MAX_SIZE:
+            raise InputError(
+                f"max_image_size must be at most {MAX_SIZE}, not {said(self.max_image_size)}."
+            )
         if self.threads is not None:
             require_whole("threads", self.threads, 1)
         if self.masks is not None and not Path(self.masks).is_dir():

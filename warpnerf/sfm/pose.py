@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from warpnerf.checked import checked_arguments
 from warpnerf.checks import InputError
 from warpnerf.runtime.memory import usable_cores
 from warpnerf.scenes.cameras.camera import Camera
@@ -56,6 +57,7 @@ STAGES = {
 Progress = Callable[[float, str], None]
 
 
+@checked_arguments
 def pose(
     source: str | Path,
     output: str | Path,

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 
-from warpnerf.checks import require_kind
+from warpnerf.checked import checked_arguments
 from warpnerf.config import TrainConfig
 from warpnerf.presets import PRESETS
 from warpnerf.rendering.field import Field
@@ -31,6 +31,7 @@ class TrainResult:
     """What was trained on, with the extent that was used: it may have been looked for first."""
 
 
+@checked_arguments
 def train(
     scene: Scene,
     config: TrainConfig | None = None,
@@ -70,10 +71,6 @@ def train(
             configuration are not those of the training to be resumed.
         FloatingPointError: The loss, or a value in the grid, is no longer a finite number.
     """
-    require_kind(scene, Scene, "train wants a scene", "load_scene gives that of a folder")
-    if config is not None:
-        way_out = 'those of names are in PRESETS, as in train(scene, PRESETS["fast"])'
-        require_kind(config, TrainConfig, "train wants a configuration", way_out)
     if config is None:
         config = PRESETS["fast"] if resume is None else resume.config
     if eval_every is not None:

@@ -1,4 +1,4 @@
-"""A viewer session: its clients, whose turn it is, and how much time pictures get.
+"""A viewer session: its clients, which of them is served next, and how much time pictures get.
 
 All rendering happens in the thread that calls ``work`` or ``serve``: in a training that is the
 training's own, between two updates, so that nothing changes under a picture, and pictures change
@@ -230,7 +230,7 @@ class Session:
             self._requests.popleft()()
 
     def _next(self) -> tuple[Page | None, float]:
-        """The page whose turn it is, and since or until when; none: infinity."""
+        """The page to be served next, and since or until when; none: infinity."""
         settings, now = self._panel.settings, monotonic()
         waiting = []
         for page in list(self._pages.values()):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from warpnerf.checked import checked_arguments
 from warpnerf.checks import InputError, require_extra
 from warpnerf.media.filming import depth_range
 from warpnerf.rendering.field import Field
@@ -18,6 +19,7 @@ from warpnerf.viewer.painter import Subject
 from warpnerf.viewer.session import Session
 
 
+@checked_arguments
 def view(
     *shown: Field | str | Path,
     scene: Scene | None = None,

@@ -74,6 +74,10 @@ class LensFields(msgspec.Struct):
     orthographic: object = None
 
 
+MAX_COEFFICIENT = 1e9
+"""Of distortion: even of long telephoto lenses, k1 is some hundreds, and k3 some millions."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Lens:
     """A lens whose missing values follow from the size of its image."""
@@ -125,6 +129,12 @@ class Lens:
         if nearest is not None:
             return nearest[1]
         coefficients = {k: values[k] for k in COEFFICIENTS if values.get(k)}
+        for name, value in coefficients.items():
+            if abs(value) > MAX_COEFFICIENT:
+                raise InputError(
+                    f"{self.file}: {self.fields[name]} = {value:g} is the distortion of no lens; "
+                    "calibrate again, or leave it out."
+                )
         if coefficients and not has_invertible_distortion(camera):
             named = ", ".join(f"{self.fields[k]} = {v:g}" for k, v in coefficients.items())
             raise InputError(

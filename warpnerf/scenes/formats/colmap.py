@@ -10,9 +10,10 @@ from __future__ import annotations
 import math
 import os
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
@@ -105,6 +106,17 @@ def _images(model: Path) -> list[ModelImage]:
     file = model / f"images.{kind}"
     require_regular_file(file)
     return (images_of_bytes if kind == "bin" else images_of_text)(file)
+
+
+def _require_once(file: Path, images: Sequence[ModelImage]) -> None:
+    """Raise InputError where two images have one number or one name."""
+    for what, of in (("number", lambda image: image.number), ("name", lambda image: image.name)):
+        (most, n), *_ = Counter(map(of, images)).most_common(1) or [(None, 0)]
+        if n > 1:
+            raise InputError(
+                f"{file}: {n} images have the {what} {printable(str(most)[:80])}; remove all but "
+                "one of them, or export it again."
+            )
 
 
 def _others(model: Path, n: int, folder: Path) -> tuple[list[str], list[str]]:
@@ -203,6 +215,7 @@ def load_colmap(
         (cameras_of_bytes, images_of_bytes) if kind == "bin" else (cameras_of_text, images_of_text)
     )
     cameras, images = read_cameras(camera_file), read_images(image_file)
+    _require_once(image_file, images)
     folder = scene_folder(model)
     photographs = photograph_folder(folder)
     if photographs is None:
@@ -214,7 +227,7 @@ def load_colmap(
     for image in images:
         field = f"{image_file}: image {printable(image.name[:80])!r}"
         path = find_image(photographs, image.name, field=field)
-        if path is None:
+        if path is None or not PurePosixPath(image.name).name:  # such as "."
             missing.append(printable(image.name[:80]))
             continue
         if image.camera not in cameras:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -127,10 +127,18 @@ class _Bytes:
             )
 
 
+def _require_new(file: Path, number: int, cameras: Mapping[int, ModelCamera]) -> None:
+    """Raise InputError where a camera's number is one of these already."""
+    if number in cameras:
+        raise InputError(
+            f"{file}: two cameras have the number {number}; remove one of them, or export it again."
+        )
+
+
 def cameras_of_bytes(file: Path) -> dict[int, ModelCamera]:
     """Cameras of cameras.bin by their numbers; InputError where it is damaged."""
     data = _Bytes(file)
-    cameras = {}
+    cameras: dict[int, ModelCamera] = {}
     for _ in range(data.count(24, "cameras")):
         number, model, width, height = data.take("IiQQ")
         if not 0 <= model < len(MODEL_NAMES):
@@ -142,6 +150,7 @@ def cameras_of_bytes(file: Path) -> dict[int, ModelCamera]:
                 f"{file}: camera {number}: the lens {name} is not modelled; undistort the images "
                 "to a pinhole camera (colmap image_undistorter)."
             )
+        _require_new(file, number, cameras)
         cameras[number] = ModelCamera(name, width, height, data.take(f"{len(parameters)}d"))
     return cameras
 
@@ -179,7 +188,7 @@ def _parsed(file: Path, number: int, what: str, parse: Callable[[], Any]) -> Any
 
 def cameras_of_text(file: Path) -> dict[int, ModelCamera]:
     """Cameras of cameras.txt by their numbers; InputError where a line is none."""
-    cameras = {}
+    cameras: dict[int, ModelCamera] = {}
     for number, line in _lines(file):
         if not line:
             continue
@@ -192,6 +201,7 @@ def cameras_of_text(file: Path) -> dict[int, ModelCamera]:
             return int(words[0]), camera
 
         key, camera = _parsed(file, number, "camera", parse)
+        _require_new(file, key, cameras)
         cameras[key] = camera
     return cameras
 

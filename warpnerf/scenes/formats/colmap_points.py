@@ -54,6 +54,11 @@ def read_points(model: Path, images: Mapping[int, str], folder: Path) -> Points 
             raise InputError(
                 f"{file}: cannot be read: {error.strerror or error}; change that, or move it away."
             ) from None
+        except MemoryError:
+            raise InputError(
+                f"{file}: has {file.stat().st_size / 1e9:.3g} GB, more than the memory that is "
+                "free; move it away, as training does without points, or filter them."
+            ) from None
         source = Path(os.path.relpath(file, folder)).as_posix()
         found = _tracked(positions, numbers, lengths, images, source)
         break

@@ -73,6 +73,11 @@ def load_llff(
         height, width, focal = size.tolist()
         if min(height, width, focal) <= 0.0:
             raise InputError(f"{file}: {place}: height, width and focal length must be above 0.")
+        if not 0.0 < row[15] < row[16]:
+            raise InputError(
+                f"{file}: {place}: the near bound must be above 0 and below the far bound, not "
+                f"{row[15]:.4g} with {row[16]:.4g}; they are its last two numbers, in this order."
+            )
         pose = np.stack([right, -down, backward, position], axis=1)
         # As angles of view, which hold for reduced photographs as well.
         angles = {

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
+from warpnerf.checked import checked_arguments
 from warpnerf.checks import InputError, require_one_of
 from warpnerf.runtime.memory import require_threads
 from warpnerf.scenes.files import exists
@@ -34,6 +35,7 @@ BUILTIN = "builtin:"
 BUILTIN_NAMES = ("room", "room-sparse")
 
 
+@checked_arguments
 def load_scene(
     path: str | Path,
     *,
