@@ -92,6 +92,7 @@ class StagedWrites:
         trace: TracebackType | None,
     ) -> None:
         """Rename all, or remove all."""
+        n_renamed = 0
         try:
             if kind is None:
                 for path, pieces in self._streams:
@@ -99,8 +100,9 @@ class StagedWrites:
                         stream.writelines(pieces)
                 for temporary, path in self._ready:
                     temporary.replace(path)
+                    n_renamed += 1
         finally:
-            for temporary, _ in self._ready:
+            for temporary, _ in self._ready[n_renamed:]:
                 if temporary.is_dir():
                     shutil.rmtree(temporary, ignore_errors=True)
                 else:

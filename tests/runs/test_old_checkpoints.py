@@ -29,6 +29,7 @@ from tests.support.tiny_trainings import early_growth as early_growth
 from warpnerf.checks import InputError
 from warpnerf.config import GridConfig, LossConfig, MarchConfig, TrainConfig
 from warpnerf.model.models import Rgb
+from warpnerf.model.sampler_kinds import MARCHED
 from warpnerf.runs.checkpoint import load_checkpoint, load_field, save_checkpoint
 from warpnerf.runs.tensor_file import DamagedFileError
 from warpnerf.scenes.scene import Scene
@@ -135,6 +136,7 @@ def test_files_of_the_version_before_hold_the_model_rgb(tmp_path: Path) -> None:
     # All rays were drawn then, a thinner medium was not free space, steps outside the box were
     # shorter, all grids grew late, and boxes were the scene's.
     then = {
+        "sampler": MARCHED,
         "skip_empty_rays": False,
         "alpha_min": 0.01,
         "march": MarchConfig(growth=0.02),
@@ -223,7 +225,10 @@ def in_folded_space() -> Scene:
 def test_a_training_without_a_plan_goes_on_as_it_would_have(
     content_distance: Any, scene: Callable[[], Scene], tmp_path: Path, on_cpu: None
 ) -> None:
-    path, config = tmp_path / "begun", tiny_config(content_distance=content_distance)
+    path, config = (
+        tmp_path / "begun",
+        tiny_config(content_distance=content_distance, sampler=MARCHED),
+    )
     whole = stopped_at(STEPS, tmp_path / "whole", config, scene())
     for step in (3, GROWING[0] + 2):
         state = stopped_at(step, path, config, scene())
@@ -248,7 +253,7 @@ def test_growths_that_were_counted_with_a_tighter_box(
     step: int, tmp_path: Path, on_cpu: None
 ) -> None:
     """As format 6 counted them for objects; they continue as if they had been counted as now."""
-    path, scene, config = tmp_path / "begun", ball(), tiny_config()
+    path, scene, config = tmp_path / "begun", ball(), tiny_config(sampler=MARCHED)
     state = stopped_at(step, path, config, scene)
     for counted in (state.grown + 1, state.grown):
         save_checkpoint(path, as_older(replace(state, grown=counted)))

@@ -14,11 +14,11 @@ from tests.support.tiny_fields import tiny_field
 from tests.support.tiny_scenes import write_transforms
 from warpnerf.checks import InputError
 from warpnerf.cli.evaluate import eval_command
-from warpnerf.cli.export import export_command
+from warpnerf.cli.export import Options, export_command
 from warpnerf.cli.render import RenderOptions, render_command
 from warpnerf.cli.train import TrainOptions, train_command
 from warpnerf.config import TrainConfig
-from warpnerf.exporting import export as exporting
+from warpnerf.exporting import visibility as exporting
 from warpnerf.runs.run import Run
 from warpnerf.runs.scene import load_run_scene
 from warpnerf.scenes.formats.load import load_scene
@@ -56,12 +56,14 @@ def test_commands_keep_the_masks_of_the_training(
     assert len(list(stills.glob("*.png"))) == 5
 
     looked: list[np.ndarray] = []
+    visibility = exporting.visibility
 
-    def look(field: Any, views: Any, on_camera: Any) -> None:
+    def look(field: Any, views: Any, on_camera: Any) -> Any:
         looked.extend(view.mask for view in views)
+        return visibility(field, views, on_camera)
 
     monkeypatch.setattr(exporting, "visibility", look)
-    assert export_command(run, tmp_path / "a.npz", scene=place, threads=1) == 0
+    assert export_command(run, (tmp_path / "a.npz",), Options(), scene=place, threads=1) == 0
     assert looked and all(mask[:, 4:].all() and not mask[:, :4].any() for mask in looked)
 
 
@@ -89,7 +91,7 @@ def test_commands_on_a_scene_that_moved_say_how_to_name_it(tmp_path: Path) -> No
     (tmp_path / "scene").rename(tmp_path / "elsewhere")
     for command in (
         lambda: eval_command(run),
-        lambda: export_command(run, tmp_path / "a.npz", threads=1),
+        lambda: export_command(run, (tmp_path / "a.npz",), Options(), threads=1),
         lambda: render_command(run, RenderOptions(output=tmp_path / "a.gif"), threads=1),
     ):
         with pytest.raises(InputError, match=r"scene: the scene .* no longer there.*by --scene"):
@@ -101,7 +103,7 @@ def test_another_scene_is_not_taken_for_one_that_moved(tmp_path: Path) -> None:
     write_transforms(tmp_path / "other", 4)
     other = {"scene": str(tmp_path / "other"), "threads": 1}
     for command in (
-        lambda: export_command(run, tmp_path / "a.npz", **other),
+        lambda: export_command(run, (tmp_path / "a.npz",), Options(), **other),
         lambda: render_command(run, RenderOptions(output=tmp_path / "a.gif"), **other),
     ):
         with pytest.raises(InputError, match=r"other: is not what .* 3 photographs, not 5"):
@@ -126,7 +128,7 @@ def test_the_viewer_of_a_field_wants_a_scene_that_is_loaded() -> None:
     pytest.importorskip("viser")
     for scene in ("photos", 3):
         with pytest.raises(
-            InputError, match=r"scene of the view must be a Scene, not .* gives that"
+            InputError, match=r"view: scene must be a Scene or None, not .* gives that"
         ):
             wn.view(tiny_field(), scene=scene)  # type: ignore[arg-type]
 

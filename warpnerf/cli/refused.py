@@ -33,7 +33,7 @@ def read_words(read: Callable[[], Result], name: str | None, shows_help: bool) -
     Args:
         read: Reads them by tyro, which prints what is wrong in a box and exits.
         name: Of the subcommand; None: there is none.
-        shows_help: Whether help is asked for, which is laid out for the terminal.
+        shows_help: Whether help is wanted, which is laid out for the terminal.
 
     Returns:
         What ``read`` returns.

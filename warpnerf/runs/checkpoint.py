@@ -404,23 +404,18 @@ def _read(path: Path) -> tuple[_Header, dict[str, np.ndarray]]:
     """Header and tensors of a field or a training; what is not ours is refused."""
     tree, tensors = read_tensors(path, (FIELD, COMPACT, TRAINING, *OLDER))
     kind = tree["format"]
-    known = MODELS | FORMER_NAMES
-    if isinstance(model := tree.get("model"), dict) and model.get("name") not in known:
-        raise InputError(
-            f"{path} holds a field of the model {model.get('name')!r}, but this version knows "
-            f"{', '.join(MODELS)}; register that model, or use the version that wrote it."
-        )
-    if isinstance(stored := tree.get("field"), dict) and stored.get("name") not in STORAGE_KINDS:
-        raise InputError(
-            f"{path} holds a field that is stored as {stored.get('name')!r}, but this version "
-            f"knows {', '.join(STORAGE_KINDS)}; register that storage, or use the version that "
-            "wrote it."
-        )
-    if isinstance(name := tree.get("contraction"), str) and name not in SPACES:
-        raise InputError(
-            f"{path} holds a field in the space {name!r}, but this version knows "
-            f"{', '.join(SPACES)}; register that space, or use the version that wrote it."
-        )
+    for part, known, what, thing in (
+        ("model", MODELS, "of the model", "model"),
+        ("field", STORAGE_KINDS, "that is stored as", "storage"),
+        ("contraction", SPACES, "in the space", "space"),
+    ):
+        value = tree.get(part)
+        name = value.get("name") if isinstance(value, dict) else value
+        if isinstance(name, str) and name not in known and name not in FORMER_NAMES:
+            raise InputError(
+                f"{path} holds a field {what} {name!r}, but this version knows {', '.join(known)}; "
+                f"register that {thing}, or use the version that wrote it."
+            )
     try:
         if isinstance(training := tree.get("training"), dict):
             tree["training"] = _with_plan(training)
