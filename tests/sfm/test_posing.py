@@ -78,6 +78,16 @@ def test_masks_are_where_colmap_looks_and_the_scene_names_them(
     assert view.mask is not None and np.array_equal(view.mask, white[..., 0] > 0)
 
 
+def test_masks_that_a_scene_cannot_name_are_named(
+    tmp_path: Path, photos: Path, colmap: Colmap
+) -> None:
+    for name in ("dynamic_mask_03.png", "dynamic_mask_05.png", "04.png.mask.png"):
+        Image.new("L", (8, 6), 255).save(photos / name)
+    (note,) = pose(photos, tmp_path / "scene").notes
+    assert "white is ignored are not used" in note and "2 (first: dynamic_mask_03.png)" in note
+    assert "name them as 00.png.mask.png" in note
+
+
 def test_photographs_of_one_name_may_share_a_mask(
     tmp_path: Path, photos: Path, colmap: Colmap
 ) -> None:

@@ -90,12 +90,7 @@ def read_photographs(
         list(pool.map(require_whole_image, paths))
     keys: dict[object, int] = {}
     photographs = []
-    if masks is None:
-        beside = map(mask_beside, paths)
-        found = [mask if mask is not None and mask.white_counts else None for mask in beside]
-    else:
-        found = masks_of_folder(masks, [path.name for path in paths])
-    for number, (path, mask) in enumerate(zip(paths, found, strict=True)):
+    for number, (path, mask) in enumerate(zip(paths, masks_of(paths, masks), strict=True)):
         size = image_size(path)
         key = {"auto": (size, read_exif(path, _camera)), "one": "one", "each": number}[lenses]
         photographs.append(
@@ -117,6 +112,20 @@ def read_photographs(
                 "size; use --lenses auto."
             )
     return photographs
+
+
+def masks_of(paths: Sequence[Path], masks: Path | None) -> list[Mask | None]:
+    """The masks of photographs, one for each or None, as ``read_photographs`` finds them.
+
+    Those in which white is ignored are left aside: a scene's file cannot say that of a mask.
+
+    Raises:
+        InputError: A folder of masks was named, and holds none of these photographs.
+    """
+    if masks is not None:
+        return masks_of_folder(masks, [path.name for path in paths])
+    beside = map(mask_beside, paths)
+    return [mask if mask is not None and mask.white_counts else None for mask in beside]
 
 
 def put_into(folder: Path, file: Path, name: str) -> None:
