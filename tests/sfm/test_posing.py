@@ -88,6 +88,15 @@ def test_masks_that_a_scene_cannot_name_are_named(
     assert "name them as 00.png.mask.png" in note
 
 
+def test_masks_that_do_not_fit_are_left_aside(tmp_path: Path, photos: Path, colmap: Colmap) -> None:
+    Image.new("L", (4, 3), 255).save(photos / "03.mask.png")
+    Image.new("L", (8, 6), 255).save(photos / "04.mask.png")
+    (note,) = pose(photos, tmp_path / "scene").notes
+    assert note.startswith("not used as masks: 1 images") and "(first: 03.mask.png)" in note
+    frames = json.loads((tmp_path / "scene" / "transforms.json").read_text())["frames"]
+    assert [frame["mask_path"] for frame in frames if "mask_path" in frame] == ["masks/04.mask.png"]
+
+
 def test_photographs_of_one_name_may_share_a_mask(
     tmp_path: Path, photos: Path, colmap: Colmap
 ) -> None:

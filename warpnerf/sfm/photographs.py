@@ -22,7 +22,7 @@ from warpnerf.scenes.images.images import (
     require_whole_image,
     says_equirectangular,
 )
-from warpnerf.scenes.images.masks import Mask, mask_beside, masks_of_folder
+from warpnerf.scenes.images.masks import Mask, fits, mask_beside, masks_of_folder
 from warpnerf.sfm.config import Lenses
 
 UPRIGHT = {
@@ -117,15 +117,23 @@ def read_photographs(
 def masks_of(paths: Sequence[Path], masks: Path | None) -> list[Mask | None]:
     """The masks of photographs, one for each or None, as ``read_photographs`` finds them.
 
-    Those in which white is ignored are left aside: a scene's file cannot say that of a mask.
+    Of those beside the photographs, some are left aside: in which white is ignored, as a scene's
+    file cannot say that of a mask, and those of other sizes.
 
     Raises:
         InputError: A folder of masks was named, and holds none of these photographs.
     """
     if masks is not None:
         return masks_of_folder(masks, [path.name for path in paths])
-    beside = map(mask_beside, paths)
-    return [mask if mask is not None and mask.white_counts else None for mask in beside]
+    return [mask if is_used(mask, path) else None for path in paths for mask in [mask_beside(path)]]
+
+
+def is_used(mask: Mask | None, path: Path) -> bool:
+    """Whether a mask that lies beside a photograph is used for its pose."""
+    if mask is None or not mask.white_counts:
+        return False
+    width, height = image_size(path)
+    return fits(mask, width=width, height=height)
 
 
 def put_into(folder: Path, file: Path, name: str) -> None:

@@ -311,12 +311,19 @@ def _notes(
             "convert them to JPEG"
         )
     beside = [] if is_video else [mask_beside(p.path) for p in photographs if p.mask is None]
-    inverse = [mask.path.name for mask in beside if mask is not None and not mask.white_counts]
+    left = [mask for mask in beside if mask is not None]
+    inverse = [mask.path.name for mask in left if not mask.white_counts]
     if inverse:
         yield (
             "masks in which white is ignored are not used for poses, nor put into the scene: "
             f"{len(inverse)} (first: {inverse[0]}); invert them, and name them as "
             f"{photographs[0].path.name}.mask.png"
+        )
+    unfit = [mask.path.name for mask in left if mask.white_counts]
+    if unfit and not any(p.mask is not None and not p.mask.found for p in photographs):
+        yield (
+            f"not used as masks: {len(unfit)} images of another size than the photographs whose "
+            f"masks they are by name (first: {unfit[0]})"
         )
     sizes = {p.size: p.path.name for p in reversed(photographs)}
     if len(sizes) > 1:

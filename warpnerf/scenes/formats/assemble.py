@@ -25,6 +25,7 @@ from warpnerf.scenes.images.images import exif_orientation, image_shape, read_im
 from warpnerf.scenes.images.masks import (
     PackedMask,
     all_of_blocks,
+    fits,
     mask_beside,
     masks_of_folder,
     read_mask,
@@ -95,7 +96,8 @@ def assemble(
         found = masks_of_folder(masks, [frame.name for frame in frames])
         frames = [replace(frame, mask=mask) for frame, mask in zip(frames, found, strict=True)]
     else:
-        frames = _with_masks_beside(frames)
+        frames, unfit = _with_masks_beside(frames, downscale)
+        warnings = [*warnings, *unfit]
 
     frames, points, offset = centred(frames, points)
     if offset is not None:
@@ -177,17 +179,27 @@ def _bounds(frames: Sequence[Frame], views: Sequence[View]) -> np.ndarray | None
     return np.array([given[view.name] for view in views])
 
 
-def _with_masks_beside(frames: Sequence[Frame]) -> list[Frame]:
-    """Frames with the masks that lie beside their photographs, where they have none."""
+def _with_masks_beside(frames: Sequence[Frame], downscale: int) -> tuple[list[Frame], list[str]]:
+    """Frames with the masks that lie beside their photographs, where they have none; warnings."""
     photographs = {frame.path for frame in frames}
-    found = []
+    found, unfit = [], []
     for frame in frames:
         mask = frame.mask
         if mask is None and frame.image is None:
             mask = mask_beside(frame.path)
             mask = None if mask is None or mask.path in photographs else mask
+        if mask is not None and mask.found:
+            height, width, _ = image_shape(frame.path)
+            if not fits(mask, width=width, height=height, downscale=downscale):
+                unfit.append(mask.path.name)
+                mask = None
         found.append(replace(frame, mask=mask))
-    return found
+    if not unfit:
+        return found, []
+    return found, [
+        f"not used as masks: {len(unfit)} images of another size than the photographs whose masks "
+        f"they are by name (first: {unfit[0]})"
+    ]
 
 
 def complete_splits(

@@ -268,6 +268,7 @@ def load_colmap(
         camera, reduced = cameras[image.camera], photographs.name != "images"
         lens = _lens(camera_file, image.camera, camera, path, reduced)
         mask = mask_in(folder / "masks", image.name)
+        mask = None if mask is None else replace(mask, found=True)
         pose = _pose(image, field)
         frames.append(Frame(name=image.name, path=path, c2w=pose, lens=lens, mask=mask))
     if not frames:
