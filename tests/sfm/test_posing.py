@@ -199,6 +199,17 @@ def test_few_photographs_and_mixed_sizes_are_noted(tmp_path: Path, colmap: Colma
     assert notes[2].startswith("only 6 photographs: ")
 
 
+def test_photographs_of_the_shape_of_panoramas_are_noted(tmp_path: Path, colmap: Colmap) -> None:
+    (tmp_path / "photos").mkdir()
+    for k in range(N):
+        Image.fromarray(picture(k, width=12, height=6)).save(tmp_path / "photos" / f"{k}.png")
+    (note,) = pose(tmp_path / "photos", tmp_path / "scene").notes
+    assert note.startswith("all photographs are exactly twice as wide as high: if they are pano")
+    Image.fromarray(picture(0, width=8, height=6)).save(tmp_path / "photos" / "0.png")
+    notes = pose(tmp_path / "photos", tmp_path / "scene", overwrite=True).notes
+    assert not any("twice" in note for note in notes)
+
+
 def test_a_photograph_that_colmap_cannot_read_is_named(
     tmp_path: Path, photos: Path, colmap: Colmap
 ) -> None:

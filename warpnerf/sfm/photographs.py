@@ -155,16 +155,13 @@ def put_into(folder: Path, file: Path, name: str) -> None:
 
 
 def _refuse_panoramas(paths: Sequence[Path]) -> None:
-    """Raise InputError where photographs show all directions, by their metadata or their shape."""
+    """Raise InputError where photographs show all directions, by their metadata."""
     said = [path for path in paths if says_equirectangular(path)]
-    alike = all(width == 2 * height for width, height in map(image_size, paths))
-    if said or alike:
-        how = "say so" if said else "are all exactly twice as wide as high"
+    if said:
         raise InputError(
-            f"{(said or paths)[0]}: looks like a panorama of 360 degrees, which has no lens that "
-            f"poses could be estimated for ({len(said or paths)} of {len(paths)} photographs "
-            f"{how}); cut each into pictures of 90 degrees first, or, where they are none, cut "
-            "off a row of pixels."
+            f"{said[0]}: is a panorama of 360 degrees, which has no lens that poses could be "
+            f"estimated for ({len(said)} of {len(paths)} photographs say so); cut each into "
+            "pictures of 90 degrees first, or leave them out: move them to another folder."
         )
 
 

@@ -329,6 +329,11 @@ def _notes(
     if len(sizes) > 1:
         shown = ", ".join(f"{name} {w}x{h}" for (w, h), name in sorted(sizes.items())[:2])
         yield f"photographs of {len(sizes)} sizes (first: {shown}), each with a lens of its own"
+    if not is_video and all(width == 2 * height for width, height in sizes):
+        yield (
+            "all photographs are exactly twice as wide as high: if they are panoramas of 360 "
+            "degrees, the poses are wrong; cut each into pictures of 90 degrees first"
+        )
     if matching == "sequential" and not is_video:
         yield (
             f"{len(photographs)} photographs are compared with their neighbours by name only; if "
