@@ -31,7 +31,7 @@ from warpnerf.scenes.formats.contents import (
     what_is_there,
 )
 from warpnerf.scenes.formats.transforms_text import PosedFile, transforms_text
-from warpnerf.scenes.images.masks import mask_beside, read_mask
+from warpnerf.scenes.images.masks import mask_beside, read_mask, unfit_masks
 from warpnerf.sfm import scene_files
 from warpnerf.sfm.config import Lenses, PoseConfig
 from warpnerf.sfm.frames import sharp_frames
@@ -320,11 +320,8 @@ def _notes(
             f"{photographs[0].path.name}.mask.png"
         )
     unfit = [mask.path.name for mask in left if mask.white_counts]
-    if unfit and not any(p.mask is not None and not p.mask.found for p in photographs):
-        yield (
-            f"not used as masks: {len(unfit)} images of another size than the photographs whose "
-            f"masks they are by name (first: {unfit[0]})"
-        )
+    if not any(p.mask is not None and not p.mask.found for p in photographs):
+        yield from unfit_masks(unfit)
     sizes = {p.size: p.path.name for p in reversed(photographs)}
     if len(sizes) > 1:
         shown = ", ".join(f"{name} {w}x{h}" for (w, h), name in sorted(sizes.items())[:2])

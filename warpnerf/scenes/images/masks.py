@@ -130,6 +130,16 @@ def fits(mask: Mask, *, width: int, height: int, downscale: int = 1) -> bool:
     return _times(columns, rows, width, height, downscale) is not None
 
 
+def unfit_masks(names: Sequence[str]) -> list[str]:
+    """A sentence on masks, if any, that were found but do not fit."""
+    if not names:
+        return []
+    return [
+        f"not used as masks: {len(names)} images of another size than the photographs whose masks "
+        f"they are by name (first: {names[0]})"
+    ]
+
+
 def _times(columns: int, rows: int, width: int, height: int, downscale: int) -> int | None:
     """How many times as large as its photograph a mask is; 0: as large as that is then reduced to;
     None: neither."""

@@ -8,8 +8,11 @@ What a scene is must not follow from these.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
+
+from warpnerf.scenes.images.images import image_shape, read_image
 
 FREE = 0.15
 """Share of transparent pixels from which on what is alike in all views may be an object, too."""
@@ -22,6 +25,10 @@ EDGE = 0.05
 """Share of a picture's sides that counts as their edge, and in both directions as a corner."""
 RECTANGLE = 0.98
 """Share of the pixels of the smallest box around a shape that the shape fills if it is one."""
+ROWS_LOOKED_AT = 128
+"""Rows and columns of a photograph, about, that are looked at."""
+NO_ALPHA = (1, 1)
+"""Shape that stands for that of a photograph without alpha."""
 OPAQUE = 128
 """Least alpha, of 255, of a pixel that shows something."""
 
@@ -77,6 +84,20 @@ def _has_a_ground(seen: np.ndarray) -> bool:
 def _edge(seen: np.ndarray) -> tuple[int, int]:
     rows, columns = seen.shape
     return max(1, round(EDGE * rows)), max(1, round(EDGE * columns))
+
+
+def outline(path: Path, image: np.ndarray | None = None) -> np.ndarray:
+    """Where a photograph shows nothing, [H, W] bool, reduced by leaving pixels out.
+
+    Args:
+        path: Its file.
+        image: Its pixels, [H, W, 3 or 4] uint8, where they are in memory anyway.
+    """
+    shape = image_shape(path) if image is None else image.shape
+    if shape[2] == 3:
+        return np.zeros(NO_ALPHA, dtype=bool)
+    every = max(1, min(shape[:2]) // ROWS_LOOKED_AT)
+    return shows_nothing((read_image(path) if image is None else image)[::every, ::every])
 
 
 def shows_nothing(image: np.ndarray) -> np.ndarray:
