@@ -105,7 +105,7 @@ def _size(model: Path) -> int | None:
 
 
 def _rank(model: Path) -> float:
-    """Larger models come first, and damaged ones before all: they are refused, not passed over."""
+    """Larger models come first, and damaged ones before all: they are refused, not skipped."""
     size = _size(model)
     return -math.inf if size is None else -size
 
