@@ -42,7 +42,7 @@ def digests(scene: wn.Scene, config: wn.TrainConfig) -> dict[str, str]:
         def keep(state: object) -> None:
             states[:] = [state]
 
-        wn.train(scene, config, on_checkpoint=keep)
+        wn.train(scene, config, on_checkpoint=keep, progress=False)
         wn.save_checkpoint(path, states[0])
         tensors = load_file(path)
     return {

@@ -50,7 +50,7 @@ def main() -> None:
                 config = plain_training(
                     model="rgb", steps=steps, scaling=scaling, device=args.device, seed=seed
                 )
-                field = wn.train(scene, config).field
+                field = wn.train(scene, config, progress=False).field
                 found.append(look(field, scene))
                 if steps == min(args.steps) and seed == args.seeds[0]:
                     view = scene.views[scene.splits["test"][4]]

@@ -141,7 +141,7 @@ def train(path: str, model: str, downscale: int, steps: int, time_limit: float) 
     watching.start()
     try:
         config = plain_training(model=model, steps=steps, time_limit=time_limit)
-        result = wn.train(scene, config)
+        result = wn.train(scene, config, progress=False)
     finally:
         done.set()
         watching.join()

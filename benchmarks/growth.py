@@ -81,7 +81,7 @@ def measure(scene: wn.Scene, config: wn.TrainConfig, shift: float, anew: bool) -
         grid=replace(config.grid, shift_at_growth=shift),
         optim=replace(config.optim, restart_at_growth=anew),
     )
-    result = wn.train(scene, config)
+    result = wn.train(scene, config, progress=False)
     found = wn.evaluate(result.field, scene).mean
     return {"psnr": found["psnr"], "ssim": found["ssim"], "seconds": result.progress.seconds}
 

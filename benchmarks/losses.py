@@ -70,7 +70,7 @@ def quality(
     """The field of the last seed, and figures of the test views for each."""
     figures = []
     for seed in range(seeds):
-        field = wn.train(scene, replace(config, seed=seed)).field
+        field = wn.train(scene, replace(config, seed=seed), progress=False).field
         figures.append(wn.evaluate(field, scene, split="test").mean)
     return field, figures
 

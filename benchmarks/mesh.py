@@ -123,7 +123,7 @@ def main() -> None:
     arguments = parser.parse_args()
     scene = wn.load_scene("builtin:room")
     config = plain_training(steps=arguments.steps, device=arguments.device)
-    result = wn.train(scene, config)
+    result = wn.train(scene, config, progress=False)
     field = result.field
     print(f"{arguments.steps} steps, voxel edge {field.lattice.voxel_size.mean():.4f} m")
     truth, visible = photographed(scene), wn.visibility(field, scene.training_cameras)

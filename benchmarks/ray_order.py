@@ -69,7 +69,7 @@ def main() -> None:
             steps=arguments.steps,
             time_limit=arguments.time_limit,
         )
-        field = wn.train(scene, config).field
+        field = wn.train(scene, config, progress=False).field
         rows[name] = {}
         for threads in arguments.threads:
             for steps in (1, 4, 16):

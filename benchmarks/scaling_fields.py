@@ -114,7 +114,7 @@ def trained(scene: wn.Scene, field: str, scaling: str, seed: int, args: Any) -> 
         device=args.device,
         grid=replace(config.grid, voxels=args.voxels),
     )
-    result = wn.train(scene, config)
+    result = wn.train(scene, config, progress=False)
     splits = {**scene.splits}
     for split in ("train", "test"):
         splits[split] = some(splits[split], LOOKED_AT)

@@ -1,5 +1,6 @@
 """The benchmarks that train run, and write complete records."""
 
+import ast
 import json
 import os
 import subprocess
@@ -184,3 +185,12 @@ def test_a_camera_that_was_moved_is_found_again():
     away = calibration.moved(camera.c2w, np.array([0.004, -0.003, 0.002, 0.01, 0.02, -0.01]))
     found = calibration.fitted_pose(field, replace(camera, c2w=away), truth, 3.0)
     assert np.abs(found - camera.c2w).max() < 0.1 * np.abs(away - camera.c2w).max()
+
+
+def test_what_is_printed_is_the_results_and_no_progress():
+    """Else a terminal shows a bar between the lines of a table, and a file does not."""
+    for script in sorted((ROOT / "benchmarks").glob("*.py")):
+        for node in ast.walk(ast.parse(script.read_text())):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) == "wn.train":
+                asked = {word.arg for word in node.keywords}
+                assert asked & {"progress", "on_progress"}, f"{script.name}:{node.lineno}"

@@ -61,7 +61,7 @@ def test_help_names_every_option() -> None:
     assert code == 0
     options = ["output", "steps", "time-limit", "scaling", "content-distance", "near", "downscale"]
     more = ["device", "threads", "seed", "preset", "voxels", "resume", "checkpoint-every"]
-    more += ["model", "model-options", "loss", "overwrite"]
+    more += ["model", "model-options", "loss", "overwrite", "eval-views"]
     for option in [*options, *more]:
         assert f"--{option}" in out
     code, out, _ = run("eval", "--help")
@@ -113,6 +113,7 @@ def test_fewer_views_are_looked_at(views: str, looked_at: int | None, tmp_path: 
     else:
         metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
         assert len(metrics["images"]) == looked_at
+        assert f"of {looked_at} views" in out
 
 
 def test_eval_repeats_the_figures(trained: tuple[Path, str], tmp_path: Path) -> None:
@@ -264,9 +265,10 @@ def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def begun(folder: Path, *signals: int) -> tuple[int, str, str]:
+def begun(folder: Path, *signals: int, resumed: bool = False) -> tuple[int, str, str]:
     """A training that is sent signals when it is under way: how it ended."""
-    process = start("train", *GROWING, "--output", folder)
+    words = ("--resume", folder) if resumed else (*GROWING, "--output", folder)
+    process = start("train", *words)
     try:
         assert process.stdout is not None
         for line in process.stdout:  # a progress report: training is under way
@@ -305,6 +307,9 @@ def test_stopped_and_resumed_a_run_ends_as_if_it_had_not_been(
     folder = tmp_path / "my run"
     _, out, _ = begun(folder, signal.SIGINT)
     assert load_checkpoint(Run(folder).checkpoints[0]).grown == 0
+    (folder / "metrics.json").write_text("{}")
+    begun(folder, signal.SIGINT, resumed=True)
+    assert not (folder / "metrics.json").exists()  # it was of another field
     command = shlex.split(out.strip().partition("continue with: ")[2])
     code, out, err = run(*command[1:])
     assert code == 0, err
@@ -449,6 +454,7 @@ def test_a_run_is_named_by_scene_and_time(tmp_path: Path) -> None:
     (folder,) = (tmp_path / "runs").iterdir()
     assert re.fullmatch(r"room-sparse-\d{4}-\d\d-\d\d-\d{6}", folder.name)
     assert f"wrote runs/{folder.name}: " in done.stdout
+    assert f"training into runs/{folder.name}\nreading" in done.stdout
 
 
 SPOIL = """

@@ -105,10 +105,23 @@ def test_a_grid_larger_than_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     require_memory(DENSE, Rgb(), (10, 10, 10), cpu)
     require_memory(DENSE, Deferred(specular=4), (5, 10, 10), cpu)
     for size, model in (((10, 10, 11), Rgb()), ((5, 10, 11), Deferred(specular=4))):
-        with pytest.raises(InputError, match=r"grid\.voxels: a grid of .* use fewer voxels"):
+        with pytest.raises(InputError, match=r"grid\.voxels: .* a grid of .* use fewer voxels"):
             require_memory(DENSE, model, size, cpu)
     with pytest.raises(InputError, match=r"grid\.voxels must give fewer than \d+ nodes"):
         require_memory(DENSE, Rgb(), (20000, 20000, 20000), cpu)
+
+
+@pytest.mark.parametrize(("besides", "larger"), [(3.0, "grid.voxels"), (7.0, "rays_per_step")])
+def test_what_fits_alone_may_be_too_large_together(
+    besides: float, larger: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gib = 2**30
+    monkeypatch.setattr("warpnerf.fields.storage.usable_memory", lambda: 8 * gib)
+    monkeypatch.setattr(type(DENSE), "training_bytes", lambda *_: 6 * gib)
+    each = max(6.0, besides)
+    says = rf"^{larger}: of the {6.0 + besides} GiB .* {each} GiB, but this machine has 8\.0 GiB"
+    with pytest.raises(InputError, match=says):
+        require_memory(DENSE, Rgb(), (9, 9, 9), wp.get_device("cpu"), int(besides * gib))
 
 
 def test_free_cells_of_a_grid(workers: Workers) -> None:

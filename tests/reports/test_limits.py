@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
-from warpnerf.reports.limits import what_limits
+from tests.support.tiny_trainings import ball
+from warpnerf.config import GridConfig
+from warpnerf.model.storage_kinds import Hash
+from warpnerf.presets import PRESETS
+from warpnerf.reports.limits import voxel_pixels, what_limits
+from warpnerf.scenes.extent.sharpness import sharpness
+from warpnerf.training.plan import resolve
 from warpnerf.training.state import Progress
 
 
@@ -51,6 +61,23 @@ def test_pixels_that_meet_nothing_count() -> None:
     assert reports(0.3, seen=0.1)[-1].picture_psnr == pytest.approx(30.0)
     limit = what_limits(reports(0.3, seen=0.1), 1.3, 26.2)
     assert limit is not None and limit.name == "photographs"
+
+
+def test_the_width_of_voxels_is_that_of_the_plan_in_the_box_that_there_is() -> None:
+    """Also where a run is resumed, whose scene does not tell what a short training found."""
+    config = replace(PRESETS["fast"], grid=GridConfig(voxels=8000))
+    plan = resolve(ball(), config)
+    space = plan.space
+    half = 0.5 * (space.box_max - space.box_min)
+    tight = replace(space, box_min=space.box_min + 0.5 * half, box_max=space.box_max - 0.5 * half)
+    for now, share in ((space, 1.0), (tight, 0.5)):
+        lattice = SimpleNamespace(space=now, size=(20, 20, 20))
+        trainer: Any = SimpleNamespace(config=config, plan=plan, lattice=lattice, scene=None)
+        width = voxel_pixels(trainer)
+        assert width == pytest.approx(share * plan.voxel_pixels.median)
+        assert width == pytest.approx(sharpness(ball(), now, 8000, True).median)
+    hashed: Any = SimpleNamespace(config=replace(config, field=Hash()))
+    assert voxel_pixels(hashed) is None
 
 
 def test_a_training_of_few_reports_says_nothing() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import warpnerf as wn
 from tests.support.tiny_trainings import ball
 from warpnerf.checks import InputError
 from warpnerf.cli.main import main
+from warpnerf.runs import files, listing
 from warpnerf.runs.config import describe
 from warpnerf.runs.listing import in_words, remove_checkpoints, runs_in, runs_table
 from warpnerf.runs.lock import only_writer
@@ -30,7 +32,7 @@ def made(folder: Path, config: wn.TrainConfig, *, fraction: float, psnr: float |
     if fraction == 1.0:
         (folder / "field.safetensors").write_bytes(bytes(1_000_000))
     if psnr is not None:
-        metrics = {"mean": {"psnr": psnr, "ssim": 0.9}}
+        metrics = {"mean": {"psnr": psnr, "ssim": 0.9}, "images": [{"name": "a"}, {"name": "b"}]}
         (folder / "metrics.json").write_text(json.dumps(metrics))
     return folder
 
@@ -45,15 +47,19 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_the_table(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_table(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert main(["runs", str(folder)]) == 0
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert lines == [
-        ["run", "scene", "steps", "done", "time", "PSNR", "SSIM", "disk", "configuration"],
-        ["a", "builtin:room", "70", "100%", "2:05", "31.42", "0.9000", "4", "MB", "fast"],
+        ["run", "scene", "steps", "done", "time", "views", "PSNR", "SSIM", "disk", "configuration"],
+        ["a", "builtin:room", "70", "100%", "2:05", "2", "31.42", "0.9000", "4", "MB", "fast"],
         ["deep/b", "builtin:room", "70", "25%", "2:05", "3", "MB", "fast", "seed=3"],
     ]
     assert runs_table(runs_in(folder / "a"), folder / "a").splitlines()[1].startswith("a ")
+    monkeypatch.chdir(folder / "a")
+    assert runs_table(runs_in(Path()), Path()).splitlines()[1].startswith("a ")
 
 
 @pytest.mark.parametrize("name", wn.PRESETS)
@@ -91,6 +97,82 @@ def test_a_run_that_is_trained_into_is_left_alone(folder: Path) -> None:
     with only_writer(run.folder), pytest.raises(InputError, match="is training into"):
         remove_checkpoints(run)
     assert len(list(run.folder.glob("checkpoint-*"))) == 1
+
+
+def test_clean_goes_on_past_a_run_that_is_trained_into(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made(folder / "z", wn.PRESETS["fast"], fraction=1.0, psnr=None)
+    with only_writer(folder / "a"):
+        assert main(["runs", str(folder), "--clean"]) == 0
+    out = capsys.readouterr().out
+    assert f"left alone: {folder / 'a'}: process" in out and "z: checkpoints of 3 MB" in out
+    assert len(list((folder / "a").glob("checkpoint-*"))) == 1
+
+
+def test_files_may_go_meanwhile(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A training that saves a checkpoint removes older ones."""
+    (run,) = runs_in(folder / "a")
+    (checkpoint,) = run.folder.glob("checkpoint-*")
+    gone = run.folder / "checkpoint-00000060.safetensors"
+    monkeypatch.setattr(files, "checkpoints", lambda place: [checkpoint, gone])
+    walked = [(str(run.folder), [], [path.name for path in (gone, checkpoint)])]
+    monkeypatch.setattr(listing.os, "walk", lambda place: walked)
+    assert runs_in(run.folder)[0].n_bytes == 3_000_000
+    assert remove_checkpoints(run) == 3_000_000
+
+
+def test_a_run_that_was_begun_anew_meanwhile_keeps_its_checkpoints(folder: Path) -> None:
+    (run,) = runs_in(folder / "a")
+    (run.folder / "field.safetensors").unlink()
+    assert remove_checkpoints(run) == 0
+    assert len(list(run.folder.glob("checkpoint-*"))) == 1
+
+
+def test_what_a_run_replaces_is_part_of_it(folder: Path) -> None:
+    made(folder / "a" / "previous", wn.PRESETS["fast"], fraction=1.0, psnr=None)
+    a, b = runs_in(folder)
+    assert (a.folder.name, b.folder.name) == ("a", "b") and a.n_bytes > 8_000_000
+    (previous,) = runs_in(folder / "a" / "previous")
+    with only_writer(folder / "a"), pytest.raises(InputError, match="is training into"):
+        remove_checkpoints(previous)
+
+
+def test_photographs_that_lie_elsewhere_take_no_room(folder: Path) -> None:
+    (folder / "photos").mkdir()
+    (folder / "photos" / "0.jpg").write_bytes(bytes(5_000_000))
+    (folder / "a" / "scene").mkdir()
+    before = runs_in(folder / "a")[0].n_bytes
+    os.link(folder / "photos" / "0.jpg", folder / "a" / "scene" / "0.jpg")
+    assert runs_in(folder / "a")[0].n_bytes == before
+    (folder / "photos" / "0.jpg").unlink()
+    assert runs_in(folder / "a")[0].n_bytes == before + 5_000_000
+
+
+def test_scenes_have_the_names_of_their_folders(folder: Path) -> None:
+    record = {"made_of": {"source": "/home/me/garden.v2"}, "written": []}
+    (folder / "a" / "scene").mkdir()
+    (folder / "a" / "scene" / "pose.json").write_text(json.dumps(record))
+    config = json.loads((folder / "a" / "config.json").read_text()) | {"scene": "scene"}
+    (folder / "a" / "config.json").write_text(json.dumps(config))
+    assert " garden.v2 " in runs_table(runs_in(folder), folder).splitlines()[1]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="names that others do not allow")
+def test_names_do_not_break_the_table(folder: Path) -> None:
+    (folder / "a").rename(folder / "a\nb")
+    assert '"a\\nb"' in runs_table(runs_in(folder), folder).splitlines()[1]
+
+
+def test_runs_whose_configuration_is_damaged_are_named(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "a" / "config.json").write_text("{")
+    assert main(["runs", str(folder)]) == 0
+    out = capsys.readouterr().out
+    assert "cannot be read: 1 runs" in out and "config.json: is not valid JSON" in out
+    assert main(["runs", str(folder / "a")]) == 2
+    assert "holds no run that can be read: " in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("place", ["none", "a/log.jsonl", "empty"])

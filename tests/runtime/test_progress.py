@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
+import rich.console
 
 from tests.support.tiny_trainings import ball, tiny_config
 from warpnerf.runtime import progress
@@ -46,6 +48,26 @@ def test_what_came_before_the_first_report_is_not_expected_again(lines_of: Lines
         " 50%  step 50",
         " 60%  step 60  40 s left",
     ]
+
+
+@pytest.mark.parametrize(
+    ("console", "widgets", "bar"),
+    [
+        ({"force_terminal": True}, False, True),
+        ({"force_terminal": True, "_environ": {"TERM": "dumb"}}, False, False),
+        ({"force_terminal": False}, True, False),
+        ({"force_jupyter": True}, True, True),
+        ({"force_jupyter": True}, False, False),
+    ],
+)
+def test_where_there_is_a_bar(
+    console: dict[str, Any], widgets: bool, bar: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = rich.console.Console(**{"_environ": {"TERM": "xterm"}} | console)
+    monkeypatch.setattr(rich.console, "Console", lambda: made)
+    spec = object() if widgets else None
+    monkeypatch.setattr(progress.importlib.util, "find_spec", lambda name: spec)
+    assert progress.has_bar() == bar
 
 
 @pytest.mark.parametrize(

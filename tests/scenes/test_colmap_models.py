@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
 
 from tests.scenes.test_colmap import scene_with_model, write_model
 from tests.support.tiny_scenes import write_transforms
+from warpnerf.checks import InputError
 from warpnerf.inspection.inspection import inspect
 from warpnerf.scenes.formats.load import load_scene
 
@@ -43,11 +45,41 @@ def test_a_model_that_is_named_is_read_and_a_larger_one_is_a_warning(tmp_path: P
     assert "the model sparse/0 of 4 images is read; sparse/1 has 9" in scene.warnings
 
 
-def test_a_damaged_model_is_not_the_largest(tmp_path: Path) -> None:
+def test_a_damaged_model_is_refused_and_not_replaced_by_a_fragment(tmp_path: Path) -> None:
     two_models(tmp_path, False)
     (tmp_path / "sparse" / "1" / "images.bin").write_bytes(b"no")
-    scene = load_scene(tmp_path)
-    assert "the model sparse/0 of 4 images is read; sparse/1 has 0" in scene.notes
+    with pytest.raises(InputError, match=r"sparse/1/images\.bin: .*another model .*sparse/0\.$"):
+        load_scene(tmp_path)
+    scene = load_scene(tmp_path / "sparse" / "0")
+    assert "the model sparse/0 of 4 images is read; sparse/1 is damaged" in scene.warnings
+
+
+def test_numbered_captures_are_not_models_of_one_scene(tmp_path: Path) -> None:
+    for number in (1, 2):
+        capture = tmp_path / str(number)
+        write_transforms(capture, 3 * number)
+        (capture / "transforms.json").unlink()
+        for file in write_model(capture, 3 * number).iterdir():
+            file.rename(capture / file.name)
+    scene = load_scene(tmp_path / "1")
+    assert (scene.name, len(scene.views)) == ("1", 3)
+    assert not [said for said in (*scene.notes, *scene.warnings) if "the model" in said]
+    with pytest.raises(InputError, match=r"2 of its folders hold one each \(first: 1\)"):
+        load_scene(tmp_path)
+    (tmp_path / "1" / "images").rename(tmp_path / "1" / "elsewhere")
+    with pytest.raises(InputError, match=r"put them into .*/1/images"):
+        load_scene(tmp_path / "1")
+
+
+def test_masks_and_thumbnails_below_the_photographs_are_none(tmp_path: Path) -> None:
+    scene_with_model(tmp_path)
+    for name in ("masks", "thumbs"):
+        shutil.copytree(tmp_path / "images", tmp_path / "images" / name, ignore=ignore_folders)
+    assert not any("not in the model" in said for said in load_scene(tmp_path).warnings)
+
+
+def ignore_folders(folder: str, names: list[str]) -> list[str]:
+    return [name for name in names if (Path(folder) / name).is_dir()]
 
 
 def test_one_model_of_all_photographs_needs_no_word(tmp_path: Path) -> None:

@@ -11,10 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.scenes.test_colmap import scene_with_model
 from tests.support.tiny_scenes import DATA, needs_capture
 from warpnerf.checks import InputError
 from warpnerf.scenes.formats.colmap_files import images_of_bytes
 from warpnerf.scenes.formats.colmap_points import read_points
+from warpnerf.scenes.formats.load import load_scene
 
 NAMES = {1: "a.jpg", 5: "sub/b.jpg", 9: "unseen.jpg"}
 POINTS = [  # position, and the images of its track
@@ -192,3 +194,12 @@ def test_a_damaged_ply_is_named(tmp_path: Path) -> None:
     (tmp_path / "points3D.ply").write_text("no")
     with pytest.raises(InputError, match=r"points3D.ply: is no PLY file"):
         read_points(tmp_path, NAMES, tmp_path)
+
+
+def test_a_ply_that_cannot_be_read_does_not_stop_the_capture(tmp_path: Path) -> None:
+    scene_with_model(tmp_path)
+    (tmp_path / "points3D.ply").write_text("no")
+    scene = load_scene(tmp_path)
+    assert scene.points is None
+    (warning,) = scene.warnings
+    assert warning.startswith("no points: ") and "points3D.ply: is no PLY file" in warning

@@ -79,8 +79,6 @@ def test_images_without_keypoints_are_all_of_the_scene_and_named(tmp_path: Path)
 @pytest.mark.parametrize(
     "line",
     [
-        "1.5 2.5",  # keypoints cut short
-        "1.5 2.5 -1 3.0",
         "1.5 x -1",
         POSES[2].rpartition(" ")[0],  # a pose without a name is no three keypoints
         POSES[1].replace("001.png", "001"),  # may be keypoints, cut short
@@ -96,3 +94,15 @@ def test_what_is_neither_keypoints_nor_an_image_is_refused(tmp_path: Path, line:
 def test_keypoints_may_be_written_as_other_programs_do(tmp_path: Path) -> None:
     for keypoints in ("1 2 -1", "1e2\t-2.5 -1.0", "nan inf 3", " ".join([KEYPOINTS] * 1000)):
         assert read(tmp_path, "".join(f"{pose}\n{keypoints}\n" for pose in POSES)) == NAMES
+
+
+@pytest.mark.parametrize(
+    "line", ["0 0", "0", "1.5 2.5 -1 3.0", "-nan(ind) 2 -1", "-1.#IND 1 -1", "1 2 0.5"]
+)
+def test_other_numbers_stand_for_keypoints_with_a_warning(tmp_path: Path, line: str) -> None:
+    file = scene_with_model(tmp_path, text=True) / "images.txt"
+    file.write_text("".join(f"{pose}\n{line}\n" for pose in POSES))
+    scene = load_scene(tmp_path)
+    assert [view.name for view in scene.views] == NAMES
+    (warning,) = scene.warnings
+    assert "images.txt: the keypoints of 4 of 4 images are no X Y POINT3D_ID" in warning

@@ -52,6 +52,15 @@ def test_reduced_photographs_have_a_reduced_lens(tmp_path: Path) -> None:
     assert (camera.fx, camera.fy) == pytest.approx((5.0, 5.0))
 
 
+def test_masks_beside_photographs_are_no_photographs(tmp_path: Path) -> None:
+    write_llff(tmp_path)
+    Image.fromarray(255 * np.eye(6, 8, dtype=np.uint8)).save(tmp_path / "images" / "000.mask.png")
+    scene = load_scene(tmp_path)
+    assert len(scene.views) == 4
+    (mask,) = [view.mask for view in scene.views if view.mask is not None]
+    assert np.array_equal(mask, np.eye(6, 8, dtype=bool))
+
+
 def test_what_is_wrong_is_named(tmp_path: Path) -> None:
     file = write_llff(tmp_path)
     rows = rows_of(4)

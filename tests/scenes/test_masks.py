@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 import warpnerf as wn
-from tests.scenes.test_colmap import scene_with_model
+from tests.scenes.test_colmap import scene_with_model, write_model
 from tests.support.cli_process import assert_refused, assert_trained, command, make_scene, train
 from tests.support.small_model import SQUARED
 from tests.support.tiny_scenes import (
@@ -171,6 +171,26 @@ def test_masks_that_lie_beside_photographs_are_used(
     save_mask(tmp_path / "given" / "003.png")
     given = masks_of(load_scene(tmp_path, masks=tmp_path / "given"))
     assert given[photograph] is None
+
+
+@pytest.mark.parametrize("place", ["images/001_mask.png", "masks/001.png"])
+def test_what_only_has_a_masks_name_and_does_not_fit_is_left_aside(
+    tmp_path: Path, place: str
+) -> None:
+    write_transforms(tmp_path)
+    if place.startswith("masks"):
+        (tmp_path / "transforms.json").unlink()
+        write_model(tmp_path)
+        (tmp_path / "masks").mkdir()
+    Image.new("L", (4, 3), 255).save(tmp_path / place)
+    scene = load_scene(tmp_path)
+    assert set(masks_of(scene).values()) == {None}
+    (warning,) = scene.warnings
+    assert warning.startswith("not used as masks: 1 images of another size")
+    assert warning.endswith(f"(first: {Path(place).name})")
+    assert not load_scene(tmp_path, downscale=2).warnings  # it is as large as photographs then are
+    (tmp_path / place).write_text("no image")
+    assert load_scene(tmp_path).warnings == (warning,)
 
 
 def test_a_photograph_may_be_called_a_mask(tmp_path: Path) -> None:

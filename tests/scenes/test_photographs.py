@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,8 +20,10 @@ from warpnerf.checks import InputError
 from warpnerf.cli.main import main
 from warpnerf.config import GridConfig, TrainConfig
 from warpnerf.evaluation.evaluate import evaluate
+from warpnerf.scenes.formats import assemble
 from warpnerf.scenes.formats.load import load_scene
-from warpnerf.scenes.images import photographs
+from warpnerf.scenes.images import photographs, transparency
+from warpnerf.scenes.images.images import read_image
 from warpnerf.scenes.images.photographs import Keeping
 from warpnerf.scenes.images.pixel_file import PixelFile, expect_random_reads
 from warpnerf.scenes.scene import Scene
@@ -127,6 +130,35 @@ def test_memory_decides(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     )
     with pytest.raises(InputError, match=r"are free in .*; make room there, or use --downscale 3"):
         load_scene(tmp_path)
+
+
+@pytest.mark.parametrize(("downscale", "alpha"), [(1, 255), (2, 0)])
+def test_photographs_whose_alpha_is_ignored_are_decoded_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, downscale: int, alpha: int
+) -> None:
+    write_transforms(tmp_path, 40)
+    for k in range(40):
+        rgba = np.dstack([picture(k), np.full((6, 8), 255, np.uint8)])
+        rgba[0, 0, 3] = alpha
+        Image.fromarray(rgba).save(tmp_path / f"images/{k:03d}.png")
+    decoded: Counter[str] = Counter()
+
+    def counted(path: Path) -> np.ndarray:
+        decoded[path.name] += 1
+        return read_image(path)
+
+    for module in (photographs, assemble, transparency):
+        monkeypatch.setattr(module, "read_image", counted)
+    scenes = in_places(tmp_path, downscale=downscale)
+    assert {scene_digest(scene) for scene in scenes} == {scene_digest(scenes[0])}
+    decoded.clear()
+    load_scene(tmp_path, downscale=downscale)
+    looked_at = assemble.LOOKED_AT
+    assert min(decoded.values()) == 1 and sum(decoded.values()) <= 40 + looked_at
+    monkeypatch.setattr(photographs, "available_memory", lambda: 40 * 8 * 6)
+    decoded.clear()
+    assert any("on disk" in note for note in load_scene(tmp_path).notes)
+    assert min(decoded.values()) == 2
 
 
 def test_a_disk_that_is_full_later_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -26,7 +27,8 @@ def test_the_lists_are_the_split(tmp_path: Path) -> None:
     scene = load_scene(tmp_path)
     assert names_of(scene) == {"train": ["000.png", "002.png"], "test": ["003.png"]}
     notes = " ".join(scene.notes)
-    assert "training and test photographs are those of train_list.txt, test_list.txt" in notes
+    assert "training photographs are those of train_list.txt, test photographs are" in notes
+    assert "test photographs are those of test_list.txt" in notes
     assert "in no split and not used: 1 of 4 images (first: 001.png)" in notes
 
 
@@ -37,6 +39,51 @@ def test_what_is_not_for_testing_is_for_training(tmp_path: Path) -> None:
         "train": ["000.png", "002.png", "003.png"],
         "test": ["001.png"],
     }
+
+
+def test_what_is_not_for_training_is_for_testing(tmp_path: Path) -> None:
+    scene_with_model(tmp_path)
+    (tmp_path / "train_list.txt").write_bytes(b"\xef\xbb\xbf" + b"images\\000.png\n./002.png\n")
+    scene = load_scene(tmp_path)
+    assert names_of(scene) == {"train": ["000.png", "002.png"], "test": ["001.png", "003.png"]}
+    assert "training photographs are those of train_list.txt, all others are for testing" in (
+        scene.notes
+    )
+    assert not any("no test split" in note or "not used" in note for note in scene.notes)
+    (tmp_path / "train_list.txt").write_text("\n".join(f"{k:03}.png" for k in range(4)))
+    assert names_of(load_scene(tmp_path))["test"] == ["000.png"]
+
+
+def test_notes_say_what_a_list_is_used_for(tmp_path: Path) -> None:
+    scene_with_model(tmp_path)
+    (tmp_path / "validation_list.txt").write_text("001.png\n")
+    (tmp_path / "test_list.txt").write_text("\n \n")
+    scene = load_scene(tmp_path)
+    assert "validation photographs are those of validation_list.txt" in scene.notes
+    assert scene.warnings == ("test_list.txt: is empty, and not used",)
+    assert names_of(scene) == {"train": ["002.png", "003.png"], "test": ["000.png"]} | {
+        "val": ["001.png"]
+    }
+
+
+def test_photographs_that_are_in_the_model_but_not_there(tmp_path: Path) -> None:
+    scene_with_model(tmp_path)
+    (tmp_path / "images" / "003.png").unlink()
+    (tmp_path / "test_list.txt").write_text("003.png\n001.png\n")
+    scene = load_scene(tmp_path)
+    assert names_of(scene)["test"] == ["001.png"]
+    assert not any("not in the model" in said for said in scene.warnings)
+    (tmp_path / "test_list.txt").write_text("003.png\n")
+    with pytest.raises(InputError, match=r"none of the model's photographs .* \(first: 003\.png\)"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names")
+def test_a_pipe_is_refused(tmp_path: Path) -> None:
+    scene_with_model(tmp_path)
+    os.mkfifo(tmp_path / "train_list.txt")
+    with pytest.raises(InputError, match=r"train_list\.txt: is a pipe"):
+        load_scene(tmp_path)
 
 
 def test_photographs_that_are_not_in_the_model_are_said(tmp_path: Path) -> None:

@@ -31,6 +31,23 @@ def around(seed: int, share: float) -> np.ndarray:
     return (V - at[0] * H) ** 2 + (U - at[1] * W) ** 2 > radius**2
 
 
+def circle(ratio: float = 1.0) -> np.ndarray:
+    """Around the picture of a fisheye lens, as wide as so large a share of the picture is high."""
+    return np.hypot(V - (H - 1) / 2, U - (W - 1) / 2) > ratio * H / 2
+
+
+def below_the_sky(seed: int, share: float) -> np.ndarray:
+    """A sky that was cut out above a skyline, which differs from view to view."""
+    phase = np.random.default_rng(seed).uniform(0.0, 6.0)
+    return H * share * (1.0 + 0.5 * np.sin(U / 9.0 + phase)) > V
+
+
+def between(seed: int, share: float) -> np.ndarray:
+    """An object that fills the picture's height, with nothing at both sides: about so much."""
+    waist = 4.0 * np.sin(V / H * np.pi + seed)
+    return abs(U - (W - 1) / 2) > W / 2 * (1.0 - share) + waist
+
+
 NOTHING = np.zeros((H, W), dtype=bool)
 ONE = NOTHING.copy()
 ONE[0, 0] = True
@@ -47,6 +64,18 @@ ONE[0, 0] = True
         pytest.param([around(k, 0.6) for k in range(9)], True, id="an object"),
         pytest.param([around(0, 0.6)] * 9, True, id="an object that looks alike from all sides"),
         pytest.param([around(k, 0.3) for k in range(9)], True, id="an object, close"),
+        pytest.param([border(0.3)] * 9, False, id="undistorted, very wide"),
+        pytest.param([circle()] * 9, False, id="fisheye"),
+        pytest.param([circle(0.97), circle(0.97)[:, 10:70]] * 5, False, id="fisheye, two sizes"),
+        pytest.param([circle(1.0)[:, 5:75]] * 9, False, id="fisheye, cut"),
+        pytest.param([abs(U - 40) > 9] * 9, True, id="a bar before nothing"),
+        pytest.param([below_the_sky(k, 0.3) for k in range(9)], False, id="no sky"),
+        pytest.param([below_the_sky(k, 0.1) for k in range(9)], False, id="little sky"),
+        pytest.param([below_the_sky(k, 0.2)[::-1] for k in range(9)], False, id="no floor"),
+        *(
+            pytest.param([between(k, share) for k in range(9)], True, id=f"object, {share:.1%}")
+            for share in (0.125, 0.165, 0.17)
+        ),
         pytest.param([around(k, 0.6) for k in range(4)] + [NOTHING] * 5, False, id="in a few"),
         pytest.param(
             [border(0.05), border(0.05)[:50, :70], border(0.05)] * 3, False, id="two sizes"

@@ -192,6 +192,22 @@ def test_the_same_masks_named_from_elsewhere_are_the_same(
     assert is_made_of(Path("scene"), Path("photos"), PoseConfig(masks=Path("masks")))
 
 
+def test_masks_that_come_or_change_later_are_another_scene(
+    tmp_path: Path, photos: Path, colmap: Colmap
+) -> None:
+    scene, masks = tmp_path / "scene", tmp_path / "masks"
+    masks.mkdir()
+    for folder, config in ((photos, PoseConfig()), (masks, PoseConfig(masks=masks))):
+        for name, size in (("03.png.mask.png", 8), ("03.png.mask.png", 16), ("04.png", 8)):
+            name = name if folder == photos else name.replace(".png.mask.png", ".png")
+            if folder == photos and name == "04.png":
+                continue  # a photograph's own
+            Image.new("L", (size, size * 3 // 4), 255).save(folder / name)
+            assert not is_made_of(scene, photos, config)
+            pose(photos, scene, config, overwrite=True)
+            assert is_made_of(scene, photos, config)
+
+
 def test_half_a_scene_is_made_again(tmp_path: Path, photos: Path, colmap: Colmap) -> None:
     pose(photos, tmp_path / "scene")
     assert is_made_of(tmp_path / "scene", photos, PoseConfig())

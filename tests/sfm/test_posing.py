@@ -78,6 +78,25 @@ def test_masks_are_where_colmap_looks_and_the_scene_names_them(
     assert view.mask is not None and np.array_equal(view.mask, white[..., 0] > 0)
 
 
+def test_masks_that_a_scene_cannot_name_are_named(
+    tmp_path: Path, photos: Path, colmap: Colmap
+) -> None:
+    for name in ("dynamic_mask_03.png", "dynamic_mask_05.png", "04.png.mask.png"):
+        Image.new("L", (8, 6), 255).save(photos / name)
+    (note,) = pose(photos, tmp_path / "scene").notes
+    assert "white is ignored are not used" in note and "2 (first: dynamic_mask_03.png)" in note
+    assert "name them as 00.png.mask.png" in note
+
+
+def test_masks_that_do_not_fit_are_left_aside(tmp_path: Path, photos: Path, colmap: Colmap) -> None:
+    Image.new("L", (4, 3), 255).save(photos / "03.mask.png")
+    Image.new("L", (8, 6), 255).save(photos / "04.mask.png")
+    (note,) = pose(photos, tmp_path / "scene").notes
+    assert note.startswith("not used as masks: 1 images") and "(first: 03.mask.png)" in note
+    frames = json.loads((tmp_path / "scene" / "transforms.json").read_text())["frames"]
+    assert [frame["mask_path"] for frame in frames if "mask_path" in frame] == ["masks/04.mask.png"]
+
+
 def test_photographs_of_one_name_may_share_a_mask(
     tmp_path: Path, photos: Path, colmap: Colmap
 ) -> None:
@@ -178,6 +197,17 @@ def test_few_photographs_and_mixed_sizes_are_noted(tmp_path: Path, colmap: Colma
     assert notes[0].startswith("left out 1 files whose format is not read (first: phone.heic)")
     assert notes[1].startswith("photographs of 2 sizes (first: tall.png 6x8, 00.png 8x6)")
     assert notes[2].startswith("only 6 photographs: ")
+
+
+def test_photographs_of_the_shape_of_panoramas_are_noted(tmp_path: Path, colmap: Colmap) -> None:
+    (tmp_path / "photos").mkdir()
+    for k in range(N):
+        Image.fromarray(picture(k, width=12, height=6)).save(tmp_path / "photos" / f"{k}.png")
+    (note,) = pose(tmp_path / "photos", tmp_path / "scene").notes
+    assert note.startswith("all photographs are exactly twice as wide as high: if they are pano")
+    Image.fromarray(picture(0, width=8, height=6)).save(tmp_path / "photos" / "0.png")
+    notes = pose(tmp_path / "photos", tmp_path / "scene", overwrite=True).notes
+    assert not any("twice" in note for note in notes)
 
 
 def test_a_photograph_that_colmap_cannot_read_is_named(

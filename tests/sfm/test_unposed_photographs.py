@@ -159,10 +159,11 @@ def test_panoramas_are_refused_with_a_way_out(tmp_path: Path) -> None:
     for number, width in enumerate((60, 60, 60, 70)):
         Image.new("RGB", (width, 30)).save(tmp_path / f"{number}.jpg")
     paths = photographs_in(tmp_path)
-    with pytest.raises(InputError, match=r"0\.jpg: looks like a panorama .*3 of 3 .* as wide as"):
-        read_photographs(paths[:3], lenses="auto", masks=None)
+    assert len(read_photographs(paths[:3], lenses="auto", masks=None)) == 3  # by phones, 18:9
     assert len(read_photographs(paths, lenses="auto", masks=None)) == 4
     gpano(tmp_path / "4.jpg", 61)
     gpano(tmp_path / "5.webp", 61)
-    with pytest.raises(InputError, match=r"4\.jpg: looks .*2 of 6 photographs say so.* 90 deg"):
+    with pytest.raises(
+        InputError, match=r"4\.jpg: is .*2 of 6 photographs say so.* 90 deg.* leave"
+    ):
         read_photographs(photographs_in(tmp_path), lenses="auto", masks=None)

@@ -15,6 +15,7 @@ from tests.support.compiling import launch_unoptimised
 from tests.support.small_model import SMALL
 from warpnerf.checks import InputError
 from warpnerf.runtime.parallel import Workers
+from warpnerf.training import train as training
 from warpnerf.verification import verify as checks
 from warpnerf.verification.gradient_check import ProblemKernels
 from warpnerf.verification.gradient_errors import relative_error
@@ -171,19 +172,22 @@ def test_each_can_fail(
 
 
 def test_training_that_differs_fails(
-    monkeypatch: pytest.MonkeyPatch, device: str, on_cpu: None
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], device: str, on_cpu: None
 ) -> None:
+    """And that none shows a progress bar, which would stand between the checks."""
+    monkeypatch.setattr(training, "has_bar", lambda: True)
     some = {name: checks.TRAININGS[name] for name in ("training", "training with field vm")}
     monkeypatch.setattr(checks, "TRAININGS", some)
     train = checks.train
     count = iter(range(100))
 
-    def drifting(scene: Any, config: Any) -> Any:
-        return train(scene, replace(config, steps=config.steps + next(count)))
+    def drifting(scene: Any, config: Any, **rest: Any) -> Any:
+        return train(scene, replace(config, steps=config.steps + next(count)), **rest)
 
     assert failing(device, "twice from one seed") == set()
     monkeypatch.setattr(checks, "train", drifting)
     assert len(failing(device, "twice from one seed")) == 2
+    assert not capsys.readouterr().out
 
 
 def test_a_check_that_cannot_run_fails_and_says_why(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -19,6 +18,7 @@ from warpnerf.cli.view import training_page
 from warpnerf.config import TrainConfig
 from warpnerf.presets import PRESETS
 from warpnerf.runs import lock
+from warpnerf.runs.names import new_folder
 from warpnerf.runtime.memory import require_threads
 from warpnerf.runtime.progress import ProgressBar
 from warpnerf.runtime.signals import Stopped, StopRequest
@@ -61,15 +61,11 @@ def train_command(options: TrainOptions, given: Annotated[Given, USUAL] = NOTHIN
         from warpnerf.rendering.losses import parts_with
 
         parts_with(config.model, "float32", config.loss)
-    output = options.output or _named_by(options.scene)
-    return _begin(options.scene, output, options, config)
-
-
-def _named_by(source: str) -> Path:
-    """A folder for a run of a scene, named by it and by the time."""
-    builtin = source.startswith("builtin:")
-    name = source.removeprefix("builtin:") if builtin else Path(source).resolve().stem
-    return Path("runs", f"{name or 'scene'}-{time.strftime('%Y-%m-%d-%H%M%S')}")
+    if options.output is not None:
+        return _begin(options.scene, options.output, options, config)
+    with new_folder(options.scene) as output:
+        print(f"training into {output}", flush=True)
+        return _begin(options.scene, output, options, config)
 
 
 def _starting_point(options: TrainOptions) -> tuple[TrainConfig, TrainOptions]:
@@ -295,6 +291,8 @@ def _train(
     held_out = None if options.eval_every is None else HeldOut(trainer, options.eval_every)
     log = None if options.log is None else run.open_log(options.log)
     reports: list[Progress] = []
+    if trainer.fraction < 1.0:
+        run.discard_figures()
 
     def between() -> None:
         if session is not None:
@@ -394,7 +392,7 @@ def _evaluate(
         return stopped.exit_code
     print(
         f"wrote {run.folder}: field.safetensors, metrics.json, log.jsonl, config.json, and test/ "
-        f"with truth, rendering and depth of every view\nlook at {run.sheet}",
+        f"with truth, rendering and depth of {len(result.images)} views\nlook at {run.sheet}",
     )
     return 0
 

@@ -104,6 +104,7 @@ USUAL = Usual(
         "downscale",
         "masks",
         "split",
+        "eval_views",
         "model",
         "resume",
         "keep",

@@ -381,14 +381,15 @@ def require_memory(
     where = device if device.is_cuda else "this machine"
     if total is None or own + besides <= total:
         return
+    both = f"of the {(own + besides) / 2**30:.1f} GiB that training needs"
     there_is = f"but {where} has {total / 2**30:.1f} GiB"
     if besides > own:
         raise InputError(
-            f"rays_per_step: the rays of an update, and what the sampler keeps, need "
-            f"{besides / 2**30:.1f} GiB to train, {there_is}; use fewer, fewer steps an update "
+            f"rays_per_step: {both}, the rays of an update, and what the sampler keeps, are "
+            f"{besides / 2**30:.1f} GiB, {there_is}; use fewer, fewer steps an update "
             "(optim.accumulate_at), or fewer voxels of the sampler."
         )
     raise InputError(
-        f"grid.voxels: {kind.in_words(model, size)} needs {own / 2**30:.1f} GiB to train, "
+        f"grid.voxels: {both}, {kind.in_words(model, size)} is {own / 2**30:.1f} GiB, "
         f"{there_is}; use fewer voxels, or a model with fewer features."
     )

@@ -30,6 +30,8 @@ NOTABLE = 0.15
 """Of that, from where on it is, if it is as far off along both sides."""
 ALIKE = 0.02
 """Of that, by which such shares may differ."""
+LEAST = 0.05
+"""Share of a picture's sides: a principal point that is nearer to the corner is in other units."""
 SHORT = 0.15
 """Focal length as a share of the image's width: 147 degrees, which no lens but a fisheye sees."""
 
@@ -179,9 +181,10 @@ def _odd_lenses(scene: Scene) -> list[str]:
         size = np.array([camera.width, camera.height])
         shares = np.array([camera.cx, camera.cy]) / size
         off = np.abs(shares - 0.5).max()
+        is_in_pixels = shares.min() > LEAST and min(camera.cx, camera.cy) > 1.0  # else shares
         if off > ASIDE and np.abs(shares - 0.5 * size[::-1] / size).max() < ALIKE:
             turned.append(view.name)
-        elif off > NOTABLE and np.ptp(shares) < ALIKE:
+        elif off > NOTABLE and np.ptp(shares) < ALIKE and is_in_pixels:
             other_size.append((view.name, 2.0 * float(shares.mean())))
         elif off > OFF_CENTRE:
             aside.append(view.name)

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from warpnerf.scenes.extent.sharpness import sharpness
 from warpnerf.scenes.extent.space_plan import BLUR_POWER
 from warpnerf.training.state import Progress
 
@@ -54,8 +53,11 @@ def voxel_pixels(trainer: Trainer) -> float | None:
     """
     if not trainer.config.field.as_fine_as_nodes:
         return None
-    lattice = trainer.lattice
-    return sharpness(trainer.scene, lattice.space, math.prod(lattice.size), True).median
+    plan, lattice = trainer.plan, trainer.lattice
+    # As planned, with what cameras were found to see, which a scene that is read again does not
+    # tell. A tighter box, and numbers of nodes that are whole, make voxels smaller or larger.
+    edge = lattice.space.voxel_edge(math.prod(lattice.size))
+    return plan.voxel_pixels.median * edge / plan.space.voxel_edge(plan.config.grid.voxels)
 
 
 def what_limits(

@@ -174,6 +174,12 @@ def take_scene(folder: Path, source: str) -> None:
         waiting.parent.rmdir()
 
 
+def discard_figures(folder: Path) -> None:
+    """Remove metrics and pictures of test views, which are of another field than that to come."""
+    for name in ("metrics.json", SHEET, *(f"test/{name}" for name in _pictures(folder))):
+        (folder / name).unlink(missing_ok=True)
+
+
 def _by_products(folder: Path) -> list[Path]:
     """What else a run writes, but its configuration."""
     names = ("log.jsonl", CSV, CURVES, "metrics.json", SHEET, VISIBILITY)

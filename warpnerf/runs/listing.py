@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -17,7 +18,10 @@ from warpnerf.config_json import config_to_json
 from warpnerf.presets import PRESETS
 from warpnerf.runs import files, lock
 from warpnerf.runs.config import RunConfig
+from warpnerf.runs.names import scene_name
 from warpnerf.runtime.terminal import table_text
+from warpnerf.scenes.files import exists, printable
+from warpnerf.sfm.scene_files import IN_RUN, read_record
 
 DEPTH = 3
 """Folders within folders in which runs are looked for."""
@@ -39,6 +43,7 @@ class Metrics(msgspec.Struct, frozen=True):
     """metrics.json, as far as it is listed."""
 
     mean: dict[str, float] = {}
+    images: list[msgspec.Raw] = []
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +62,8 @@ class RunSummary:
     """Of training."""
     metrics: Mapping[str, float]
     """Means over the test views, by name; empty: they were not looked at."""
+    n_views: int
+    """Over how many views; 0: none, or it is not known."""
     n_bytes: int
     """Of all its files."""
 
@@ -78,15 +85,49 @@ def runs_in(folder: Path) -> list[RunSummary]:
     if not folder.is_dir():
         raise InputError(f"{folder} is no folder; name one that holds runs.")
     found = []
-    for depth in range(DEPTH):
-        for path in sorted(folder.glob("*/" * depth + "config.json")):
-            try:
-                found.append(_summary(path.parent))
-            except InputError:
-                continue  # of another program
+    for place in _candidates(folder):
+        with suppress(InputError):  # of another program, or damaged
+            found.append(_summary(place))
     if not found:
+        damaged = damaged_in(folder)
+        if damaged:
+            why = next(iter(damaged.values()))
+            raise InputError(f"{folder} holds no run that can be read: {why}")
         raise InputError(f"{folder} holds no run; name a folder that holds runs.")
     return sorted(found, key=lambda run: run.folder)
+
+
+def damaged_in(folder: Path) -> dict[Path, str]:
+    """Folders that hold what a run has saved, but whose config.json cannot be read, and why.
+
+    Args:
+        folder: As of ``runs_in``.
+    """
+    found = {}
+    for place in _candidates(folder):
+        try:
+            files.read_config(place)
+        except InputError as error:
+            if files.results(place):
+                found[place] = str(error)
+    return found
+
+
+def _candidates(folder: Path) -> list[Path]:
+    """Folders that have a config.json, but for runs that wait in another one's previous/."""
+    places = [
+        path.parent
+        for depth in range(DEPTH)
+        for path in sorted(folder.glob("*/" * depth + "config.json"))
+    ]
+    return [place for place in places if place == folder or _around(place) is None]
+
+
+def _around(folder: Path) -> Path | None:
+    """The run in whose previous/ a run lies; None where it lies in none."""
+    folder = folder.resolve()
+    waits = folder.name == files.PREVIOUS and exists(folder.parent / "config.json")
+    return folder.parent if waits else None
 
 
 def in_words(config: TrainConfig) -> str:
@@ -118,30 +159,36 @@ def remove_checkpoints(run: RunSummary) -> int:
     if not run.is_finished:
         return 0
     n_bytes = 0
-    with lock.only_writer(run.folder):
-        kept = run.folder / files.VISIBILITY
-        for path in [*files.checkpoints(run.folder), *([kept] if kept.exists() else [])]:
-            n_bytes += path.stat().st_size
-            path.unlink()
+    with lock.only_writer(_around(run.folder) or run.folder):
+        if not _summary(run.folder).is_finished:  # another one has begun there meanwhile
+            return 0
+        for path in [*files.checkpoints(run.folder), run.folder / files.VISIBILITY]:
+            with suppress(FileNotFoundError):
+                size = path.stat().st_size
+                path.unlink()
+                n_bytes += size
     return n_bytes
 
 
 def runs_table(runs: Sequence[RunSummary], folder: Path) -> str:
     """A table with a line for each run, and at its end how it is configured."""
     metrics = {k: how for k, how in METRICS.items() if any(k in run.metrics for run in runs)}
-    headings = ["run", "scene", "steps", "done", "time", *(name for name, _ in metrics.values())]
+    headings = ["run", "scene", "steps", "done", "time"]
+    headings += [*(["views"] if metrics else []), *(name for name, _ in metrics.values())]
     rows = []
     for run in runs:
-        name = run.folder.relative_to(folder).as_posix()
+        name = printable(run.folder.relative_to(folder).as_posix())
         minutes, seconds = divmod(round(run.seconds), 60)
         found = [
             format(run.metrics[key], how) if key in run.metrics else ""
             for key, (_, how) in metrics.items()
         ]
+        if metrics:
+            found.insert(0, str(run.n_views or ""))
         rows.append(
             [
-                folder.name if name == "." else name,
-                Path(run.config.scene).name,
+                printable(folder.resolve().name) if name == "." else name,
+                printable(_scene_of(run)),
                 str(run.step),
                 f"{run.fraction:.0%}",
                 f"{minutes}:{seconds:02}",
@@ -166,8 +213,34 @@ def _summary(folder: Path) -> RunSummary:
         fraction=last.fraction,
         seconds=last.seconds,
         metrics=metrics.mean,
-        n_bytes=sum(p.lstat().st_size for p in folder.rglob("*") if not p.is_dir()),
+        n_views=len(metrics.images),
+        n_bytes=_disk_usage(folder),
     )
+
+
+def _disk_usage(folder: Path) -> int:
+    """Bytes of a folder's files, without photographs that lie elsewhere too, as hard links.
+
+    A training may remove files meanwhile.
+    """
+    total = 0
+    for place, _, names in os.walk(folder):
+        in_scene = IN_RUN in Path(place).relative_to(folder).parts
+        for name in names:
+            with suppress(OSError):
+                state = os.lstat(os.path.join(place, name))  # noqa: PTH118, many files
+                total += 0 if in_scene and state.st_nlink > 1 else state.st_size
+    return total
+
+
+def _scene_of(run: RunSummary) -> str:
+    """What the scene of a run is called; one that lies in the run, by what it was made of."""
+    source = run.config.scene
+    if Path(source) == run.folder / IN_RUN:
+        with suppress(InputError):
+            record = read_record(Path(source))
+            source = str(record.made_of.get("source", source)) if record is not None else source
+    return scene_name(source)
 
 
 def _last_report(log: Path) -> Report:

@@ -310,6 +310,15 @@ class Run:
             if kept != lines:
                 write_atomically(path, b"".join(kept))
 
+    def discard_figures(self) -> None:
+        """Remove metrics and pictures, before the field becomes another one.
+
+        Raises:
+            InputError: They cannot be removed.
+        """
+        with self._writing():
+            run_files.discard_figures(self.folder)
+
     def save_field(self, field: Field, keep_checkpoints: bool = True) -> None:
         """Write the field, in half precision.
 

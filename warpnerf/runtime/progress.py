@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import time
 from typing import TYPE_CHECKING
 
@@ -13,11 +14,14 @@ LINE_EVERY = 5.0
 
 
 def has_bar() -> bool:
-    """Whether progress is a bar here, in a terminal or a notebook; elsewhere it is lines."""
+    """Whether progress is a bar here: in a terminal that can move its cursor, or in a notebook with
+    ipywidgets, without which rich shows none; elsewhere it is lines."""
     from rich.console import Console
 
     console = Console()
-    return console.is_terminal or console.is_jupyter
+    if console.is_jupyter:
+        return importlib.util.find_spec("ipywidgets") is not None
+    return console.is_terminal and not console.is_dumb_terminal
 
 
 class ProgressBar:

@@ -22,7 +22,7 @@ from warpnerf.scenes.images.images import (
     require_whole_image,
     says_equirectangular,
 )
-from warpnerf.scenes.images.masks import Mask, mask_beside, masks_of_folder
+from warpnerf.scenes.images.masks import Mask, fits, mask_beside, masks_of_folder
 from warpnerf.sfm.config import Lenses
 
 UPRIGHT = {
@@ -90,12 +90,7 @@ def read_photographs(
         list(pool.map(require_whole_image, paths))
     keys: dict[object, int] = {}
     photographs = []
-    if masks is None:
-        beside = map(mask_beside, paths)
-        found = [mask if mask is not None and mask.white_counts else None for mask in beside]
-    else:
-        found = masks_of_folder(masks, [path.name for path in paths])
-    for number, (path, mask) in enumerate(zip(paths, found, strict=True)):
+    for number, (path, mask) in enumerate(zip(paths, masks_of(paths, masks), strict=True)):
         size = image_size(path)
         key = {"auto": (size, read_exif(path, _camera)), "one": "one", "each": number}[lenses]
         photographs.append(
@@ -119,6 +114,28 @@ def read_photographs(
     return photographs
 
 
+def masks_of(paths: Sequence[Path], masks: Path | None) -> list[Mask | None]:
+    """The masks of photographs, one for each or None, as ``read_photographs`` finds them.
+
+    Of those beside the photographs, some are left aside: in which white is ignored, as a scene's
+    file cannot say that of a mask, and those of other sizes.
+
+    Raises:
+        InputError: A folder of masks was named, and holds none of these photographs.
+    """
+    if masks is not None:
+        return masks_of_folder(masks, [path.name for path in paths])
+    return [mask if is_used(mask, path) else None for path in paths for mask in [mask_beside(path)]]
+
+
+def is_used(mask: Mask | None, path: Path) -> bool:
+    """Whether a mask that lies beside a photograph is used for its pose."""
+    if mask is None or not mask.white_counts:
+        return False
+    width, height = image_size(path)
+    return fits(mask, width=width, height=height)
+
+
 def put_into(folder: Path, file: Path, name: str) -> None:
     """Put a file into a folder as a hard link, which takes no room, or else as a copy.
 
@@ -138,16 +155,13 @@ def put_into(folder: Path, file: Path, name: str) -> None:
 
 
 def _refuse_panoramas(paths: Sequence[Path]) -> None:
-    """Raise InputError where photographs show all directions, by their metadata or their shape."""
+    """Raise InputError where photographs show all directions, by their metadata."""
     said = [path for path in paths if says_equirectangular(path)]
-    alike = all(width == 2 * height for width, height in map(image_size, paths))
-    if said or alike:
-        how = "say so" if said else "are all exactly twice as wide as high"
+    if said:
         raise InputError(
-            f"{(said or paths)[0]}: looks like a panorama of 360 degrees, which has no lens that "
-            f"poses could be estimated for ({len(said or paths)} of {len(paths)} photographs "
-            f"{how}); cut each into pictures of 90 degrees first, or, where they are none, cut "
-            "off a row of pixels."
+            f"{said[0]}: is a panorama of 360 degrees, which has no lens that poses could be "
+            f"estimated for ({len(said)} of {len(paths)} photographs say so); cut each into "
+            "pictures of 90 degrees first, or leave them out: move them to another folder."
         )
 
 

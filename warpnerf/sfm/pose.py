@@ -31,11 +31,11 @@ from warpnerf.scenes.formats.contents import (
     what_is_there,
 )
 from warpnerf.scenes.formats.transforms_text import PosedFile, transforms_text
-from warpnerf.scenes.images.masks import read_mask
+from warpnerf.scenes.images.masks import mask_beside, read_mask, unfit_masks
 from warpnerf.sfm import scene_files
 from warpnerf.sfm.config import Lenses, PoseConfig
 from warpnerf.sfm.frames import sharp_frames
-from warpnerf.sfm.photographs import UnposedPhotograph, put_into, read_photographs
+from warpnerf.sfm.photographs import UnposedPhotograph, masks_of, put_into, read_photographs
 from warpnerf.sfm.summary import WELL_COVERED, Posing, nothing_placed, summary
 from warpnerf.sfm.worker import estimate, require_pycolmap
 
@@ -154,15 +154,23 @@ def inputs(source: Path, config: PoseConfig) -> dict[str, Any]:
         config: How poses are estimated; the number of threads does not count.
     """
     files = photographs_in(source) if source.is_dir() else [source]
-    states = [(path, path.stat()) for path in files]
+    found = masks_of(files, config.masks) if source.is_dir() else []
     masks = None if config.masks is None else config.masks.resolve()
     settings = asdict(config) | {"masks": masks}
     how = {name: str(value) for name, value in settings.items() if name != "threads"}
+    of_masks = {"masks": _states([mask.path for mask in found if mask is not None])}
     return {
         "source": str(source.resolve()),
-        "files": [[path.name, state.st_size, state.st_mtime_ns] for path, state in states],
+        "files": _states(files),
         "how": how,
+        **(of_masks if of_masks["masks"] else {}),  # records were without before
     }
+
+
+def _states(files: Sequence[Path]) -> list[list[str | int]]:
+    """Name, size and time of the last change of files."""
+    states = [(path, path.stat()) for path in files]
+    return [[path.name, state.st_size, state.st_mtime_ns] for path, state in states]
 
 
 def is_made_of(folder: Path, source: Path, config: PoseConfig) -> bool:
@@ -302,10 +310,27 @@ def _notes(
             f"left out {len(unread)} files whose format is not read (first: {unread[0].name}); "
             "convert them to JPEG"
         )
+    beside = [] if is_video else [mask_beside(p.path) for p in photographs if p.mask is None]
+    left = [mask for mask in beside if mask is not None]
+    inverse = [mask.path.name for mask in left if not mask.white_counts]
+    if inverse:
+        yield (
+            "masks in which white is ignored are not used for poses, nor put into the scene: "
+            f"{len(inverse)} (first: {inverse[0]}); invert them, and name them as "
+            f"{photographs[0].path.name}.mask.png"
+        )
+    unfit = [mask.path.name for mask in left if mask.white_counts]
+    if not any(p.mask is not None and not p.mask.found for p in photographs):
+        yield from unfit_masks(unfit)
     sizes = {p.size: p.path.name for p in reversed(photographs)}
     if len(sizes) > 1:
         shown = ", ".join(f"{name} {w}x{h}" for (w, h), name in sorted(sizes.items())[:2])
         yield f"photographs of {len(sizes)} sizes (first: {shown}), each with a lens of its own"
+    if not is_video and all(width == 2 * height for width, height in sizes):
+        yield (
+            "all photographs are exactly twice as wide as high: if they are panoramas of 360 "
+            "degrees, the poses are wrong; cut each into pictures of 90 degrees first"
+        )
     if matching == "sequential" and not is_video:
         yield (
             f"{len(photographs)} photographs are compared with their neighbours by name only; if "

@@ -319,7 +319,7 @@ def _trained_twice(config: TrainConfig) -> float:
     scene = _noise()
 
     def values(seed: int) -> np.ndarray:
-        field = train(scene, replace(config, seed=seed)).field
+        field = train(scene, replace(config, seed=seed), progress=False).field
         arrays = [*field.storage.tensors().values(), field.weights.numpy()]
         if field.proposal is not None:
             arrays.append(field.proposal.grid.values.numpy())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -25,12 +26,14 @@ from warpnerf.scenes.images.images import exif_orientation, image_shape, read_im
 from warpnerf.scenes.images.masks import (
     PackedMask,
     all_of_blocks,
+    fits,
     mask_beside,
     masks_of_folder,
     read_mask,
+    unfit_masks,
 )
-from warpnerf.scenes.images.photographs import Keeping, Photograph, keep
-from warpnerf.scenes.images.transparency import show_an_object, shows_nothing
+from warpnerf.scenes.images.photographs import Keeping, Photograph, keep, stay_in_memory
+from warpnerf.scenes.images.transparency import NO_ALPHA, outline, show_an_object, shows_nothing
 from warpnerf.scenes.scene import Scene, View
 from warpnerf.scenes.split import Split, withheld
 
@@ -39,9 +42,6 @@ LITTLE = 0.1
 
 LOOKED_AT = 16
 """Training photographs, at most, whose transparent pixels tell what the scene is."""
-LOOKED_AT_PIXELS = 128
-"""Rows and columns of each, about, that are looked at."""
-
 POSED = "pose.json"
 """Lies beside a scene that `warpnerf pose` wrote, whose poses are those of the stored pixels."""
 
@@ -95,7 +95,8 @@ def assemble(
         found = masks_of_folder(masks, [frame.name for frame in frames])
         frames = [replace(frame, mask=mask) for frame, mask in zip(frames, found, strict=True)]
     else:
-        frames = _with_masks_beside(frames)
+        frames, unfit = _with_masks_beside(frames, downscale)
+        warnings = [*warnings, *unfit]
 
     frames, points, offset = centred(frames, points)
     if offset is not None:
@@ -107,8 +108,14 @@ def assemble(
     with ThreadPoolExecutor(keeping.threads or usable_cores()) as pool:
         trained = [frame for frame in frames if frame.name in complete["train"]]
         some = trained[:: -(-len(trained) // LOOKED_AT)]
-        is_object = show_an_object(list(pool.map(_transparent, some)))
-        read = list(pool.map(lambda frame: _read_frame(frame, downscale, is_object), frames))
+        outlines = list(pool.map(lambda frame: outline(frame.path, frame.image), some))
+        is_object = show_an_object(outlines)
+        # Where alpha is ignored, masks are made of it: the same pixels are kept if there is room.
+        holds = any(outline.shape != NO_ALPHA for outline in outlines) and stay_in_memory(
+            keeping,
+            sum(pool.map(lambda frame: 3 * math.prod(_shape(frame)[:2]) // downscale**2, frames)),
+        )
+        read = list(pool.map(lambda frame: _read_frame(frame, downscale, is_object, holds), frames))
         turned = list(pool.map(_may_lie, frames))
     left = [entry for entry in read if entry is not None]
     complete, mask_warnings = _without_masked(file, frames, left, complete)
@@ -177,17 +184,22 @@ def _bounds(frames: Sequence[Frame], views: Sequence[View]) -> np.ndarray | None
     return np.array([given[view.name] for view in views])
 
 
-def _with_masks_beside(frames: Sequence[Frame]) -> list[Frame]:
-    """Frames with the masks that lie beside their photographs, where they have none."""
+def _with_masks_beside(frames: Sequence[Frame], downscale: int) -> tuple[list[Frame], list[str]]:
+    """Frames with the masks that lie beside their photographs, where they have none; warnings."""
     photographs = {frame.path for frame in frames}
-    found = []
+    found, unfit = [], []
     for frame in frames:
         mask = frame.mask
         if mask is None and frame.image is None:
             mask = mask_beside(frame.path)
             mask = None if mask is None or mask.path in photographs else mask
+        if mask is not None and mask.found:
+            height, width, _ = image_shape(frame.path)
+            if not fits(mask, width=width, height=height, downscale=downscale):
+                unfit.append(mask.path.name)
+                mask = None
         found.append(replace(frame, mask=mask))
-    return found
+    return found, unfit_masks(unfit)
 
 
 def complete_splits(
@@ -282,18 +294,13 @@ def _transparency_warning(read: Sequence[_Read]) -> list[str]:
         return []
     return [
         f"transparent pixels, {np.mean(list(shares.values())):.1%} of {len(shares)} of {len(read)} "
-        f"images (first: {min(shares)}), are ignored: too few, or too much alike, to be what "
-        "surrounds an object"
+        f"images (first: {min(shares)}), are ignored: too few, too much alike, or too much at "
+        "one side to be what surrounds an object"
     ]
 
 
-def _transparent(frame: Frame) -> np.ndarray:
-    """Where a photograph shows nothing, [H, W] bool, reduced by leaving pixels out."""
-    shape = image_shape(frame.path) if frame.image is None else frame.image.shape
-    if shape[2] == 3:
-        return np.zeros((1, 1), dtype=bool)
-    every = max(1, min(shape[:2]) // LOOKED_AT_PIXELS)
-    return shows_nothing(_pixels(frame)[::every, ::every])
+def _shape(frame: Frame) -> tuple[int, ...]:
+    return image_shape(frame.path) if frame.image is None else frame.image.shape
 
 
 def _pixels(frame: Frame) -> np.ndarray:
@@ -390,16 +397,16 @@ class _Read:
     """Share of its pixels that are ignored as transparent."""
 
 
-def _read_frame(frame: Frame, downscale: int, is_object: bool) -> _Read | None:
+def _read_frame(frame: Frame, downscale: int, is_object: bool, holds: bool) -> _Read | None:
     """What belongs to a frame; None where its mask leaves no pixel of it.
 
     Args:
         frame: To read.
         downscale: Edge of the blocks of pixels that become one.
         is_object: Whether alpha counts; else transparent pixels are ignored.
+        holds: Whether a photograph that is decoded for its alpha stays in memory.
     """
-    shape = image_shape(frame.path) if frame.image is None else frame.image.shape
-    height, width, channels = shape
+    height, width, channels = _shape(frame)
     whole = frame.lens.camera(width=width, height=height, c2w=frame.c2w, image=frame.name)
     if downscale > min(width, height):
         raise InputError(
@@ -416,9 +423,10 @@ def _read_frame(frame: Frame, downscale: int, is_object: bool) -> _Read | None:
         given = resampling.mask(given)
     if given is not None:
         mask = given if mask is None else mask & given
-    ignored = 0.0
+    ignored, pixels = 0.0, None
     if channels == 4 and not is_object:
-        seen = ~shows_nothing(_pixels(frame))
+        pixels = _pixels(frame)
+        seen = ~shows_nothing(pixels)
         if not seen.all():
             ignored = 1.0 - float(seen.mean())
             size = (height // downscale, width // downscale)
@@ -437,6 +445,8 @@ def _read_frame(frame: Frame, downscale: int, is_object: bool) -> _Read | None:
         drops_alpha=channels == 4 and not is_object,
         resampling=resampling,
     )
+    if holds and pixels is not None:
+        photograph = replace(photograph, made=photograph.made_of(pixels))
     depth = None if frame.depth is None else read_depth(frame.depth, whole, downscale)
     return _Read(
         name=frame.name,

@@ -12,6 +12,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
@@ -40,7 +41,7 @@ from warpnerf.scenes.formats.colmap_files import (
     images_of_text,
     stated_images,
 )
-from warpnerf.scenes.formats.colmap_points import read_points
+from warpnerf.scenes.formats.colmap_points import UnusablePlyError, read_points
 from warpnerf.scenes.formats.frame import Frame
 from warpnerf.scenes.formats.llff import ENDINGS
 from warpnerf.scenes.formats.split_lists import read_split_lists
@@ -50,8 +51,10 @@ from warpnerf.scenes.images.photographs import KEEPING, Keeping
 from warpnerf.scenes.scene import Scene
 from warpnerf.scenes.split import Split
 
-MODEL_FOLDERS = ("sparse", "colmap/sparse", ".")
-"""Where models are looked for in a scene's folder, in this order: in 0, 1, ... there, and there."""
+SPARSE = "sparse"
+MODEL_FOLDERS = (SPARSE, f"colmap/{SPARSE}", ".")
+"""Where models are looked for in a scene's folder, in this order: there, and where that is a folder
+sparse, first in its 0, 1, ..."""
 
 UNPOSED = 0.1
 """Share of the photographs that are not in the model, above which that is a warning."""
@@ -79,26 +82,32 @@ def _find_models(folder: Path) -> list[Path]:
     for name in MODEL_FOLDERS:
         models = _models_in(folder / name)
         if models:
-            return models if len(models) == 1 else sorted(models, key=_size, reverse=True)
+            return models if len(models) == 1 else sorted(models, key=_rank)
     return []
 
 
 def _models_in(place: Path) -> list[Path]:
-    """The models 0, 1, ... of a folder, and itself if it is one."""
-    try:
-        numbered = [path for path in place.iterdir() if re.fullmatch(r"\d{1,4}", path.name)]
-    except OSError:
-        numbered = []
+    """The models 0, 1, ... of a folder sparse, and any folder itself if it is one."""
+    numbered: list[Path] = []
+    if place.resolve().name == SPARSE:  # elsewhere numbered folders are captures of their own
+        with suppress(OSError):
+            numbered = [path for path in place.iterdir() if re.fullmatch(r"\d{1,4}", path.name)]
     numbered.sort(key=lambda path: int(path.name))
     return [path for path in (*numbered, place) if model_kind(path) is not None]
 
 
-def _size(model: Path) -> int:
-    """How many images a model has; 0 where that cannot be read."""
+def _size(model: Path) -> int | None:
+    """How many images a model has; None where it cannot be read."""
     try:
         return len(_images(model))
     except (InputError, OSError):
-        return 0
+        return None
+
+
+def _rank(model: Path) -> float:
+    """Larger models come first, and damaged ones before all: they are refused, not skipped."""
+    size = _size(model)
+    return -math.inf if size is None else -size
 
 
 def _images(model: Path) -> list[ModelImage]:
@@ -121,18 +130,32 @@ def _require_once(file: Path, images: Sequence[ModelImage]) -> None:
 
 def _others(model: Path, n: int, folder: Path) -> tuple[list[str], list[str]]:
     """Notes and warnings of models beside that of n images that is read."""
-    model = model.resolve()
-    place = model.parent if model.name.isdecimal() else model
-    sizes = {path: _size(path) for path in _models_in(place) if path != model}
+    sizes = {path: _size(path) for path in _beside(model)}
     if not sizes:
         return [], []
+    model = model.resolve()
 
     def name(path: Path) -> str:
         return printable(Path(os.path.relpath(path, folder)).as_posix())
 
-    rest = ", ".join(f"{name(path)} has {size}" for path, size in sizes.items())
+    rest = ", ".join(
+        f"{name(path)} {'is damaged' if size is None else f'has {size}'}"
+        for path, size in sizes.items()
+    )
     said = [f"the model {name(model)} of {n} images is read; {rest}"]
-    return ([], said) if max(sizes.values()) > n else (said, [])
+    return ([], said) if any(size is None or size > n for size in sizes.values()) else (said, [])
+
+
+def _beside(model: Path) -> list[Path]:
+    """The other models of the same scene."""
+    model = model.resolve()
+    place = model.parent if _is_numbered(model) else model
+    return [path for path in _models_in(place) if path != model]
+
+
+def _is_numbered(model: Path) -> bool:
+    """Whether a folder is one of the models 0, 1, ... of a folder sparse."""
+    return model.name.isdecimal() and model.parent.name == SPARSE
 
 
 def _unposed(photographs: Path, used: set[Path]) -> tuple[list[str], list[str]]:
@@ -145,6 +168,9 @@ def _unposed(photographs: Path, used: set[Path]) -> tuple[list[str], list[str]]:
             if name.lower().endswith(ENDINGS) and not name.startswith(".")
         ]
     )
+    # Others hold masks or thumbnails.
+    folders = {path.parent for path in used}
+    there = [path for path in there if path.parent in folders]
     left = sorted(path for path in there if path not in used)
     if not left:
         return [], []
@@ -173,8 +199,8 @@ def scene_folder(model: Path) -> Path:
     for folder in folders:
         if photograph_folder(folder) is not None:
             return folder
-    names = ("colmap", "sparse", "0")  # of folders in a scene's that lead to its model
-    if model.name.isdecimal():
+    names = ("colmap", SPARSE)  # of folders in a scene's that lead to its model
+    if _is_numbered(model):
         folders = folders[1:]
     return next((folder for folder in folders if folder.name not in names), model)
 
@@ -214,8 +240,15 @@ def load_colmap(
     read_cameras, read_images = (
         (cameras_of_bytes, images_of_bytes) if kind == "bin" else (cameras_of_text, images_of_text)
     )
-    cameras, images = read_cameras(camera_file), read_images(image_file)
-    _require_once(image_file, images)
+    try:
+        cameras, images = read_cameras(camera_file), read_images(image_file)
+        _require_once(image_file, images)
+    except InputError as error:
+        others = [path for path in _beside(model) if _size(path)]
+        if not others:
+            raise
+        way_out = f"or name another model of the scene, such as {printable(str(others[0]))}"
+        raise InputError(f"{str(error).removesuffix('.')}; {way_out}.") from None
     folder = scene_folder(model)
     photographs = photograph_folder(folder)
     if photographs is None:
@@ -235,6 +268,7 @@ def load_colmap(
         camera, reduced = cameras[image.camera], photographs.name != "images"
         lens = _lens(camera_file, image.camera, camera, path, reduced)
         mask = mask_in(folder / "masks", image.name)
+        mask = None if mask is None else replace(mask, found=True)
         pose = _pose(image, field)
         frames.append(Frame(name=image.name, path=path, c2w=pose, lens=lens, mask=mask))
     if not frames:
@@ -256,6 +290,13 @@ def load_colmap(
             f"keypoints (first: {printable(bare[0][:80])}): all are read, but other programs lose "
             "every second one"
         )
+    odd = [image.name for image in images if image.odd_keypoints]
+    if odd:
+        warnings.append(
+            f"{image_file.name}: the keypoints of {len(odd)} of {len(images)} images are no X Y "
+            f"POINT3D_ID of each (first: {printable(odd[0][:80])}): poses do not depend on them, "
+            "but other programs may refuse the file"
+        )
     if missing:
         warnings.append(
             f"{image_file.name}: left out {len(missing)} of {len(images)} images for want of a "
@@ -263,9 +304,15 @@ def load_colmap(
         )
     notes, larger = _others(model, len(images), folder)
     few, many = _unposed(photographs, {frame.path for frame in frames})
-    splits, listed, lost = read_split_lists(folder, {frame.name for frame in frames})
+    there, of_model = {frame.name for frame in frames}, {image.name for image in images}
+    splits, listed, lost = read_split_lists(folder, there, of_model)
     notes = [*notes, *few, *listed]
     warnings = [*warnings, *larger, *many, *lost]
+    points = None
+    try:
+        points = read_points(model, {image.number: image.name for image in images}, folder)
+    except UnusablePlyError as error:
+        warnings.append(f"no points: {error}")
     scene = assemble(
         folder=folder,
         file=image_file,
@@ -276,7 +323,7 @@ def load_colmap(
         masks=masks,
         keeping=keeping,
         withhold=withhold,
-        points=read_points(model, {image.number: image.name for image in images}, folder),
+        points=points,
     )
     return replace(scene, notes=(*notes, *scene.notes))
 

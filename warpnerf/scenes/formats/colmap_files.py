@@ -54,6 +54,11 @@ MODEL_NAMES = (
 DIGITS = "0123456789+-.eE"
 NUMERIC = DIGITS + " \tnaif"
 """Of lines of numbers, which may be nan or inf."""
+WHOLE = re.compile(r"[-+]?\d+")
+ODD_NUMBER = re.compile(
+    r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|[-+]?(nan(\(\w*\))?|inf(inity)?|1\.#\w+)", re.IGNORECASE
+)
+"""Of keypoints; those that are no numbers as the compiler of a program on Windows writes them."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +83,8 @@ class ModelImage:
     translation: tuple[float, float, float]
     keypoints: bool = True
     """Whether a line for its keypoints, empty or not, follows that of its pose in images.txt."""
+    odd_keypoints: bool = False
+    """Whether that line has numbers other than X, Y and POINT3D_ID of each keypoint."""
 
 
 class _Bytes:
@@ -216,7 +223,8 @@ def images_of_text(file: Path) -> list[ModelImage]:
     """Images of images.txt, in its order: a line of the pose each, and one of its keypoints.
 
     As in COLMAP's reader, empty lines are skipped before the line of a pose. The line after it is
-    that of the keypoints, unless it is another pose: some programs leave keypoints out.
+    that of the keypoints, unless it is another pose: some programs leave keypoints out, and some
+    write other numbers.
 
     Raises:
         InputError: A line is neither.
@@ -235,6 +243,10 @@ def images_of_text(file: Path) -> list[ModelImage]:
         else:
             with suppress(ValueError, IndexError):
                 image = _image(line)
+            if image is None and _are_odd_keypoints(line):
+                images[-1] = replace(images[-1], odd_keypoints=True)
+                posed = False
+                continue
             if image is None or not image.name.strip(DIGITS):
                 raise InputError(
                     f"{file}: line {number}: is neither the keypoints of image "
@@ -255,6 +267,14 @@ def _image(line: str) -> ModelImage:
     w, x, y, z, *translation = map(float, words[1:8])
     a, b, c = translation
     return ModelImage(int(words[0]), words[9], int(words[8]), (w, x, y, z), (a, b, c))
+
+
+def _are_odd_keypoints(line: str) -> bool:
+    """Whether a line has numbers only, and not those of a pose whose name is missing."""
+    words = line.split()
+    if not all(ODD_NUMBER.fullmatch(word) for word in words):
+        return False
+    return not (len(words) >= 9 and WHOLE.fullmatch(words[0]) and WHOLE.fullmatch(words[8]))
 
 
 def _are_keypoints(line: str) -> bool:

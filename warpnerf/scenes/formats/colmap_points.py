@@ -27,6 +27,10 @@ MAX_LINE = 2**22
 """Characters of a line of points3D.txt: a track of some 300 000 photographs."""
 
 
+class UnusablePlyError(InputError):
+    """A points3D.ply beside a model, which other programs write in forms of their own."""
+
+
 def read_points(model: Path, images: Mapping[int, str], folder: Path) -> Points | None:
     """Read the points of a model.
 
@@ -40,6 +44,7 @@ def read_points(model: Path, images: Mapping[int, str], folder: Path) -> Points 
         which does not tell; None without such a file.
 
     Raises:
+        UnusablePlyError: There is none but a points3D.ply that cannot be read.
         InputError: The file is damaged.
     """
     found: Points | None = None
@@ -67,7 +72,10 @@ def read_points(model: Path, images: Mapping[int, str], folder: Path) -> Points 
     for place in _up_to(model, folder):
         file = place / PLY
         if exists(file):
-            positions = read_ply(file)
+            try:
+                positions = read_ply(file)
+            except InputError as error:
+                raise UnusablePlyError(str(error)) from None
             source = Path(os.path.relpath(file, folder)).as_posix()
             return Points(positions=positions[usable(positions)], tracks=None, source=source)
     return found

@@ -19,6 +19,7 @@ from warpnerf.scenes.files import photograph_folder
 from warpnerf.scenes.formats.assemble import assemble
 from warpnerf.scenes.formats.frame import Frame
 from warpnerf.scenes.images.arrays import read_npy
+from warpnerf.scenes.images.masks import without_masks
 from warpnerf.scenes.images.photographs import KEEPING, Keeping
 from warpnerf.scenes.scene import Scene
 from warpnerf.scenes.split import Split
@@ -59,7 +60,8 @@ def load_llff(
     photographs = photograph_folder(folder)
     if photographs is None:
         raise InputError(f"{folder}: its photographs are not there; put them into images/.")
-    paths = sorted(p for p in photographs.iterdir() if p.suffix.lower() in ENDINGS)
+    images = sorted(p for p in photographs.iterdir() if p.suffix.lower() in ENDINGS)
+    paths = without_masks(images)
     if len(paths) != len(rows):
         raise InputError(
             f"{file}: holds {len(rows)} poses, but {photographs} {len(paths)} photographs; LLFF "

@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from warpnerf.checks import InputError
-from warpnerf.scenes.images.images import read_image
+from warpnerf.scenes.images.images import image_size, read_image
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 """Of masks, which are named after a photograph or its stem."""
@@ -24,6 +24,8 @@ class Mask:
     """Of the image."""
     white_counts: bool = True
     """False for those of instant-ngp, where white is ignored."""
+    found: bool = False
+    """Whether nobody named it or its folder: it has a mask's name, and may be something else."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,12 +56,12 @@ def mask_beside(photograph: Path) -> Mask | None:
     instant-ngp; NAME.jpg.mask.png or NAME.mask.png, as of RealityScan; or NAME_mask.png."""
     path = photograph.with_name(f"dynamic_mask_{photograph.stem}.png")
     if os.path.isfile(path):  # noqa: PTH113, never raises
-        return Mask(path, white_counts=False)
+        return Mask(path, white_counts=False, found=True)
     stems = (f"{photograph.name}.mask", f"{photograph.stem}.mask", f"{photograph.stem}_mask")
     for name in (f"{stem}{suffix}" for stem in stems for suffix in SUFFIXES):
         path = photograph.with_name(name)
         if os.path.isfile(path):  # noqa: PTH113
-            return Mask(path)
+            return Mask(path, found=True)
     return None
 
 
@@ -119,6 +121,36 @@ def masks_of_folder(folder: Path, names: Sequence[str]) -> list[Mask | None]:
     return found
 
 
+def fits(mask: Mask, *, width: int, height: int, downscale: int = 1) -> bool:
+    """Whether a mask is an image of a size that ``read_mask`` takes, by its header."""
+    try:
+        columns, rows = image_size(mask.path)
+    except InputError:
+        return False
+    return _times(columns, rows, width, height, downscale) is not None
+
+
+def unfit_masks(names: Sequence[str]) -> list[str]:
+    """A sentence on masks, if any, that were found but do not fit."""
+    if not names:
+        return []
+    return [
+        f"not used as masks: {len(names)} images of another size than the photographs whose masks "
+        f"they are by name (first: {names[0]})"
+    ]
+
+
+def _times(columns: int, rows: int, width: int, height: int, downscale: int) -> int | None:
+    """How many times as large as its photograph a mask is; 0: as large as that is then reduced to;
+    None: neither."""
+    if (columns, rows) == (width // downscale, height // downscale):
+        return 0
+    times = max(1, round(columns / width))
+    # What fills no whole pixel of a reduced photograph was dropped, or has one of its own.
+    apart = max(abs(columns / times - width), abs(rows / times - height))
+    return times if apart < 1.0 else None
+
+
 def read_mask(mask: Mask, *, width: int, height: int, downscale: int) -> np.ndarray:
     """Read a mask for a photograph, of its size or a whole number of times as large, rounded.
 
@@ -148,11 +180,10 @@ def read_mask(mask: Mask, *, width: int, height: int, downscale: int) -> np.ndar
     counts = white if mask.white_counts else rgb == 0
     rows, columns = counts.shape
     small = (height // downscale, width // downscale)
-    if (rows, columns) == small:
+    times = _times(columns, rows, width, height, downscale)
+    if times == 0:
         return counts
-    times = max(1, round(columns / width))
-    # What fills no whole pixel of a reduced photograph was dropped, or has one of its own.
-    if max(abs(columns / times - width), abs(rows / times - height)) >= 1.0:
+    if times is None:
         raise InputError(
             f"{mask.path}: has {columns}x{rows} pixels, but its photograph {width}x{height}; make "
             "the mask as large as the photograph."

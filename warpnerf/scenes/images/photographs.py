@@ -80,6 +80,8 @@ class Photograph:
     """Whether alpha in its file is left out."""
     resampling: Resampling | None = None
     """By which it is undistorted, after it is reduced; None: it is used as it is."""
+    made: np.ndarray | None = None
+    """What ``read`` returns, where its file was decoded before anyway."""
 
     @property
     def n_bytes(self) -> int:
@@ -95,7 +97,12 @@ class Photograph:
         Raises:
             InputError: The file is damaged, or no longer what it was.
         """
-        image = read_image(self.path) if self.image is None else self.image
+        if self.made is not None:
+            return self.made
+        return self.made_of(read_image(self.path) if self.image is None else self.image)
+
+    def made_of(self, image: np.ndarray) -> np.ndarray:
+        """As ``read``, of the pixels of its file."""
         if self.downscale > 1:
             image = box_filter(image, self.downscale)
         if self.resampling is not None and image.shape[:2] == self.shape[:2]:
@@ -119,6 +126,13 @@ class Kept:
     """What should be told."""
 
 
+def stay_in_memory(keeping: Keeping, n_bytes: int) -> bool:
+    """Whether photographs of so many bytes will be kept in memory, and well fit there."""
+    available = available_memory()
+    fits = available is None or n_bytes <= MEMORY_SHARE * available
+    return keeping.place in ("memory", "auto") and fits
+
+
 def keep(
     photographs: Sequence[Photograph], keeping: Keeping, *, file: Path, downscale: int
 ) -> Kept:
@@ -134,29 +148,29 @@ def keep(
         InputError: A photograph is damaged, or they need more room than there is.
     """
     needed = sum(photograph.n_bytes for photograph in photographs)
+    more = sum(photograph.n_bytes for photograph in photographs if photograph.made is None)
     available = available_memory()
     place = keeping.place
     if place == "files":
         with_alpha = [photograph.shape[2] == 4 for photograph in photographs]
-        seen = map(_transparent, _read_all(list(compress(photographs, with_alpha)), keeping))
+        seen = map(_see_through, _read_all(list(compress(photographs, with_alpha)), keeping))
         see_through = [alpha and next(seen) for alpha in with_alpha]
         return Kept(images=list(photographs), see_through=see_through)
     if place == "auto":
-        fits = available is None or needed <= MEMORY_SHARE * available
-        place = "memory" if fits else "disk"
+        place = "memory" if stay_in_memory(keeping, more) else "disk"
     height, width, _ = photographs[0].shape
     need = (
         f"{file}: {len(photographs)} photographs (the first of {width}x{height} pixels) need "
         f"{_size(needed)}"
     )
     if place == "memory":
-        if available is not None and needed > available:
+        if available is not None and more > available:
             raise InputError(
                 f"{need}, but {_size(available)} of memory are free; keep them on disk (--images "
                 f"disk), or use --downscale {_reduction(downscale, needed, available)}."
             )
         images = list(_read_all(photographs, keeping))
-        return Kept(images=[*images], see_through=[_transparent(image) for image in images])
+        return Kept(images=[*images], see_through=[_see_through(image) for image in images])
     folder = keeping.disk.resolve()
     try:
         free = shutil.disk_usage(folder).free
@@ -169,7 +183,7 @@ def keep(
         see_through = []
         for image in _read_all(photographs, keeping):
             pixels.add(image)
-            see_through.append(_transparent(image))
+            see_through.append(_see_through(image))
         kept = pixels.close()
     except OSError as error:
         raise InputError(
@@ -201,7 +215,7 @@ def _read_all(photographs: Sequence[Photograph], keeping: Keeping) -> Iterator[n
             yield waiting.popleft().result()
 
 
-def _transparent(image: np.ndarray) -> bool:
+def _see_through(image: np.ndarray) -> bool:
     return image.shape[2] == 4 and bool((image[:, :, 3] < 255).any())
 
 
