@@ -118,6 +118,7 @@ def test_files_that_hold_double_precision_have_the_capture_s_coordinates(tmp_pat
 
 def test_an_exported_scene_is_read_where_the_capture_is(tmp_path: Path) -> None:
     scene = georeferenced(tmp_path / "scene")
+    (tmp_path / "out").mkdir()
     write_scene(tmp_path / "out", scene.at_offset(None), surface_at(UTM))
     content = json.loads((tmp_path / "out" / "transforms.json").read_text())
     place = np.array(content["frames"][1]["transform_matrix"])[:3, 3]
