@@ -64,6 +64,18 @@ def test_reduced_photographs_are_used(tmp_path: Path, colmap: bool) -> None:
     assert not scene.warnings
 
 
+def test_reduced_photographs_whose_alpha_is_ignored_are_used(tmp_path: Path) -> None:
+    write_transforms(tmp_path)
+    for path in (tmp_path / "images").iterdir():
+        pixels = np.dstack([np.array(Image.open(path)), np.full((6, 8), 255, np.uint8)])
+        Image.fromarray(pixels).save(path)
+    write_reduced(tmp_path)
+    scene = load_scene(tmp_path, downscale=2)
+    for view in scene.views:
+        path = tmp_path / "images_2" / Path(view.name).name
+        assert np.array_equal(view.image, np.array(Image.open(path))[..., :3])
+
+
 def test_reduced_photographs_may_have_another_extension(tmp_path: Path) -> None:
     write_transforms(tmp_path)
     for k in range(4):  # noise of so few pixels would not survive JPEG

@@ -18,7 +18,7 @@ from warpnerf.scenes.cameras.undistort import seen_pixels
 from warpnerf.scenes.extent.conventions import check_against_photographs
 from warpnerf.scenes.extent.points import Points, extent_by_points
 from warpnerf.scenes.files import by_number, exists
-from warpnerf.scenes.formats.frame import Frame, lens_notes
+from warpnerf.scenes.formats.frame import Frame, lens_notes, with_masks_beside
 from warpnerf.scenes.formats.georeference import centred, in_words
 from warpnerf.scenes.formats.reduced import with_reduced
 from warpnerf.scenes.images.depths import Depth, read_depth
@@ -26,11 +26,8 @@ from warpnerf.scenes.images.images import exif_orientation, image_shape, read_im
 from warpnerf.scenes.images.masks import (
     PackedMask,
     all_of_blocks,
-    fits,
-    mask_beside,
     masks_of_folder,
     read_mask,
-    unfit_masks,
 )
 from warpnerf.scenes.images.photographs import Keeping, Photograph, keep, stay_in_memory
 from warpnerf.scenes.images.transparency import NO_ALPHA, outline, show_an_object, shows_nothing
@@ -95,7 +92,7 @@ def assemble(
         found = masks_of_folder(masks, [frame.name for frame in frames])
         frames = [replace(frame, mask=mask) for frame, mask in zip(frames, found, strict=True)]
     else:
-        frames, unfit = _with_masks_beside(frames, downscale)
+        frames, unfit = with_masks_beside(frames, downscale)
         warnings = [*warnings, *unfit]
 
     frames, points, offset = centred(frames, points)
@@ -111,7 +108,7 @@ def assemble(
         outlines = list(pool.map(lambda frame: outline(frame.path, frame.image), some))
         is_object = show_an_object(outlines)
         # Where alpha is ignored, masks are made of it: the same pixels are kept if there is room.
-        holds = any(outline.shape != NO_ALPHA for outline in outlines) and stay_in_memory(
+        holds = any(each.shape != NO_ALPHA for each in outlines) and stay_in_memory(
             keeping,
             sum(pool.map(lambda frame: 3 * math.prod(_shape(frame)[:2]) // downscale**2, frames)),
         )
@@ -182,24 +179,6 @@ def _bounds(frames: Sequence[Frame], views: Sequence[View]) -> np.ndarray | None
     if len(given) < len(frames):
         return None
     return np.array([given[view.name] for view in views])
-
-
-def _with_masks_beside(frames: Sequence[Frame], downscale: int) -> tuple[list[Frame], list[str]]:
-    """Frames with the masks that lie beside their photographs, where they have none; warnings."""
-    photographs = {frame.path for frame in frames}
-    found, unfit = [], []
-    for frame in frames:
-        mask = frame.mask
-        if mask is None and frame.image is None:
-            mask = mask_beside(frame.path)
-            mask = None if mask is None or mask.path in photographs else mask
-        if mask is not None and mask.found:
-            height, width, _ = image_shape(frame.path)
-            if not fits(mask, width=width, height=height, downscale=downscale):
-                unfit.append(mask.path.name)
-                mask = None
-        found.append(replace(frame, mask=mask))
-    return found, unfit_masks(unfit)
 
 
 def complete_splits(
@@ -445,7 +424,7 @@ def _read_frame(frame: Frame, downscale: int, is_object: bool, holds: bool) -> _
         drops_alpha=channels == 4 and not is_object,
         resampling=resampling,
     )
-    if holds and pixels is not None:
+    if holds and pixels is not None and frame.reduced is None:
         photograph = replace(photograph, made=photograph.made_of(pixels))
     depth = None if frame.depth is None else read_depth(frame.depth, whole, downscale)
     return _Read(

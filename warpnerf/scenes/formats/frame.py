@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,8 @@ from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.cameras.foreign import TOLERANCE, ImagePlane
 from warpnerf.scenes.cameras.lens import Lens
 from warpnerf.scenes.images.depths import DepthFile
-from warpnerf.scenes.images.masks import Mask
+from warpnerf.scenes.images.images import image_shape
+from warpnerf.scenes.images.masks import Mask, fits, mask_beside, unfit_masks
 from warpnerf.scenes.images.resampling import Resampling
 
 
@@ -75,3 +76,26 @@ def lens_notes(used: Sequence[tuple[Frame, Camera, Resampling | None]]) -> list[
         + ("so they are undistorted to it" if moved else "and is used in its place")
         for (model, moved), off in found.items()
     ]
+
+
+def with_masks_beside(frames: Sequence[Frame], downscale: int) -> tuple[list[Frame], list[str]]:
+    """Frames with the masks that lie beside their photographs, where they have none; warnings.
+
+    Args:
+        frames: Of the scene.
+        downscale: Edge of the blocks of pixels that become one.
+    """
+    photographs = {frame.path for frame in frames}
+    found, unfit = [], []
+    for frame in frames:
+        mask = frame.mask
+        if mask is None and frame.image is None:
+            mask = mask_beside(frame.path)
+            mask = None if mask is None or mask.path in photographs else mask
+        if mask is not None and mask.found:
+            height, width, _ = image_shape(frame.path)
+            if not fits(mask, width=width, height=height, downscale=downscale):
+                unfit.append(mask.path.name)
+                mask = None
+        found.append(replace(frame, mask=mask))
+    return found, unfit_masks(unfit)
