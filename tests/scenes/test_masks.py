@@ -327,7 +327,7 @@ def test_the_command_remembers_the_folder_of_masks(tmp_path: Path) -> None:
     kept = np.kron(KEPT, np.ones((2, 2), bool))
     for number in range(4):
         save_mask(tmp_path / "masks" / f"{number:03}.png", kept)
-    done = train(scene, "--masks", "masks", folder=tmp_path)
+    done = train(scene, "--masks", "masks", "--keep", "checkpoint", folder=tmp_path)
     assert_trained(done)
     assert "4 of 4 images have pixels that are ignored" in done.out
     assert json.loads((done.run / "config.json").read_text())["masks"] == str(tmp_path / "masks")

@@ -182,13 +182,13 @@ def test_the_command_says_where_they_are_and_goes_on_anywhere(
     begin = ["train", str(tmp_path / "scene"), "--output", str(run), "--model", "rgb"]
     begin += ["--steps", "8", "--voxels", "512", "--threads", "1"]
     monkeypatch.setattr(photographs, "TELL_EVERY", -1.0)
-    assert main([*begin, "--images", "disk"]) == 0
+    assert main([*begin, "--images", "disk", "--keep", "checkpoint"]) == 0
     said = capsys.readouterr().out
     assert f"MiB in {run}, removed at the end" in said
     assert "read 7 of 8 photographs" in said
     field = (run / "field.safetensors").read_bytes()
     assert main(["train", "--resume", str(run), "--images", "disk"]) == 0
-    assert main([*begin, "--overwrite"]) == 0
+    assert main([*begin, "--keep", "checkpoint", "--overwrite"]) == 0
     assert "on disk" not in capsys.readouterr().out.rpartition("reading ")[2]
     assert (run / "field.safetensors").read_bytes() == field
     assert main(["eval", str(run), "--threads", "1"]) == 0

@@ -24,6 +24,7 @@ from warpnerf.checks import InputError
 from warpnerf.config import GridConfig, TrainConfig
 from warpnerf.inspection.inspection import inspect
 from warpnerf.media.scene_plan import plan_picture
+from warpnerf.model.sampler_kinds import MARCHED
 from warpnerf.optim_config import OptimConfig
 from warpnerf.runs.checkpoint import load_checkpoint, save_checkpoint
 from warpnerf.scenes.extent.points import Points, observed_extent
@@ -311,8 +312,9 @@ def test_by_default_they_lie_between_each_camera_s_and_the_scene_s() -> None:
 def test_a_checkpoint_of_one_distance_for_all_goes_on_so(tmp_path: Path) -> None:
     """As they were written when auto was the scene's for each camera."""
     scene = scene_of_two_distances()
-    auto = replace(PER_CAMERA, content_distance="auto")
-    half = Trainer(scene, replace(PER_CAMERA, content_distance=scene.content_distance))
+    auto = replace(PER_CAMERA, content_distance="auto", sampler=MARCHED)
+    one = {"content_distance": scene.content_distance, "sampler": MARCHED}
+    half = Trainer(scene, replace(PER_CAMERA, **one))
     half.run(stop=lambda: half.steps_done >= 10)
     state, file = half.state(), tmp_path / "state.safetensors"
     older = OlderPlan(
