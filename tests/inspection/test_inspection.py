@@ -223,7 +223,7 @@ def test_costs_are_those_of_the_model(tmp_path: Path) -> None:
         assert found.costs["mine"].plan.memory - rgb.costs["mine"].plan.memory == more
         times = found.costs["mine"].seconds / rgb.costs["mine"].seconds
         assert times == pytest.approx(model.relative_time)
-        assert f"model {model.name}: about" in str(found)
+        assert f"model {model.name}, rays resampled: about" in str(found)
         assert found.facts()["costs"]["mine"]["model"]["name"] == model.name
 
 

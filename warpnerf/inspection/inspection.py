@@ -194,7 +194,7 @@ class Inspection:
             rows.append(
                 (
                     f"training, {name}",
-                    f"model {cost.plan.config.model.name}: about "
+                    f"model {cost.plan.config.model.name}, rays {cost.plan.sampler.past}: about "
                     f"{cost.plan.memory / 2**30:.2g} GiB of memory; "
                     f"very roughly {_duration(cost.seconds)} on {cost.threads} CPU threads",
                 )

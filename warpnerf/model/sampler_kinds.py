@@ -30,6 +30,8 @@ class SamplerKind(ABC):
 
     name: ClassVar[str]
     """What files call it."""
+    past: ClassVar[str]
+    """What it does to rays, for people: they are ..."""
 
     @abstractmethod
     def part(self, load: Load) -> Any:
@@ -64,6 +66,7 @@ class Marched(SamplerKind):
     """Steps that are the same for all rays: the model's sampler, by ``MarchConfig``."""
 
     name: ClassVar[str] = "march"
+    past: ClassVar[str] = "marched"
 
     def part(self, load: Load) -> Any:
         """The model's own."""
@@ -75,6 +78,7 @@ class AutoSampler(SamplerKind):
     """Proposal sampling or ray marching, as suits the scene: ``TrainConfig.sampler_in``."""
 
     name: ClassVar[str] = "auto"
+    past: ClassVar[str] = "marched or resampled"
 
     def part(self, load: Load) -> Any:
         """None: it has to be decided first."""
@@ -88,6 +92,7 @@ class Resampled(SamplerKind):
     small density grid."""
 
     name: ClassVar[str] = "resampled"
+    past: ClassVar[str] = "resampled"
     samples: int = 32
     """Intervals per ray, each sampled once."""
     bins: int = 64
