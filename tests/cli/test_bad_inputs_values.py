@@ -64,7 +64,7 @@ NAN = math.nan
         ),
         pytest.param(
             ["--voxels", str(21 * 10**8)],
-            "GiB to train, but this machine has",
+            "GiB, but this machine has",
             id="61-more-than-the-memory",
             marks=pytest.mark.skipif(
                 (usable_memory() or 0) > 40 * 21 * 10**8, reason="this machine has 84 GB"
@@ -269,7 +269,7 @@ def scaled(**changes: Any) -> Any:
             id="63-sparse-corner",
         ),
         pytest.param(
-            scaled, {"colors": np.ones((2, 5, 3))}, "colors must be a torch", id="63-scale-numpy"
+            scaled, {"colors": np.ones((2, 5, 3))}, "colors must be a Tensor", id="63-scale-numpy"
         ),
         pytest.param(
             scaled,

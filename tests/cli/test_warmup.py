@@ -13,6 +13,7 @@ from tests.training.test_determinism import small_scene
 from warpnerf.config import GridConfig, TrainConfig
 from warpnerf.model.interface import Model
 from warpnerf.model.models import Deferred, PerSample, Rgb
+from warpnerf.model.spaces import SPACES
 from warpnerf.optim_config import OptimConfig
 from warpnerf.presets import DEFAULT_PRESETS, PRESETS
 from warpnerf.runtime.parallel import Workers
@@ -49,7 +50,9 @@ def test_a_training_loads_no_other_kernels(
     trainer = Trainer(scene, config)
     assert not trainer.workers._loaded  # a scene is described before anything is compiled
     where = trainer.workers.device
-    needed = training_kernels(model, contraction, scaling, "none", where, config.loss)
+    drawn = config.sampler_in(SPACES[contraction])
+    given = contraction, scaling, "none", where, config.loss
+    needed = training_kernels(model, *given, sampler=drawn)
     trainer.update()
     assert trainer.workers._loaded == set(needed)
     trainer.run()
@@ -57,7 +60,8 @@ def test_a_training_loads_no_other_kernels(
     modules = {kernel.module for kernel in needed}
     assert {kernel.module for kernel in trainer.workers._loaded} == modules
     trainer.field().render(scene.cameras[0])
-    modules |= {kernel.module for kernel in rendering_kernels(model, contraction, where)}
+    rendered = rendering_kernels(model, contraction, where, sampler=drawn)
+    modules |= {kernel.module for kernel in rendered}
     assert {kernel.module for kernel in trainer.workers._loaded} == modules
 
 

@@ -391,7 +391,7 @@ def test_help_is_read_at_a_glance(
         assert "``" not in full and "None" not in full and "GridConfig" not in full
     lines = helped(capsys, "train", "--help").splitlines()
     shown = [line.split()[0] for line in lines if line.startswith("  --")]
-    first = "output preset steps time-limit voxels downscale masks model resume config overwrite"
+    first = "output preset steps time-limit voxels downscale masks split eval-views model resume"
     assert [flag.strip("-,") for flag in shown[:11]] == first.split()
 
 

@@ -69,7 +69,7 @@ def test_the_command_refuses_in_a_sentence_and_writes_nothing(tmp_path: Path) ->
 
 def test_a_run_keeps_its_losses(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    options = ["--model", "rgb", "--steps", "30", "--output", folder]
+    options = ["--model", "rgb", "--steps", "30", "--keep", "checkpoint", "--output", folder]
     code, _, err = run("train", *TINY, *options, "--loss", "distortion=0.01", "entropy=0.002")
     assert code == 0, err
     kept = json.loads((folder / "config.json").read_text())["train"]["loss"]

@@ -180,7 +180,7 @@ def test_downscale_does_not_let_hidden_colour_bleed(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("downscale", [0, -1, 1.5, True, "2"])
 def test_downscale_that_is_no_factor_is_refused(tmp_path: Path, downscale: Any) -> None:
-    with pytest.raises(InputError, match="downscale must be a whole number of at least 1"):
+    with pytest.raises(InputError, match="downscale must be a whole number"):
         load_scene(tmp_path, downscale=downscale)
 
 
@@ -198,7 +198,7 @@ def test_places_without_a_scene_are_refused(tmp_path: Path) -> None:
         ("none", r"none: does not exist; .*builtin:room"),
         ("notes.txt", r"notes\.txt: is not a scene"),
         ("n" * 5000, "does not exist"),
-        ("a\0b", "does not exist"),
+        ("a\0b", "has a character of code 0"),
     ]:
         with pytest.raises(InputError, match=message):
             load_scene(tmp_path / name)

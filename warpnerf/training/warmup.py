@@ -142,6 +142,7 @@ def warm_up(
         of_model = "" if first is None or model == first.model else f", {_options_of(model)}"
         for contraction in _contractions(config):
             sampler = config.sampler_in(SPACES[contraction])
+            proposals = proposal_kernels(sampler, contraction, workers.device, learns=True)
             for kernel in rendering_kernels(
                 model, contraction, workers.device, config.field, sampler
             ):
@@ -159,6 +160,7 @@ def warm_up(
                     sampler,
                 ):
                     words = _words(kernel, contraction, scaling, losses) + of_model
+                    words += ", proposal" * (kernel in proposals)
                     wanted.setdefault(kernel.module, (words, kernel))
     done = []
     for name, kernel in wanted.values():
