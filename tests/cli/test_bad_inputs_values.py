@@ -366,7 +366,7 @@ def test_70_damaged_cached_kernel(tmp_path: Path) -> None:
     cache = tmp_path / "run" / "cache"
     cache.mkdir()
     assert not looked_at(tmp_path, cache).err
-    (machine_code,) = cache.rglob("*render_forward*.o")
+    machine_code = min(cache.rglob("*render_forward*.o"))
     content = bytearray(machine_code.read_bytes())
     content[len(content) // 2] ^= 0x10
     machine_code.write_bytes(content)
