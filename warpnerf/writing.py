@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 
@@ -49,21 +50,21 @@ class StagedWrites:
         if _takes_a_stream(path):
             self._streams.append((path, pieces))
             return
-        path = Path(os.path.realpath(path))
-        temporary = self._beside(path)
-        flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | getattr(os, "O_BINARY", 0)
-        file = os.open(temporary, flags, 0o666)
-        try:
-            for piece in pieces:
-                view = memoryview(piece)
-                while view:
-                    view = view[os.write(file, view[:CHUNK]) :]
-            os.fsync(file)
-        finally:
-            os.close(file)
+        with _naming(path):
+            temporary = self._beside(Path(os.path.realpath(path)))
+            flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | getattr(os, "O_BINARY", 0)
+            file = os.open(temporary, flags, 0o666)
+            try:
+                for piece in pieces:
+                    view = memoryview(piece)
+                    while view:
+                        view = view[os.write(file, view[:CHUNK]) :]
+                os.fsync(file)
+            finally:
+                os.close(file)
 
     def add_folder(self, path: Path, fill: Callable[[Path], None]) -> None:
-        """Fill a folder beside its place, which is new or an empty folder.
+        """Fill a folder beside its place, which is new or an empty folder, or a link to one.
 
         Args:
             path: Of the folder.
@@ -72,8 +73,9 @@ class StagedWrites:
         Raises:
             OSError: It cannot be written.
         """
-        temporary = self._beside(path)
-        temporary.mkdir()
+        with _naming(path):
+            temporary = self._beside(Path(os.path.realpath(path)))
+            temporary.mkdir()
         fill(temporary)
 
     def _beside(self, path: Path) -> Path:
@@ -99,7 +101,8 @@ class StagedWrites:
                     with path.open("wb") as stream:
                         stream.writelines(pieces)
                 for temporary, path in self._ready:
-                    temporary.replace(path)
+                    with _naming(path):
+                        temporary.replace(path)
                     n_renamed += 1
         finally:
             for temporary, _ in self._ready[n_renamed:]:
@@ -107,13 +110,22 @@ class StagedWrites:
                     shutil.rmtree(temporary, ignore_errors=True)
                 else:
                     temporary.unlink(missing_ok=True)
-        if os.name == "posix":
+        if kind is None and os.name == "posix":
             for parent in {path.parent for _, path in self._ready}:
                 folder = os.open(parent, os.O_RDONLY)
                 try:
                     os.fsync(folder)
                 finally:
                     os.close(folder)
+
+
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Errors name the file that is written, not its temporary name."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(error.errno, error.strerror or str(error), str(path)) from error
 
 
 def _takes_a_stream(path: Path) -> bool:

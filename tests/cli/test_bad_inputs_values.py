@@ -269,7 +269,7 @@ def scaled(**changes: Any) -> Any:
             id="63-sparse-corner",
         ),
         pytest.param(
-            scaled, {"colors": np.ones((2, 5, 3))}, "colors must be a Tensor", id="63-scale-numpy"
+            scaled, {"colors": np.ones((2, 5, 3))}, "colors must be a torch", id="63-scale-numpy"
         ),
         pytest.param(
             scaled,

@@ -58,6 +58,28 @@ def test_frames_are_the_cameras_in_the_scenes_coordinates(tmp_path: Path) -> Non
     np.testing.assert_allclose(plain.cameras(5)[2].c2w, poses[2][:3], atol=1e-9)
 
 
+def test_what_was_applied_before_and_an_offset_are_accounted_for(tmp_path: Path) -> None:
+    """As its datasets have it: what its runs keep begins before what transforms.json applied."""
+    applied = np.array([[0.0, 1.0, 0.0, 0.5], [1.0, 0.0, 0.0, -1.0], [0.0, 0.0, -1.0, 2.0]])
+    poses = [pose[:3] for pose in ring(8)[:3]]  # of transforms.json
+    tree = {"applied_transform": applied.tolist(), "applied_scale": 2.0, "frames": []}
+    (tmp_path / "transforms.json").write_text(json.dumps(tree))
+    whole = np.concatenate([TURN @ applied[:, :3], (TURN @ applied[:, 3])[:, None]], axis=1)
+    transforms = tmp_path / "dataparser_transforms.json"
+    transforms.write_text(json.dumps({"transform": whole.tolist(), "scale": 0.5 * 2.0}))
+    theirs = []  # as its data parser turns and scales poses that were applied to
+    for pose in poses:
+        other = np.vstack([TURN @ pose, [0.0, 0.0, 0.0, 1.0]])
+        other[:3, 3] *= 0.5
+        theirs.append(other)
+    offset = (100.0, -200.0, 300.0)
+    path = write(tmp_path, theirs)
+    read = read_nerfstudio_path(path, transforms, tmp_path, offset)
+    for camera, pose in zip(read.cameras(3), poses, strict=True):
+        np.testing.assert_allclose(camera.c2w[:, :3], pose[:, :3], atol=1e-9)
+        np.testing.assert_allclose(camera.c2w[:, 3], pose[:, 3] - np.array(offset), atol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("changes", "says"),
     [

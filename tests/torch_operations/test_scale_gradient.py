@@ -146,3 +146,18 @@ def test_a_content_distance_that_requires_grad_is_refused(device: str) -> None:
     content = torch.ones(1, dtype=torch.float64, device=t.device, requires_grad=True)
     with pytest.raises(InputError, match="content_distance requires grad, but"):
         scale_gradient(colors, sigmas, t, content)
+
+
+def test_it_is_compiled_as_one_graph() -> None:
+    def losing(colors: torch.Tensor, sigmas: torch.Tensor, distances: torch.Tensor) -> torch.Tensor:
+        colors, sigmas, _ = scale_gradient(colors, sigmas, distances, 2.0)
+        return colors.sum() + sigmas.sum()
+
+    compiled = torch.compile(losing, backend="eager", fullgraph=True)
+    grads = []
+    for function in (losing, compiled):
+        colors, sigmas = (torch.ones(shape, requires_grad=True) for shape in ((4, 3), (4,)))
+        function(colors, sigmas, torch.linspace(0.5, 3.0, 4)).backward()
+        grads.append((colors.grad, sigmas.grad))
+    for plain, of_graph in zip(*grads, strict=True):
+        assert torch.equal(plain, of_graph)

@@ -80,6 +80,8 @@ def export_command(
     from warpnerf.runs.scene import load_run_scene
     from warpnerf.scenes.formats.georeference import in_words
 
+    if not files:
+        raise InputError("export: name at least one file to write, such as scene.glb.")
     run = Run(folder)
     config = run.read_config()
     crop = options.crop
@@ -125,11 +127,12 @@ def export_command(
     for file in files:
         print(f"wrote {file}")
     centred = ", ".join(ending for ending in CENTRED if ending in endings)
+    turned = ", in .spz turned so that y points up" if ".spz" in endings else ""
     if views.offset is not None and centred:
         print(
             f"note: coordinates in {centred} are those of the capture's file less "
-            f"{in_words(views.offset)}, for single precision; .ply, .obj, .npz and a folder have "
-            "the file's own"
+            f"{in_words(views.offset)}, for single precision{turned}; .ply, .obj, .npz and a "
+            "folder have the file's own"
         )
     bent = any(camera_model(camera) != "PINHOLE" for camera in views.cameras)
     if "" in endings and bent and not options.pinhole:

@@ -17,6 +17,7 @@ from warpnerf.runtime.progress import ProgressBar
 
 if TYPE_CHECKING:
     from warpnerf.media.recorded_path import RecordedPath
+    from warpnerf.runs.config import RunConfig
     from warpnerf.scenes.cameras.camera import Camera
     from warpnerf.scenes.scene import Scene, View
 
@@ -75,11 +76,12 @@ class RenderOptions:
         """Whether pictures are rendered, and no video."""
         return self.stills is not None or self.photographs is not None
 
-    def recorded(self, scene: str | None) -> RecordedPath | None:
+    def recorded(self, scene: str | None, config: RunConfig) -> RecordedPath | None:
         """The path that was recorded; None: it is of another kind.
 
         Args:
             scene: What --scene names.
+            config: Of the run.
 
         Raises:
             InputError: Options do not go together.
@@ -90,6 +92,8 @@ class RenderOptions:
             checked_depths(self.depths)
         if self.stills is not None and self.photographs is not None:
             raise InputError("--stills is a split, --photographs are named; give one of them.")
+        if self.photographs == ():
+            raise InputError("--photographs names no photograph; name one, or leave it out.")
         stills, path = self.only_stills, self.path
         if self.distance is not None and (stills or path != "back"):
             raise InputError("--distance is how far --path back backs away; give both or neither.")
@@ -100,7 +104,7 @@ class RenderOptions:
             )
         if stills and not (self.fps is None and self.seconds is None):
             raise InputError("--fps and --seconds are of a video, not of --stills; leave them out.")
-        recorded = _recorded(path, self.path_transforms)
+        recorded = _recorded(path, self.path_transforms, config)
         if recorded is not None and scene is not None:
             raise InputError(f"--scene is not needed for the cameras of {path}; leave it out.")
         return recorded
@@ -129,11 +133,11 @@ def render_command(
     from warpnerf.runs.run import Run
     from warpnerf.runs.scene import load_run_scene
 
-    recorded = options.recorded(scene)
-    path, stills, output = options.path, options.only_stills, options.output
-    fps = FPS if options.fps is None else options.fps
     run = Run(folder)
     config = run.read_config()
+    recorded = options.recorded(scene, config)
+    path, stills, output = options.path, options.only_stills, options.output
+    fps = FPS if options.fps is None else options.fps
     if not stills:
         name = "video" if path == "auto" else path if recorded is None else Path(path).stem
         ending = "mov" if options.transparent else "mp4"
@@ -199,7 +203,7 @@ def render_command(
     return 0
 
 
-def _recorded(path: str, transforms: Path | None) -> RecordedPath | None:
+def _recorded(path: str, transforms: Path | None, config: RunConfig) -> RecordedPath | None:
     """The path in a file; None where the name of a kind of path is given."""
     from warpnerf.media.camera_path import PathKind
     from warpnerf.media.nerfstudio_path import TRANSFORMS, read_nerfstudio_path
@@ -227,7 +231,7 @@ def _recorded(path: str, transforms: Path | None) -> RecordedPath | None:
             f"note: no {TRANSFORMS} beside {path}: it is taken to be in the scene's coordinates; "
             "--path-transforms names that of its nerfstudio run"
         )
-    return read_nerfstudio_path(Path(path), transforms)
+    return read_nerfstudio_path(Path(path), transforms, Path(config.scene), config.offset)
 
 
 def _n_frames(fps: float, seconds: float) -> int:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warpnerf.checked import checked_arguments
+from warpnerf.checked import checked, checked_arguments
 from warpnerf.checks import InputError
 from warpnerf.exporting import atlas, mesh, page, splats, spz, surface, volume
 from warpnerf.exporting import cameras as scenes
@@ -57,6 +57,7 @@ CENTRED = (".glb", ".splat.ply", ".spz", ".html", ".nvdb")
 coordinates of the training, less its offset, and the others have those of its file."""
 
 
+@checked("options")
 @dataclass(frozen=True, kw_only=True)
 class ExportOptions:
     """Export options of meshes, and of a folder's photographs."""
@@ -69,6 +70,9 @@ class ExportOptions:
     """Give a .glb texture coordinates and a texture instead of vertex colours."""
     pinhole: bool = False
     """Undistort the photographs of a folder; see ``pinhole_scene``."""
+
+    def __post_init__(self) -> None:
+        """Types are checked; numbers, where they are used."""
 
 
 @checked_arguments

@@ -47,8 +47,6 @@ def _undistorted(view: View) -> View:
         full = np.ones((camera.height, camera.width), bool)
         both = (full if view.mask is None else view.mask) & (full if seen is None else seen)
         mask = _interpolated(both.astype(np.float32)[..., None], low, shares)[..., 0] > COUNTS
-        if not mask.any():
-            mask = None
     image = np.round(_interpolated(view.image, low, shares)).astype(np.uint8)
     return replace(
         view, camera=replace(pinhole, c2w=camera.c2w), image=image, mask=mask, depth=None

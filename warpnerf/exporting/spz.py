@@ -1,4 +1,4 @@
-"""Gaussian splats in Niantic's compressed format, .spz, version 2: about a tenth of a PLY file.
+"""Gaussian splats in Niantic's compressed format, .spz, version 2: about a seventh of a PLY file.
 
 Format: https://github.com/nianticlabs/spz. A gzip stream of a header of 16 bytes, then for all
 splats positions (three fixed-point numbers of 24 bits), opacities, colours, logarithms of scales

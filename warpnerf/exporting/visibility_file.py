@@ -42,6 +42,7 @@ def cached_visibility(
     Returns:
         What they see.
     """
+    file = None if file is None else Path(file)
     if file is None or file.is_symlink():
         return computed.visibility(field, views, on_camera)
     digest = _digest(field, views)

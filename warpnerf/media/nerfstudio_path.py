@@ -7,6 +7,7 @@ turned, moved and scaled by what its runs keep as dataparser_transforms.json.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
@@ -39,19 +40,35 @@ class CameraPath(msgspec.Struct):
     seconds: float | None = None
 
 
+class Applied(msgspec.Struct):
+    """transforms.json, as far as it tells what its poses were before: p of the scene was at
+    applied_scale * (applied_transform @ (p, 1))."""
+
+    applied_transform: list[list[float]] = msgspec.field(default_factory=np.eye(4).tolist)
+    applied_scale: float = 1.0
+
+
 class Transforms(msgspec.Struct):
-    """dataparser_transforms.json: p of the scene is at scale * (transform @ (p, 1))."""
+    """dataparser_transforms.json: what p was before that is at scale * (transform @ (p, 1))."""
 
     transform: list[list[float]]
     scale: float
 
 
-def read_nerfstudio_path(path: Path, transforms: Path | None) -> RecordedPath:
+def read_nerfstudio_path(
+    path: Path,
+    transforms: Path | None,
+    scene: Path | None = None,
+    offset: Sequence[float] | None = None,
+) -> RecordedPath:
     """Read a camera path of nerfstudio in a scene's coordinates.
 
     Args:
         path: Of camera_path.json.
         transforms: Of dataparser_transforms.json; None: the path is in the scene's coordinates.
+        scene: Folder or transforms.json of the scene, whose ``applied_transform`` and
+            ``applied_scale`` are in what ``transforms`` holds; None, or without that file: none.
+        offset: [3] what the scene's coordinates are less than those of its file; None: nothing.
 
     Returns:
         A path whose keys are the frames.
@@ -76,7 +93,9 @@ def read_nerfstudio_path(path: Path, transforms: Path | None) -> RecordedPath:
         raise InputError(f"{path}: camera_path[{wrong}].camera_to_world must be 16 numbers.")
     poses = np.array([frame.camera_to_world for frame in read.camera_path]).reshape(n, 4, 4)[:, :3]
     if transforms is not None:
-        poses = _in_scene(poses, transforms)
+        poses = _in_scene(poses, transforms, _applied(scene))
+    if offset is not None:
+        poses[:, :, 3] -= np.asarray(offset)
     fps = read.fps or 24.0
     seconds = read.seconds if read.seconds and not read.fps else n / fps
     times = np.linspace(0.0, seconds, n) if n > 1 else [0.0]
@@ -88,7 +107,15 @@ def read_nerfstudio_path(path: Path, transforms: Path | None) -> RecordedPath:
     return checked_path(RecordedPath(width=width, height=height, keys=keys), path)
 
 
-def _in_scene(poses: np.ndarray, transforms: Path) -> np.ndarray:
+def _applied(scene: Path | None) -> Applied:
+    """What a scene's transforms.json says was done to its poses before they were written."""
+    file = None if scene is None else scene / "transforms.json" if scene.is_dir() else scene
+    if file is None or file.suffix != ".json" or not file.is_file():
+        return Applied()
+    return read_json(file, Applied)
+
+
+def _in_scene(poses: np.ndarray, transforms: Path, applied: Applied) -> np.ndarray:
     """Poses [n, 3, 4] of nerfstudio's coordinates in the scene's."""
     read = read_json(transforms, Transforms)
     shape = [len(row) for row in read.transform]
@@ -104,4 +131,9 @@ def _in_scene(poses: np.ndarray, transforms: Path) -> np.ndarray:
     moved = poses.copy()
     moved[:, :, :3] = rotation.T @ poses[:, :, :3]
     moved[:, :, 3] = (poses[:, :, 3] / read.scale - shift) @ rotation
+    before = np.array(applied.applied_transform)
+    if before.shape not in ((3, 4), (4, 4)):
+        raise InputError(f"{transforms}: applied_transform of the scene must be 3 x 4 numbers.")
+    moved[:, :, :3] = before[:3, :3] @ moved[:, :, :3]
+    moved[:, :, 3] = applied.applied_scale * (moved[:, :, 3] @ before[:3, :3].T + before[:3, 3])
     return moved

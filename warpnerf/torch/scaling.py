@@ -6,13 +6,11 @@ from typing import Any, get_args
 
 import torch
 
-from warpnerf.checked import checked_arguments
 from warpnerf.checks import InputError, require_one_of, require_positive
 from warpnerf.config import Scaling
 from warpnerf.torch.tensors import require_constant, require_dense, require_tensor
 
 
-@checked_arguments
 def scale_gradient(
     colors: torch.Tensor,
     sigmas: torch.Tensor,
