@@ -56,6 +56,22 @@ def test_a_damaged_model_is_refused_and_not_replaced_by_a_fragment(tmp_path: Pat
     assert "the model sparse/0 of 4 images is read; sparse/1 is damaged" in scene.warnings
 
 
+@pytest.mark.parametrize("text", [False, True])
+def test_a_damaged_fragment_does_not_refuse_a_whole_model(tmp_path: Path, text: bool) -> None:
+    two_models(tmp_path, text)
+    file = tmp_path / "sparse" / "0" / ("images.txt" if text else "images.bin")
+    data = file.read_bytes()
+    file.write_bytes(data.replace(b" 7 002.png", b"") if text else data[:-9])
+    scene = load_scene(tmp_path)
+    assert len(scene.views) == 9
+    assert "the model sparse/1 of 9 images is read; sparse/0 is damaged" in scene.warnings
+    # Cut to the length of a fragment, it still says how large it was.
+    stated = b"# Number of images: 9, mean\n" if text else (9).to_bytes(8, "little")
+    file.write_bytes(stated + file.read_bytes()[0 if text else 8 :])
+    with pytest.raises(InputError, match=r"sparse/0/images\..*another model .*sparse/1\.$"):
+        load_scene(tmp_path)
+
+
 def test_numbered_captures_are_not_models_of_one_scene(tmp_path: Path) -> None:
     for number in (1, 2):
         capture = tmp_path / str(number)

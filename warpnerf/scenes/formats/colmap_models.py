@@ -5,6 +5,7 @@ The mapper writes a model 0, 1, ... for each part of a capture that it could not
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections.abc import Sequence
@@ -17,12 +18,17 @@ from warpnerf.scenes.formats.colmap_files import (
     ModelImage,
     images_of_bytes,
     images_of_text,
+    stated_images,
 )
 
 SPARSE = "sparse"
 MODEL_FOLDERS = (SPARSE, f"colmap/{SPARSE}", ".")
 """Where models are looked for in a scene's folder, in this order: there, and first in 0, 1, ... of
 a folder sparse, or of one with photographs of which these have none."""
+
+CLEARLY_SMALLER = 0.8
+"""Share of the images of the largest model that can be read, below which a damaged one is a
+fragment that nobody misses; above it, it may be what was meant."""
 
 
 def find_model(folder: Path) -> Path | None:
@@ -42,7 +48,7 @@ def find_models(folder: Path) -> list[Path]:
     for name in MODEL_FOLDERS:
         models = _models_in(folder / name)
         if models:
-            return models if len(models) == 1 else sorted(models, key=_rank)
+            return models if len(models) == 1 else _by_size(models)
     return []
 
 
@@ -82,10 +88,48 @@ def size_of(model: Path) -> int | None:
         return None
 
 
-def _rank(model: Path) -> float:
-    """Larger models come first, and damaged ones before all: they are refused, not skipped."""
-    size = size_of(model)
-    return -float("inf") if size is None else -size
+def _by_size(models: Sequence[Path]) -> list[Path]:
+    """Larger models first. Damaged ones come before all, as they are refused, not skipped; but last
+    if they are clearly smaller than the largest whole one."""
+    sizes = {path: size_of(path) for path in models}
+    whole = {path: size for path, size in sizes.items() if size is not None}
+    largest = max(whole, key=lambda path: whole[path], default=None)
+
+    def rank(path: Path) -> float:
+        size = sizes[path]
+        if size is not None:
+            return -size
+        fragment = largest is not None and (
+            _may_have_had(path, largest, whole[largest]) < CLEARLY_SMALLER * whole[largest]
+        )
+        return math.inf if fragment else -math.inf
+
+    return sorted(models, key=rank)
+
+
+def _may_have_had(model: Path, other: Path, n: int) -> float:
+    """About how many images a damaged model had, by the number that its file states and by its
+    length, compared with that of another model of n images; infinity where these do not tell."""
+    kind, kind_of_other = model_kind(model), model_kind(other)
+    file = model / f"images.{kind}"
+    told: list[float] = []
+    try:
+        require_regular_file(file)
+        if kind == kind_of_other:
+            there = (other / f"images.{kind}").stat().st_size
+            told.append(file.stat().st_size / there * n)
+        if kind == "bin":
+            with file.open("rb") as opened:
+                head = opened.read(8)
+            if len(head) < 8:  # a copy that broke off at once
+                return math.inf
+            told.append(int.from_bytes(head, "little"))
+        else:
+            told.append(stated_images(file) or -math.inf)
+    except (InputError, OSError, UnicodeDecodeError):
+        return math.inf
+    most = max(told)
+    return math.inf if most < 0.0 else most
 
 
 def images_of(model: Path) -> list[ModelImage]:
