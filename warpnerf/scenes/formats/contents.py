@@ -11,6 +11,7 @@ from warpnerf.scenes.files import exists
 from warpnerf.scenes.formats import llff
 from warpnerf.scenes.formats.blender import SPLITS, split_file
 from warpnerf.scenes.formats.colmap_models import find_model
+from warpnerf.scenes.formats.found_photographs import is_written
 from warpnerf.scenes.formats.npz import is_scene_file, single_npz
 from warpnerf.scenes.formats.programs import exports_in
 from warpnerf.scenes.images.masks import without_masks
@@ -116,7 +117,7 @@ def _what_is_there(folder: Path) -> str:
     unread = unread_photographs(folder)
     if unread:
         return f"it holds {len(unread)} photographs as {_kind(unread[0])}; convert them to JPEG"
-    deeper = [path for path in inner if photographs_in(path)]
+    deeper = [path for path in inner if photographs_in(path) and not is_written(path)]
     if deeper:
         first = shlex.quote(str(deeper[0]))
         n = len(photographs_in(deeper[0]))
