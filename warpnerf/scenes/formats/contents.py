@@ -66,7 +66,7 @@ def unread_photographs(folder: Path) -> list[Path]:
 def is_unposed(path: Path) -> bool:
     """Whether a path leads to what poses can be estimated of: photographs without any, a video.
 
-    A COLMAP model in any folder within is not passed over unasked.
+    A COLMAP model in any folder within is not skipped unasked.
     """
     if path.is_dir():
         posed = holds_scene(path) or _lacking(path, BESIDE_PHOTOGRAPHS) is not None
