@@ -11,6 +11,8 @@ from tests.scenes.test_colmap import scene_with_model, write_model
 from tests.support.tiny_scenes import write_transforms
 from warpnerf.checks import InputError
 from warpnerf.inspection.inspection import inspect
+from warpnerf.scenes.formats.colmap_models import find_model
+from warpnerf.scenes.formats.contents import is_unposed, what_is_there
 from warpnerf.scenes.formats.load import load_scene
 
 
@@ -54,6 +56,22 @@ def test_a_damaged_model_is_refused_and_not_replaced_by_a_fragment(tmp_path: Pat
     assert "the model sparse/0 of 4 images is read; sparse/1 is damaged" in scene.warnings
 
 
+@pytest.mark.parametrize("text", [False, True])
+def test_a_damaged_fragment_does_not_refuse_a_whole_model(tmp_path: Path, text: bool) -> None:
+    two_models(tmp_path, text)
+    file = tmp_path / "sparse" / "0" / ("images.txt" if text else "images.bin")
+    data = file.read_bytes()
+    file.write_bytes(data.replace(b" 7 002.png", b"") if text else data[:-9])
+    scene = load_scene(tmp_path)
+    assert len(scene.views) == 9
+    assert "the model sparse/1 of 9 images is read; sparse/0 is damaged" in scene.warnings
+    # Cut to the length of a fragment, it still says how large it was.
+    stated = b"# Number of images: 9, mean\n" if text else (9).to_bytes(8, "little")
+    file.write_bytes(stated + file.read_bytes()[0 if text else 8 :])
+    with pytest.raises(InputError, match=r"sparse/0/images\..*another model .*sparse/1\.$"):
+        load_scene(tmp_path)
+
+
 def test_numbered_captures_are_not_models_of_one_scene(tmp_path: Path) -> None:
     for number in (1, 2):
         capture = tmp_path / str(number)
@@ -69,6 +87,41 @@ def test_numbered_captures_are_not_models_of_one_scene(tmp_path: Path) -> None:
     (tmp_path / "1" / "images").rename(tmp_path / "1" / "elsewhere")
     with pytest.raises(InputError, match=r"put them into .*/1/images"):
         load_scene(tmp_path / "1")
+
+
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_a_sparse_folder_may_be_a_link(tmp_path: Path, elsewhere: bool) -> None:
+    capture = tmp_path / "capture"
+    two_models(capture, False)
+    out = tmp_path / "disk" / "a" / "b" / "out" if elsewhere else capture / "out"
+    out.parent.mkdir(parents=True, exist_ok=True)
+    (capture / "sparse").rename(out)
+    (capture / "sparse").symlink_to(out)
+    assert not is_unposed(capture)
+    for path in (capture, capture / "sparse", capture / "sparse" / "1"):
+        scene = load_scene(path)
+        assert (scene.name, len(scene.views)) == ("capture", 9)
+        assert any(note.endswith("out/0 has 4") for note in scene.notes)
+
+
+def test_models_may_lie_beside_their_photographs(tmp_path: Path) -> None:
+    two_models(tmp_path, True)
+    for number in "01":
+        (tmp_path / "sparse" / number).rename(tmp_path / number)
+    assert not is_unposed(tmp_path)
+    for path in (tmp_path, tmp_path / "1"):
+        scene = load_scene(path)
+        assert len(scene.views) == 9
+        assert "the model 1 of 9 images is read; 0 has 4" in scene.notes
+
+
+def test_models_in_a_renamed_folder_are_named_and_no_poses_are_estimated(tmp_path: Path) -> None:
+    two_models(tmp_path, False)
+    (tmp_path / "sparse").rename(tmp_path / "out")
+    assert find_model(tmp_path) is None
+    assert not is_unposed(tmp_path)
+    assert "its folder out holds one; use" in what_is_there(tmp_path)
+    assert len(load_scene(tmp_path / "out").views) == 9
 
 
 def test_masks_and_thumbnails_below_the_photographs_are_none(tmp_path: Path) -> None:

@@ -37,6 +37,12 @@ def half_a_model(folder: Path) -> None:
     assert not is_unposed(folder)
 
 
+def a_run(folder: Path) -> None:
+    photographs(folder / "run", ending="png")
+    for name in ("config.json", "log.jsonl"):
+        (folder / "run" / name).touch()
+
+
 def two_scenes(folder: Path) -> None:
     write_transforms(folder / "a")
     write_transforms(folder / "b")
@@ -58,6 +64,7 @@ def two_scenes(folder: Path) -> None:
         (half_a_model, r"lacks sparse/0/images\.bin; .* again, or .* `warpnerf pose .*s --output"),
         (empty_file("images.txt"), r"its COLMAP model lacks cameras\.txt"),
         (empty_file("database.db"), "a database of COLMAP but no model"),
+        (a_run, "it holds neither poses nor photographs nor a video"),
         (empty_file("notes.odt"), "neither poses nor photographs nor a video"),
         (lambda f: None, "it is empty"),
     ],

@@ -61,6 +61,19 @@ def test_masks_beside_photographs_are_no_photographs(tmp_path: Path) -> None:
     assert np.array_equal(mask, np.eye(6, 8, dtype=bool))
 
 
+@pytest.mark.parametrize("near", [0.0, -1.0])
+def test_dummy_bounds_are_not_used(tmp_path: Path, near: float) -> None:
+    file = write_llff(tmp_path)
+    assert load_scene(tmp_path).bounds is not None
+    rows = rows_of(4)
+    rows[1:, 15:] = near, 5.0
+    np.save(file, rows)
+    scene = load_scene(tmp_path)
+    assert scene.bounds is None
+    said = f"the near bound of 3 of 4 rows is not above 0 (first: row 1, {near:.4g} with 5)"
+    assert any(warning.endswith(said) for warning in scene.warnings)
+
+
 def test_what_is_wrong_is_named(tmp_path: Path) -> None:
     file = write_llff(tmp_path)
     rows = rows_of(4)

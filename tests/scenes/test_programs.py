@@ -293,3 +293,41 @@ def test_other_files_of_the_same_endings_are_no_scenes(tmp_path: Path) -> None:
     assert survey(tmp_path).format == "none"
     with pytest.raises(InputError, match="no scene found"):
         load_scene(tmp_path)
+
+
+def beside_the_file(folder: Path, write: Callable[[Path], Path]) -> None:
+    """As exported, but with the photographs beside the file."""
+    write(folder)
+    for path in (folder / "images").iterdir():
+        path.rename(folder / path.name)
+    (folder / "images").rmdir()
+
+
+@pytest.mark.parametrize("write", [write_metashape, write_reality])
+@pytest.mark.parametrize(
+    ("files", "inside"),
+    [
+        (("config.json", "log.jsonl"), "test"),
+        (("config.json", "test/metrics.json"), "test"),
+        (("config.json", "log.jsonl"), "scene/photographs"),
+        (("pose.json", "transforms.json"), "photographs"),
+    ],
+)
+def test_a_run_in_the_folder_holds_no_photographs(
+    tmp_path: Path, write: Callable[[Path], Path], files: tuple[str, ...], inside: str
+) -> None:
+    beside_the_file(tmp_path, write)
+    run = tmp_path / "runs" / "a"
+    for name in files:
+        (run / name).parent.mkdir(parents=True, exist_ok=True)
+        (run / name).touch()
+    write_pictures(run / inside, ["000.png", "001.png.png"])
+    scene = load_scene(tmp_path)
+    assert [view.name for view in scene.views] == [f"{k:03d}.png" for k in range(4)]
+    assert not any("have no camera" in said for said in (*scene.notes, *scene.warnings))
+
+
+def test_an_exact_file_name_comes_before_a_stem(tmp_path: Path) -> None:
+    beside_the_file(tmp_path, write_reality)
+    write_pictures(tmp_path / "rendered", ["000.png.png"])
+    assert "000.png" in [view.name for view in load_scene(tmp_path).views]

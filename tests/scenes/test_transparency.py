@@ -48,6 +48,14 @@ def between(seed: int, share: float) -> np.ndarray:
     return abs(U - (W - 1) / 2) > W / 2 * (1.0 - share) + waist
 
 
+def bust(seed: int) -> np.ndarray:
+    """Around a head and shoulders, which reach into both lower corners."""
+    at = W / 2 + 9.0 * np.sin(seed)
+    shoulders = ((U - (W - 1) / 2) / 39.0) ** 2 + ((V - (H - 1)) / 26.0) ** 2 < 1.0
+    head = ((U - at) / 11.0) ** 2 + ((V - 20) / 15.0) ** 2 < 1.0
+    return ~(shoulders | head)
+
+
 NOTHING = np.zeros((H, W), dtype=bool)
 ONE = NOTHING.copy()
 ONE[0, 0] = True
@@ -72,6 +80,8 @@ ONE[0, 0] = True
         pytest.param([below_the_sky(k, 0.3) for k in range(9)], False, id="no sky"),
         pytest.param([below_the_sky(k, 0.1) for k in range(9)], False, id="little sky"),
         pytest.param([below_the_sky(k, 0.2)[::-1] for k in range(9)], False, id="no floor"),
+        pytest.param([below_the_sky(k, 0.6) for k in range(9)], False, id="much sky"),
+        pytest.param([bust(k) for k in range(9)], True, id="a bust"),
         *(
             pytest.param([between(k, share) for k in range(9)], True, id=f"object, {share:.1%}")
             for share in (0.125, 0.165, 0.17)
@@ -90,6 +100,12 @@ def test_an_object_that_fills_the_picture_is_told_by_its_outline() -> None:
     few = [3 + 2 * k > U for k in range(9)]
     assert 0.02 < np.median([image.mean() for image in few]) < 0.15
     assert show_an_object(few)
+
+
+def test_a_bust_reaches_both_lower_corners() -> None:
+    seen = ~bust(0)
+    assert seen[-3:, :4].mean() > 0.5 and seen[-3:, -4:].mean() > 0.5
+    assert 0.4 < bust(0).mean() < 0.6
 
 
 def test_almost_opaque_is_opaque() -> None:

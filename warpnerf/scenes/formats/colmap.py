@@ -9,10 +9,8 @@ from __future__ import annotations
 
 import math
 import os
-import re
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
@@ -24,7 +22,6 @@ from warpnerf.scenes.cameras.lens import Lens
 from warpnerf.scenes.cameras.poses import check_pose
 from warpnerf.scenes.extent.points import Points
 from warpnerf.scenes.files import (
-    exists,
     find_image,
     photograph_folder,
     printable,
@@ -41,6 +38,15 @@ from warpnerf.scenes.formats.colmap_files import (
     images_of_text,
     stated_images,
 )
+from warpnerf.scenes.formats.colmap_models import (
+    beside,
+    find_models,
+    images_of,
+    model_kind,
+    other_models,
+    scene_folder,
+    size_of,
+)
 from warpnerf.scenes.formats.colmap_points import UnusablePlyError, read_points
 from warpnerf.scenes.formats.frame import Frame
 from warpnerf.scenes.formats.llff import ENDINGS
@@ -51,11 +57,6 @@ from warpnerf.scenes.images.photographs import KEEPING, Keeping
 from warpnerf.scenes.scene import Scene
 from warpnerf.scenes.split import Split
 
-SPARSE = "sparse"
-MODEL_FOLDERS = (SPARSE, f"colmap/{SPARSE}", ".")
-"""Where models are looked for in a scene's folder, in this order: there, and where that is a folder
-sparse, first in its 0, 1, ..."""
-
 UNPOSED = 0.1
 """Share of the photographs that are not in the model, above which that is a warning."""
 
@@ -63,58 +64,6 @@ SAME = 0.02
 """Largest difference of two cameras that are one: in spreads of all, and of unit vectors."""
 MIN_SAME = 0.5
 """Share of a scene's cameras that must be a model's for the model's points to be the scene's."""
-
-
-def find_model(folder: Path) -> Path | None:
-    """The folder of a model that belongs to a scene's folder: of several the one of most images.
-
-    Args:
-        folder: The scene's.
-
-    Returns:
-        Where cameras and images are; None where there is no model.
-    """
-    return next(iter(_find_models(folder)), None)
-
-
-def _find_models(folder: Path) -> list[Path]:
-    """All models at the first place that has some, that of most images first."""
-    for name in MODEL_FOLDERS:
-        models = _models_in(folder / name)
-        if models:
-            return models if len(models) == 1 else sorted(models, key=_rank)
-    return []
-
-
-def _models_in(place: Path) -> list[Path]:
-    """The models 0, 1, ... of a folder sparse, and any folder itself if it is one."""
-    numbered: list[Path] = []
-    if place.resolve().name == SPARSE:  # elsewhere numbered folders are captures of their own
-        with suppress(OSError):
-            numbered = [path for path in place.iterdir() if re.fullmatch(r"\d{1,4}", path.name)]
-    numbered.sort(key=lambda path: int(path.name))
-    return [path for path in (*numbered, place) if model_kind(path) is not None]
-
-
-def _size(model: Path) -> int | None:
-    """How many images a model has; None where it cannot be read."""
-    try:
-        return len(_images(model))
-    except (InputError, OSError):
-        return None
-
-
-def _rank(model: Path) -> float:
-    """Larger models come first, and damaged ones before all: they are refused, not skipped."""
-    size = _size(model)
-    return -math.inf if size is None else -size
-
-
-def _images(model: Path) -> list[ModelImage]:
-    kind = model_kind(model)
-    file = model / f"images.{kind}"
-    require_regular_file(file)
-    return (images_of_bytes if kind == "bin" else images_of_text)(file)
 
 
 def _require_once(file: Path, images: Sequence[ModelImage]) -> None:
@@ -126,36 +75,6 @@ def _require_once(file: Path, images: Sequence[ModelImage]) -> None:
                 f"{file}: {n} images have the {what} {printable(str(most)[:80])}; remove all but "
                 "one of them, or export it again."
             )
-
-
-def _others(model: Path, n: int, folder: Path) -> tuple[list[str], list[str]]:
-    """Notes and warnings of models beside that of n images that is read."""
-    sizes = {path: _size(path) for path in _beside(model)}
-    if not sizes:
-        return [], []
-    model = model.resolve()
-
-    def name(path: Path) -> str:
-        return printable(Path(os.path.relpath(path, folder)).as_posix())
-
-    rest = ", ".join(
-        f"{name(path)} {'is damaged' if size is None else f'has {size}'}"
-        for path, size in sizes.items()
-    )
-    said = [f"the model {name(model)} of {n} images is read; {rest}"]
-    return ([], said) if any(size is None or size > n for size in sizes.values()) else (said, [])
-
-
-def _beside(model: Path) -> list[Path]:
-    """The other models of the same scene."""
-    model = model.resolve()
-    place = model.parent if _is_numbered(model) else model
-    return [path for path in _models_in(place) if path != model]
-
-
-def _is_numbered(model: Path) -> bool:
-    """Whether a folder is one of the models 0, 1, ... of a folder sparse."""
-    return model.name.isdecimal() and model.parent.name == SPARSE
 
 
 def _unposed(photographs: Path, used: set[Path]) -> tuple[list[str], list[str]]:
@@ -179,30 +98,6 @@ def _unposed(photographs: Path, used: set[Path]) -> tuple[list[str], list[str]]:
         f"model (first: {printable(left[0].relative_to(photographs).as_posix()[:80])})"
     ]
     return ([], said) if len(left) > UNPOSED * len(there) else (said, [])
-
-
-def model_kind(folder: Path) -> str | None:
-    """Whether a folder holds a model: "bin", "txt" or None."""
-    for kind in ("bin", "txt"):
-        if exists(folder / f"cameras.{kind}") and exists(folder / f"images.{kind}"):
-            return kind
-    return None
-
-
-def scene_folder(model: Path) -> Path:
-    """The scene's folder that a model's folder belongs to: the one that holds the photographs.
-
-    Where there are none, the one that they should be in.
-    """
-    model = model.resolve()
-    folders = (model, *list(model.parents)[:3])
-    for folder in folders:
-        if photograph_folder(folder) is not None:
-            return folder
-    names = ("colmap", SPARSE)  # of folders in a scene's that lead to its model
-    if _is_numbered(model):
-        folders = folders[1:]
-    return next((folder for folder in folders if folder.name not in names), model)
 
 
 def load_colmap(
@@ -244,7 +139,7 @@ def load_colmap(
         cameras, images = read_cameras(camera_file), read_images(image_file)
         _require_once(image_file, images)
     except InputError as error:
-        others = [path for path in _beside(model) if _size(path)]
+        others = [path for path in beside(model) if size_of(path)]
         if not others:
             raise
         way_out = f"or name another model of the scene, such as {printable(str(others[0]))}"
@@ -302,7 +197,7 @@ def load_colmap(
             f"{image_file.name}: left out {len(missing)} of {len(images)} images for want of a "
             f"photograph (first: {missing[0]})"
         )
-    notes, larger = _others(model, len(images), folder)
+    notes, larger = other_models(model, len(images), folder)
     few, many = _unposed(photographs, {frame.path for frame in frames})
     there, of_model = {frame.name for frame in frames}, {image.name for image in images}
     splits, listed, lost = read_split_lists(folder, there, of_model)
@@ -340,7 +235,7 @@ def points_beside(folder: Path, frames: Sequence[Frame]) -> tuple[Points | None,
         None, and why a model that is there is not used.
     """
     why_not = ""
-    for model in _find_models(folder):
+    for model in find_models(folder):
         points, why = _points_of(model, folder, frames)
         if not why:
             return points, ""
@@ -352,7 +247,7 @@ def _points_of(model: Path, folder: Path, frames: Sequence[Frame]) -> tuple[Poin
     """As ``points_beside``, of one model."""
     place = model.relative_to(folder).as_posix()
     try:
-        images = _images(model)
+        images = images_of(model)
         by_name = {image.name.replace("\\", "/").rpartition("/")[2]: image for image in images}
         pairs = [(f, by_name[f.path.name]) for f in frames if f.path.name in by_name]
         poses = np.array([_pose(image, f"{model}: {image.name}") for _, image in pairs])

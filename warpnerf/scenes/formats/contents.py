@@ -10,7 +10,8 @@ from warpnerf.checks import InputError
 from warpnerf.scenes.files import exists
 from warpnerf.scenes.formats import llff
 from warpnerf.scenes.formats.blender import SPLITS, split_file
-from warpnerf.scenes.formats.colmap import find_model
+from warpnerf.scenes.formats.colmap_models import find_model
+from warpnerf.scenes.formats.found_photographs import is_written
 from warpnerf.scenes.formats.npz import is_scene_file, single_npz
 from warpnerf.scenes.formats.programs import exports_in
 from warpnerf.scenes.images.masks import without_masks
@@ -63,10 +64,15 @@ def unread_photographs(folder: Path) -> list[Path]:
 
 
 def is_unposed(path: Path) -> bool:
-    """Whether a path leads to what poses can be estimated of: photographs without any, a video."""
+    """Whether a path leads to what poses can be estimated of: photographs without any, a video.
+
+    A COLMAP model in any folder within is not skipped unasked.
+    """
     if path.is_dir():
         posed = holds_scene(path) or _lacking(path, BESIDE_PHOTOGRAPHS) is not None
-        return not posed and len(photographs_in(path)) >= NEEDED
+        if posed or len(photographs_in(path)) < NEEDED:
+            return False
+        return all(find_model(inner) is None for inner in _entries(path) if inner.is_dir())
     return path.suffix.lower() in VIDEOS and exists(path)
 
 
@@ -111,7 +117,7 @@ def _what_is_there(folder: Path) -> str:
     unread = unread_photographs(folder)
     if unread:
         return f"it holds {len(unread)} photographs as {_kind(unread[0])}; convert them to JPEG"
-    deeper = [path for path in inner if photographs_in(path)]
+    deeper = [path for path in inner if photographs_in(path) and not is_written(path)]
     if deeper:
         first = shlex.quote(str(deeper[0]))
         n = len(photographs_in(deeper[0]))

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from warpnerf.checks import InputError
-from warpnerf.scenes.files import IMAGE_SUFFIXES, printable
-from warpnerf.scenes.formats.assemble import assemble
+from warpnerf.scenes.files import IMAGE_SUFFIXES, exists, printable
+from warpnerf.scenes.formats.assemble import POSED, assemble
 from warpnerf.scenes.formats.frame import Frame
 from warpnerf.scenes.formats.llff import ENDINGS
 from warpnerf.scenes.images.masks import without_masks
@@ -44,9 +44,10 @@ class Photographs:
         self.root = among or (images if images.is_dir() else folder)
         self.paths = _photographs_below(self.root)
         self._by_name: dict[str, list[Path]] = {}
+        self._by_stem: dict[str, list[Path]] = {}
         for path in self.paths:
-            for key in {path.name.casefold(), path.stem.casefold()}:
-                self._by_name.setdefault(key, []).append(path)
+            self._by_name.setdefault(path.name.casefold(), []).append(path)
+            self._by_stem.setdefault(path.stem.casefold(), []).append(path)
 
     def find(self, name: str, field: str) -> Path | None:
         """The photograph of a name, with or without folders and extension; None: it is not there.
@@ -58,7 +59,8 @@ class Photographs:
         stem, dot, ending = last.rpartition(".")
         keys = [last, stem] if dot and f".{ending.lower()}" in (*ENDINGS, ".tif") else [last]
         for key in keys:
-            found = self._by_name.get(key.casefold(), [])
+            key = key.casefold()
+            found = self._by_name.get(key) or self._by_stem.get(key, [])
             while len(found) > 1 and folders:
                 below = folders.pop().casefold()
                 found = [path for path in found if path.parent.name.casefold() == below] or found
@@ -107,14 +109,25 @@ class Photographs:
         return ([], said) if len(left) > UNPOSED * len(self.paths) else (said, [])
 
 
+def is_written(folder: Path) -> bool:
+    """Whether a folder is a run's or a posed scene: its images are renderings, or photographs of
+    another folder again."""
+    is_run = exists(folder / "config.json") and (
+        exists(folder / "log.jsonl") or exists(folder / "test")
+    )
+    return is_run or exists(folder / POSED)
+
+
 def _photographs_below(root: Path) -> list[Path]:
-    """All photographs in a folder and in folders within it, by name."""
+    """All photographs in a folder and in folders within it, by name, but those in runs."""
     found: list[Path] = []
     for place, folders, names in os.walk(root):
         folders[:] = sorted(
             name
             for name in folders
-            if not name.startswith(".") and not NO_PHOTOGRAPHS.fullmatch(name)
+            if not name.startswith(".")
+            and not NO_PHOTOGRAPHS.fullmatch(name)
+            and not is_written(Path(place) / name)
         )
         found += [
             Path(place) / name

@@ -2,7 +2,8 @@
 
 Each row holds a matrix [3, 5], camera to world with axes down, right, backward and, in its last
 column, height, width and focal length in pixels of the original photographs; then two bounds of
-depth, between which what the photograph shows lies.
+depth, between which what the photograph shows lies. Some programs write 0 for the nearer one, where
+they know none; then bounds are not used.
 """
 
 from __future__ import annotations
@@ -75,10 +76,11 @@ def load_llff(
         height, width, focal = size.tolist()
         if min(height, width, focal) <= 0.0:
             raise InputError(f"{file}: {place}: height, width and focal length must be above 0.")
-        if not 0.0 < row[15] < row[16]:
+        near, far = row[15:].tolist()
+        if near >= far:
             raise InputError(
-                f"{file}: {place}: the near bound must be above 0 and below the far bound, not "
-                f"{row[15]:.4g} with {row[16]:.4g}; they are its last two numbers, in this order."
+                f"{file}: {place}: the near bound must be below the far bound, not {near:.4g} with "
+                f"{far:.4g}; they are its last two numbers, in this order."
             )
         pose = np.stack([right, -down, backward, position], axis=1)
         # As angles of view, which hold for reduced photographs as well.
@@ -93,15 +95,23 @@ def load_llff(
                 path=path,
                 c2w=check_pose(pose.tolist(), field=f"{file}: {place}"),
                 lens=Lens(file=file, values=angles, fields=fields),
-                bounds=(float(row[15]), float(row[16])),
+                bounds=(near, far) if near > 0.0 else None,
             )
+        )
+    dummies = [number for number, frame in enumerate(frames) if frame.bounds is None]
+    warnings = []
+    if dummies:
+        near, far = rows[dummies[0], 15:].tolist()
+        warnings.append(
+            f"{FILE}: bounds of depth are not used: the near bound of {len(dummies)} of "
+            f"{len(rows)} rows is not above 0 (first: row {dummies[0]}, {near:.4g} with {far:.4g})"
         )
     return assemble(
         folder=folder,
         file=file,
         frames=frames,
         splits={},
-        warnings=(),
+        warnings=warnings,
         downscale=downscale,
         masks=masks,
         keeping=keeping,

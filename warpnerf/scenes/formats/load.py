@@ -15,7 +15,8 @@ from warpnerf.runtime.memory import require_threads
 from warpnerf.scenes.files import exists
 from warpnerf.scenes.formats import llff
 from warpnerf.scenes.formats.blender import SPLITS, load_blender, split_file
-from warpnerf.scenes.formats.colmap import find_model, load_colmap
+from warpnerf.scenes.formats.colmap import load_colmap
+from warpnerf.scenes.formats.colmap_models import find_model
 from warpnerf.scenes.formats.contents import VIDEOS, is_unposed, pose_command, what_is_there
 from warpnerf.scenes.formats.found_photographs import Reading
 from warpnerf.scenes.formats.npz import load_npz, single_npz

@@ -13,7 +13,7 @@ from warpnerf.scenes.cameras.poses import check_pose
 from warpnerf.scenes.files import exists, printable, read_json
 from warpnerf.scenes.formats import llff
 from warpnerf.scenes.formats.blender import SPLITS, split_file
-from warpnerf.scenes.formats.colmap import find_model, model_kind
+from warpnerf.scenes.formats.colmap_models import find_model, model_kind
 from warpnerf.scenes.formats.npz import is_scene_file, single_npz
 from warpnerf.scenes.formats.programs import export_of, exports_in
 from warpnerf.scenes.formats.transforms import FrameEntry, TransformsFile

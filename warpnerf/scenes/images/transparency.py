@@ -15,7 +15,8 @@ import numpy as np
 from warpnerf.scenes.images.images import image_shape, read_image
 
 FREE = 0.15
-"""Share of transparent pixels from which on what is alike in all views may be an object, too."""
+"""Share of transparent pixels from which on what is alike in all views may be an object, too, and
+one that changes may reach two corners, as a bust does."""
 FEW = 0.02
 """Share below which photographs show none."""
 SAME_OUTLINE = 0.95
@@ -23,6 +24,8 @@ SAME_OUTLINE = 0.95
 its outline changes."""
 EDGE = 0.05
 """Share of a picture's sides that counts as their edge, and in both directions as a corner."""
+WHOLE = 0.99
+"""Share of the pixels along an edge that show something if it is seen over its whole width."""
 RECTANGLE = 0.98
 """Share of the pixels of the smallest box around a shape that the shape fills if it is one."""
 ROWS_LOOKED_AT = 128
@@ -59,7 +62,8 @@ def show_an_object(transparent: Sequence[np.ndarray]) -> bool:
     if np.mean([image.mean() for image in common]) >= SAME_OUTLINE * np.mean(shares):
         of_a_lens = share <= MOST_OF_A_LENS and all(_is_of_a_lens(~image) for image in common)
         return share >= FREE and not of_a_lens
-    cut = [_has_a_ground(~image) for image in transparent if image.any()]
+    has_a_ground = _has_a_whole_edge if share >= FREE else _has_two_corners
+    cut = [has_a_ground(~image) for image in transparent if image.any()]
     return bool(np.mean(cut) < 0.5)
 
 
@@ -74,9 +78,16 @@ def _is_of_a_lens(seen: np.ndarray) -> bool:
     return bool(box.size and box.mean() >= RECTANGLE)
 
 
-def _has_a_ground(seen: np.ndarray) -> bool:
+def _has_a_whole_edge(seen: np.ndarray) -> bool:
+    """Whether the lower or the upper edge shows something over its whole width, as a ground does
+    from which the sky was cut out, or a room without its floor."""
+    rows, _ = _edge(seen)
+    return bool(max(seen[-rows:].mean(), seen[:rows].mean()) >= WHOLE)
+
+
+def _has_two_corners(seen: np.ndarray) -> bool:
     """Whether both lower or both upper corners show something: an object that stands free leaves
-    them empty, a view from which the sky was cut out, or a floor, does not."""
+    them empty, a view from which little sky was cut out, or a floor, does not."""
     rows, columns = _edge(seen)
     return any(
         seen[v, :columns].mean() > 0.5 and seen[v, -columns:].mean() > 0.5

@@ -1,0 +1,198 @@
+"""COLMAP's sparse models in a capture's folder: which there are, and which of them is the scene's.
+
+The mapper writes a model 0, 1, ... for each part of a capture that it could not connect to others.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from warpnerf.checks import InputError
+from warpnerf.scenes.files import exists, photograph_folder, printable, require_regular_file
+from warpnerf.scenes.formats.colmap_files import (
+    ModelImage,
+    images_of_bytes,
+    images_of_text,
+    stated_images,
+)
+
+SPARSE = "sparse"
+MODEL_FOLDERS = (SPARSE, f"colmap/{SPARSE}", ".")
+"""Where models are looked for in a scene's folder, in this order: there, and first in 0, 1, ... of
+a folder sparse, or of one with photographs of which these have none."""
+
+CLEARLY_SMALLER = 0.8
+"""Share of the images of the largest model that can be read, below which a damaged one is a
+fragment that nobody misses; above it, it may be what was meant."""
+
+
+def find_model(folder: Path) -> Path | None:
+    """The folder of a COLMAP model that belongs to a scene's folder: of several the largest.
+
+    Args:
+        folder: The scene's.
+
+    Returns:
+        Where cameras and images are; None where there is no model.
+    """
+    return next(iter(find_models(folder)), None)
+
+
+def find_models(folder: Path) -> list[Path]:
+    """All models at the first place in a scene's folder that has some, the largest first."""
+    for name in MODEL_FOLDERS:
+        models = _models_in(folder / name)
+        if models:
+            return models if len(models) == 1 else _by_size(models)
+    return []
+
+
+def _models_in(place: Path) -> list[Path]:
+    """The models 0, 1, ... of a folder, and itself if it is one."""
+    numbered: list[Path] = []
+    with suppress(OSError):
+        numbered = [path for path in place.iterdir() if re.fullmatch(r"\d{1,4}", path.name)]
+    numbered = [path for path in numbered if model_kind(path) is not None and is_numbered(path)]
+    numbered.sort(key=lambda path: int(path.name))
+    return [*numbered, place] if model_kind(place) is not None else numbered
+
+
+def is_numbered(model: Path) -> bool:
+    """Whether a folder is one of several models 0, 1, ... of a scene, not a capture of its own."""
+    model = model.absolute()
+    return model.name.isdecimal() and (_is_sparse(model.parent) or _has_none_of(model))
+
+
+def _is_sparse(place: Path) -> bool:
+    """Whether a folder is called sparse, be it a link, or what a link leads to."""
+    return SPARSE in (place.name, place.resolve().name)
+
+
+def _has_none_of(model: Path) -> bool:
+    """Whether the photographs of a numbered model are in the folder above it, or beside that."""
+    if photograph_folder(model) is not None:
+        return False
+    return any(photograph_folder(folder) is not None for folder in list(model.parents)[:2])
+
+
+def size_of(model: Path) -> int | None:
+    """How many images a model has; None where it cannot be read."""
+    try:
+        return len(images_of(model))
+    except (InputError, OSError):
+        return None
+
+
+def _by_size(models: Sequence[Path]) -> list[Path]:
+    """Larger models first. Damaged ones come before all, as they are refused, not skipped; but last
+    if they are clearly smaller than the largest whole one."""
+    sizes = {path: size_of(path) for path in models}
+    whole = {path: size for path, size in sizes.items() if size is not None}
+    largest = max(whole, key=lambda path: whole[path], default=None)
+
+    def rank(path: Path) -> float:
+        size = sizes[path]
+        if size is not None:
+            return -size
+        fragment = largest is not None and (
+            _may_have_had(path, largest, whole[largest]) < CLEARLY_SMALLER * whole[largest]
+        )
+        return math.inf if fragment else -math.inf
+
+    return sorted(models, key=rank)
+
+
+def _may_have_had(model: Path, other: Path, n: int) -> float:
+    """About how many images a damaged model had, by the number that its file states and by its
+    length, compared with that of another model of n images; infinity where these do not tell."""
+    kind, kind_of_other = model_kind(model), model_kind(other)
+    file = model / f"images.{kind}"
+    told: list[float] = []
+    try:
+        require_regular_file(file)
+        if kind == kind_of_other:
+            there = (other / f"images.{kind}").stat().st_size
+            told.append(file.stat().st_size / there * n)
+        if kind == "bin":
+            with file.open("rb") as opened:
+                head = opened.read(8)
+            if len(head) < 8:  # a copy that broke off at once
+                return math.inf
+            told.append(int.from_bytes(head, "little"))
+        else:
+            told.append(stated_images(file) or -math.inf)
+    except (InputError, OSError, UnicodeDecodeError):
+        return math.inf
+    most = max(told)
+    return math.inf if most < 0.0 else most
+
+
+def images_of(model: Path) -> list[ModelImage]:
+    """The images of a model; InputError where it is damaged."""
+    kind = model_kind(model)
+    file = model / f"images.{kind}"
+    require_regular_file(file)
+    return (images_of_bytes if kind == "bin" else images_of_text)(file)
+
+
+def other_models(model: Path, n: int, folder: Path) -> tuple[list[str], list[str]]:
+    """Notes and warnings of models beside that of n images that is read.
+
+    Args:
+        model: Which is read.
+        n: How many images it has.
+        folder: The scene's, which the others are named from.
+    """
+    sizes = {path: size_of(path) for path in beside(model)}
+    if not sizes:
+        return [], []
+
+    def name(path: Path) -> str:
+        place = os.path.relpath(path.resolve(), folder.resolve())
+        return printable(Path(place).as_posix())
+
+    rest = ", ".join(
+        f"{name(path)} {'is damaged' if size is None else f'has {size}'}"
+        for path, size in sizes.items()
+    )
+    said = [f"the model {name(model)} of {n} images is read; {rest}"]
+    return ([], said) if any(size is None or size > n for size in sizes.values()) else (said, [])
+
+
+def beside(model: Path) -> list[Path]:
+    """The other models of the same scene."""
+    model = model.absolute()
+    if not is_numbered(model):
+        model = model.resolve()  # a link to one of several
+    place = model.parent if is_numbered(model) else model
+    return [path for path in _models_in(place) if path.resolve() != model.resolve()]
+
+
+def model_kind(folder: Path) -> str | None:
+    """Whether a folder holds a model: "bin", "txt" or None."""
+    for kind in ("bin", "txt"):
+        if exists(folder / f"cameras.{kind}") and exists(folder / f"images.{kind}"):
+            return kind
+    return None
+
+
+def scene_folder(model: Path) -> Path:
+    """The scene's folder that a model's folder belongs to: the one that holds the photographs.
+
+    Where there are none, the one that they should be in.
+    """
+    named, model = model.absolute(), model.resolve()
+    folders: Sequence[Path] = (model, *list(model.parents)[:3])
+    # Links may lead to a model elsewhere.
+    for folder in (*folders, *list(named.parents)[:3]):
+        if photograph_folder(folder) is not None:
+            return folder
+    names = ("colmap", SPARSE)  # of folders in a scene's that lead to its model
+    if is_numbered(model):
+        folders = folders[1:]
+    return next((folder for folder in folders if folder.name not in names), model)
