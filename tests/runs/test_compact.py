@@ -21,6 +21,7 @@ from warpnerf.fields.occupancy import FreeCells
 from warpnerf.model.models import Deferred, Rgb
 from warpnerf.rendering.field import Field
 from warpnerf.runs.checkpoint import load_field, save_field
+from warpnerf.runs.compact import expanded
 from warpnerf.runs.tensor_file import DamagedFileError, digest_of
 
 
@@ -145,3 +146,9 @@ def test_what_does_not_fit_is_refused(file: Path, tensors: dict[str, np.ndarray 
     rewrite(file, **tensors)
     with pytest.raises(DamagedFileError, match=r"field\.safetensors"):
         load_field(file, threads=1)
+
+
+@pytest.mark.parametrize("n", [10**5, 10**7])
+def test_a_size_that_no_memory_holds_is_refused(file: Path, n: int) -> None:
+    with pytest.raises(DamagedFileError, match="its nodes of 'values' do not fit"):
+        expanded(file, load_file(file), (n, n, n))
