@@ -35,7 +35,7 @@ class TrainOptions:
     and contracts as Mip-NeRF 360 does. Other options replace its values."""
     config: Path | None = None
     """Starting point instead of a preset: the config.json of a run, which is repeated, with its
-    scene, downscale and masks, but for what other options replace."""
+    scene, downscale, masks and split, but for what other options replace."""
     resume: Path | None = None
     """Resume the run in this folder, as it was begun; scene only if it has moved."""
     overwrite: bool = False

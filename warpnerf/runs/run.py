@@ -1,6 +1,6 @@
 """A run's folder: what was requested, how it went, what came out.
 
-config.json                  scene, downscale, masks, content distance used, training configuration
+config.json                  scene, downscale, masks, split, what is kept, training configuration
 log.jsonl                    a line for each progress report
 log.csv, tensorboard/        the same, by --log
 curves.png                   loss and PSNR over steps and seconds, once it is finished
