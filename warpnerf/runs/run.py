@@ -374,9 +374,11 @@ class Run:
 
     def way_on(self) -> str:
         """How to resume, or that there is nothing to resume from: half a sentence."""
-        if self.last_step is None:
-            return f"nothing was saved yet{self._aside()}"
-        return f"continue after step {self.last_step} with: {self.resume_command}"
+        if self.last_step is not None:
+            return f"continue after step {self.last_step} with: {self.resume_command}"
+        if self.results:
+            return f"the field is saved; continue with: {self.resume_command}"
+        return f"nothing was saved yet{self._aside()}"
 
     def _aside(self) -> str:
         """Where the run is that this one replaces, as long as it has saved nothing."""
@@ -390,9 +392,10 @@ class Run:
             yield
         except OSError as error:
             said = f"{self.folder} cannot be written: {error.strerror or error}; make room or give "
-            if self.last_step is None:
+            if not self.results:
                 raise InputError(f"{said}access, and begin again: {self.way_on()}.") from error
-            raise InputError(f"{said}access, then {self.way_on()}") from error
+            then = "; " if self.last_step is None else ", then "
+            raise InputError(f"{said}access{then}{self.way_on()}") from error
 
 
 def _first_whole(paths: list[Path], load: Callable[[Path], T]) -> tuple[Path, T, list[str]]:

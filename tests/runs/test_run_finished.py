@@ -1,0 +1,66 @@
+"""A run whose field is saved: what goes wrong afterwards, and how it is resumed."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.runs.test_run import Faults, disk_full, run_with, state_of
+from tests.training.test_determinism import small_scene
+from warpnerf.checks import InputError
+from warpnerf.cli.train import train_command
+from warpnerf.cli.train_options import TrainOptions
+from warpnerf.runs.run import Run
+
+TINY = {"steps": ("2",), "threads": ("1",), "grid.voxels": ("512",), "model": ("rgb",)}
+
+
+def train(folder: Path, **options: Any) -> int:
+    chosen = TrainOptions(scene="builtin:room-sparse", output=folder, downscale=8, **options)
+    return train_command(chosen, TINY)
+
+
+def resume(folder: Path, *, given: dict[str, tuple[str, ...]] | None = None, **options: Any) -> int:
+    return train_command(TrainOptions(resume=folder, **options), given or {})
+
+
+def test_a_full_disk_after_the_field_is_saved_begins_nothing_again(tmp_path: Path) -> None:
+    run = run_with(tmp_path, 5)
+    run.save_field(state_of(5).field, keep_checkpoints=False)
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(InputError) as error:
+        Faults(patch, disk_full).at = 2
+        run.evaluate(state_of(5).field, small_scene(), "train")
+    way_on = f"the field is saved; continue with: {run.resume_command}"
+    assert str(error.value).endswith(f"make room or give access; {way_on}")
+    assert run.way_on() == way_on
+
+
+@pytest.mark.parametrize("during", ["save_field", "draw_curves"])
+def test_stopped_while_it_finishes_it_says_that_the_field_is_saved(
+    during: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    real = getattr(Run, during)
+
+    def stopped(run: Run, *arguments: Any) -> None:
+        signal.raise_signal(signal.SIGINT)
+        real(run, *arguments)
+
+    folder = tmp_path / "run"
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        with monkeypatch.context() as patch:
+            patch.setattr(Run, during, stopped)
+            assert train(folder) == 130
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last == f"stopped; the field is saved; continue with: {Run(folder).resume_command}"
+    assert resume(folder) == 0
+    assert (folder / "metrics.json").exists()
