@@ -3,16 +3,29 @@
 from __future__ import annotations
 
 import signal
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.runs.test_run import Faults, disk_full, run_with, state_of
+from tests.runs.test_run import (
+    KILLED,
+    Faults,
+    calls_of,
+    disk_full,
+    in_child,
+    killed,
+    run_with,
+    state_of,
+)
 from tests.training.test_determinism import small_scene
 from warpnerf.checks import InputError
 from warpnerf.cli.train import train_command
 from warpnerf.cli.train_options import TrainOptions
+from warpnerf.config import TrainConfig
+from warpnerf.runs import pictures
 from warpnerf.runs.run import Run
 
 TINY = {"steps": ("2",), "threads": ("1",), "grid.voxels": ("512",), "model": ("rgb",)}
@@ -31,7 +44,7 @@ def test_a_full_disk_after_the_field_is_saved_begins_nothing_again(tmp_path: Pat
     run = run_with(tmp_path, 5)
     run.save_field(state_of(5).field, keep_checkpoints=False)
     with pytest.MonkeyPatch.context() as patch, pytest.raises(InputError) as error:
-        Faults(patch, disk_full).at = 2
+        patch.setattr(pictures, "write_png", lambda *_: disk_full("write"))
         run.evaluate(state_of(5).field, small_scene(), "train")
     way_on = f"the field is saved; continue with: {run.resume_command}"
     assert str(error.value).endswith(f"make room or give access; {way_on}")
@@ -64,3 +77,31 @@ def test_stopped_while_it_finishes_it_says_that_the_field_is_saved(
     assert last == f"stopped; the field is saved; continue with: {Run(folder).resume_command}"
     assert resume(folder) == 0
     assert (folder / "metrics.json").exists()
+
+
+def test_killed_while_it_is_extended_no_field_passes_for_the_longer_training(
+    tmp_path: Path,
+) -> None:
+    longer = replace(TrainConfig(), steps=5000)
+
+    def finished(name: str) -> Run:
+        run = run_with(tmp_path / name, 5)
+        run.save_field(state_of(5).field)
+        return run
+
+    counted = finished("counted")
+    n_calls = len(calls_of(lambda: counted.extend(longer)))
+    assert n_calls > 3
+
+    def extended(run: Run, at: int) -> None:
+        with pytest.MonkeyPatch.context() as patch:
+            Faults(patch, killed).at = at
+            run.extend(longer)
+
+    for at in range(1, n_calls + 1):
+        run = finished(f"run{at}")
+        assert in_child(partial(extended, run, at)) == KILLED
+        steps = run.read_config().train.steps
+        has_field = (run.folder / "field.safetensors").exists()
+        assert steps == 4000 or not has_field
+        assert run.load_state()[0].progress.step == 5

@@ -243,12 +243,20 @@ class Run:
         Raises:
             InputError: It cannot be written.
         """
-        path = self.folder / "config.json"
+        longer = {name: getattr(config, name) for name in MAY_GROW}
         with self._writing():
-            content = json.loads(path.read_bytes())
-            content["train"] |= {name: getattr(config, name) for name in MAY_GROW}
-            write_atomically(path, (json.dumps(content, indent=2) + "\n").encode())
+            # First: a field beside a longer training would be taken for what that came to.
             (self.folder / "field.safetensors").unlink(missing_ok=True)
+            run_files.change_config(self.folder, lambda content: content["train"].update(longer))
+
+    def set_keep(self, keep: Keep) -> None:
+        """Let config.json say what is kept of a run that is resumed with another --keep.
+
+        Raises:
+            InputError: It cannot be written.
+        """
+        with self._writing():
+            run_files.change_config(self.folder, lambda content: content.update(keep=keep))
 
     def open_log(self, kind: LogKind) -> Log:
         """Begin a log besides log.jsonl, or continue one.
