@@ -116,6 +116,16 @@ def test_what_half_precision_cannot_hold_stays_whole(tmp_path: Path) -> None:
     np.testing.assert_array_equal(back[:3], values[:3])
 
 
+def test_a_field_that_nothing_was_trained_of_is_stored(tmp_path: Path) -> None:
+    field = tiny_field(model=Rgb())
+    assert isinstance(field.storage, DenseGrid)
+    field.storage.values.zero_()
+    save_field(tmp_path / "field.safetensors", field, "float16")
+    assert load_file(tmp_path / "field.safetensors")["values.features"].shape == (0, 3)
+    back = load_field(tmp_path / "field.safetensors", threads=1).storage.tensors()["values"]
+    assert not back.any()
+
+
 def test_a_precision_that_there_is_not(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="precision must be one of float32, float16, not 'half'"):
         save_field(tmp_path / "field", tiny_field(model=Rgb()), "half")  # type: ignore[arg-type]
