@@ -79,6 +79,72 @@ def test_stopped_while_it_finishes_it_says_that_the_field_is_saved(
     assert (folder / "metrics.json").exists()
 
 
+def files_of(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_field_alone_is_trained_no_longer_whether_it_was_looked_at_or_not(tmp_path: Path) -> None:
+    assert train(tmp_path / "run", eval_views="none") == 0
+    before = files_of(tmp_path)
+    for views in ("all", "none"):
+        with pytest.raises(InputError, match="keeps its field alone, from which no training"):
+            resume(tmp_path / "run", given={"steps": ("3",)}, eval_views=views)
+    idle: dict[str, Any] = {"log": "csv", "eval_every": 1, "view": True, "keep": "checkpoint"}
+    for name, value in idle.items():
+        option = name.replace("_", "-")
+        with pytest.raises(InputError, match=f"^--{option} would do nothing: .*; leave it out"):
+            resume(tmp_path / "run", **{name: value})
+    assert files_of(tmp_path) == before
+    assert resume(tmp_path / "run", given={"steps": ("2",)}) == 0
+    assert (tmp_path / "run" / "metrics.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("ended_by", "raised", "says"),
+    [
+        (
+            {"time_limit": 0.3},
+            ("steps", "200000"),
+            "^time_limit is 0.3, .*raise --time-limit above",
+        ),
+        (
+            {"time_limit": 0.3},
+            ("time_limit", "0.3000001"),
+            "^time_limit is 0.3000001, .*--time-limit abo",
+        ),
+        ({"steps": 2}, ("time_limit", "1e4"), "^steps is 2, .*raise --steps above 2"),
+    ],
+)
+def test_a_limit_that_did_not_end_the_training_is_not_raised_alone(
+    ended_by: dict[str, float], raised: tuple[str, str], says: str, tmp_path: Path
+) -> None:
+    limits = {"steps": 100000, "time_limit": 1e3} | ended_by
+    words = {name: (str(value),) for name, value in limits.items()}
+    options = TrainOptions(
+        scene="builtin:room-sparse", output=tmp_path, downscale=8, keep="checkpoint"
+    )
+    assert train_command(options, TINY | words) == 0
+    before = files_of(tmp_path)
+    with pytest.raises(InputError, match=says):
+        resume(tmp_path, given={raised[0]: (raised[1],)})
+    assert files_of(tmp_path) == before
+
+
+def test_what_is_kept_is_remembered_when_it_is_resumed(tmp_path: Path) -> None:
+    train(tmp_path, keep="checkpoint")
+
+    def stopped(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Run, "rewind_log", stopped)
+        resume(tmp_path, keep="field")
+    assert Run(tmp_path).checkpoints
+    assert resume(tmp_path) == 0
+    assert Run(tmp_path).read_config().keep == "field"
+    assert [path.name for path in Run(tmp_path).results] == ["field.safetensors"]
+
+
 def test_killed_while_it_is_extended_no_field_passes_for_the_longer_training(
     tmp_path: Path,
 ) -> None:
