@@ -21,6 +21,7 @@ from warpnerf.fields.occupancy import FreeCells
 from warpnerf.model.models import Deferred, Rgb
 from warpnerf.rendering.field import Field
 from warpnerf.runs.checkpoint import load_field, save_field
+from warpnerf.runs.compact import expanded
 from warpnerf.runs.tensor_file import DamagedFileError, digest_of
 
 
@@ -115,6 +116,16 @@ def test_what_half_precision_cannot_hold_stays_whole(tmp_path: Path) -> None:
     np.testing.assert_array_equal(back[:3], values[:3])
 
 
+def test_a_field_that_nothing_was_trained_of_is_stored(tmp_path: Path) -> None:
+    field = tiny_field(model=Rgb())
+    assert isinstance(field.storage, DenseGrid)
+    field.storage.values.zero_()
+    save_field(tmp_path / "field.safetensors", field, "float16")
+    assert load_file(tmp_path / "field.safetensors")["values.features"].shape == (0, 3)
+    back = load_field(tmp_path / "field.safetensors", threads=1).storage.tensors()["values"]
+    assert not back.any()
+
+
 def test_a_precision_that_there_is_not(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="precision must be one of float32, float16, not 'half'"):
         save_field(tmp_path / "field", tiny_field(model=Rgb()), "half")  # type: ignore[arg-type]
@@ -145,3 +156,9 @@ def test_what_does_not_fit_is_refused(file: Path, tensors: dict[str, np.ndarray 
     rewrite(file, **tensors)
     with pytest.raises(DamagedFileError, match=r"field\.safetensors"):
         load_field(file, threads=1)
+
+
+@pytest.mark.parametrize("n", [10**5, 10**7])
+def test_a_size_that_no_memory_holds_is_refused(file: Path, n: int) -> None:
+    with pytest.raises(DamagedFileError, match="its nodes of 'values' do not fit"):
+        expanded(file, load_file(file), (n, n, n))

@@ -84,8 +84,9 @@ def test_another_storage_in_words(field: wn.Vm, said: str) -> None:
 def test_clean_leaves_fields_and_unfinished_runs(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    (folder / "a" / "visibility.safetensors").write_bytes(bytes(2_000_000))
     assert main(["runs", str(folder), "--clean"]) == 0
-    assert "a: checkpoints of 3 MB removed" in capsys.readouterr().out
+    assert "a: checkpoints and what exports keep removed, 5 MB\n" in capsys.readouterr().out
     assert sorted(path.name for path in (folder / "a").glob("*.safetensors")) == [
         "field.safetensors"
     ]
@@ -106,7 +107,7 @@ def test_clean_goes_on_past_a_run_that_is_trained_into(
     with only_writer(folder / "a"):
         assert main(["runs", str(folder), "--clean"]) == 0
     out = capsys.readouterr().out
-    assert f"left alone: {folder / 'a'}: process" in out and "z: checkpoints of 3 MB" in out
+    assert f"left alone: {folder / 'a'}: process" in out and "z: checkpoints and what" in out
     assert len(list((folder / "a").glob("checkpoint-*"))) == 1
 
 
@@ -170,7 +171,7 @@ def test_runs_whose_configuration_is_damaged_are_named(
     (folder / "a" / "config.json").write_text("{")
     assert main(["runs", str(folder)]) == 0
     out = capsys.readouterr().out
-    assert "cannot be read: 1 runs" in out and "config.json: is not valid JSON" in out
+    assert "cannot be read: 1 run (" in out and "config.json: is not valid JSON" in out
     assert main(["runs", str(folder / "a")]) == 2
     assert "holds no run that can be read: " in capsys.readouterr().err
 

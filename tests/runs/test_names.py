@@ -55,6 +55,23 @@ def test_a_folder_that_stays_empty_goes(tmp_path: Path, monkeypatch: pytest.Monk
     with new_folder("builtin:room"):
         pass
     assert not list(tmp_path.iterdir())
-    (tmp_path / "runs").touch()
-    with pytest.raises(InputError, match="cannot be written"), new_folder("builtin:room"):
+
+
+@pytest.mark.parametrize("dangling", [True, False])
+def test_a_file_or_a_link_that_leads_nowhere_in_place_of_all_runs(
+    dangling: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    if dangling:
+        Path("runs").symlink_to(tmp_path / "gone")
+    else:
+        Path("runs").touch()
+    says = r"^runs cannot be written: File exists"
+    with pytest.raises(InputError, match=says), new_folder("builtin:room"):
+        pass
+
+
+def test_a_name_that_is_too_long(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="too long"), new_folder("a" * 250):
         pass

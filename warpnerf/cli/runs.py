@@ -18,8 +18,8 @@ def runs_command(folder: Folder = Path("runs"), /, clean: bool = False) -> int:
 
     Args:
         folder: That holds folders of runs; by default runs.
-        clean: Remove the checkpoints of runs that have finished. They can then be looked at,
-            rendered and exported as before, but no longer be resumed.
+        clean: Remove the checkpoints of runs that have finished, and what exports keep. They can
+            then be looked at, rendered and exported as before, but no longer be trained further.
     """
     from warpnerf.runs.listing import damaged_in, remove_checkpoints, runs_in, runs_table
 
@@ -32,10 +32,12 @@ def runs_command(folder: Folder = Path("runs"), /, clean: bool = False) -> int:
                 continue
             if removed:
                 place = printable(str(run.folder))
-                print(f"{place}: checkpoints of {removed / 1e6:.0f} MB removed", flush=True)
+                size = f"{removed / 1e6:.0f} MB"
+                print(f"{place}: checkpoints and what exports keep removed, {size}", flush=True)
     print(runs_table(runs_in(folder), folder))
     damaged = damaged_in(folder)
     if damaged:
         first = next(iter(damaged.values()))
-        print(f"warning: not listed, as config.json cannot be read: {len(damaged)} runs ({first})")
+        runs = "1 run" if len(damaged) == 1 else f"{len(damaged)} runs"
+        print(f"warning: not listed, as config.json cannot be read: {runs} ({first})")
     return 0

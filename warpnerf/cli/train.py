@@ -168,13 +168,16 @@ def _resume(
 
 def _go_on(run: Run, options: TrainOptions, changed: Callable[[TrainConfig], TrainConfig]) -> int:
     from warpnerf.runs.scene import masks_of, path_of
-    from warpnerf.training.state import MAY_GROW, require_same_config
+    from warpnerf.training.state import MAY_GROW, raised, require_same_config
     from warpnerf.training.trainer import Trainer
 
     begun, moved = run.read_config(), options.scene
     if run.is_unlooked_at and options.eval_views != "none":  # stopped while it was
         config = changed(begun.train)
         require_same_config(begun.train, config)
+        if raised(begun.train, config):
+            run.load_state()  # refuses: there is none
+        options.require_no_training(run.folder)
         _require_machine(config)
         masks = options.masks or masks_of(begun, moved)
         source = path_of(begun, moved)
@@ -187,6 +190,9 @@ def _go_on(run: Run, options: TrainOptions, changed: Callable[[TrainConfig], Tra
         dataclasses.replace(state.config, **{n: getattr(begun.train, n) for n in MAY_GROW})
     )
     state.require_same_config(config)
+    longer = raised(begun.train, config)
+    if longer:
+        state.require_longer(config)
     _require_machine(config)
     masks = options.masks or masks_of(begun, moved)
     source = path_of(begun, moved)
@@ -200,17 +206,18 @@ def _go_on(run: Run, options: TrainOptions, changed: Callable[[TrainConfig], Tra
         old, new = getattr(state.config, name), getattr(config, name)
         if new != old:
             print(f"  note: {name} {new} instead of {old}: sums are rounded in another order")
-    for name in MAY_GROW:
+    for name in longer:
         old, new = getattr(begun.train, name), getattr(config, name)
-        if new != old:
-            print(
-                f"  note: {name} {new} instead of {old}: learning rates rise to those of the "
-                "longer training; one that is as long from the start ends otherwise"
-            )
+        print(
+            f"  note: {name} {new} instead of {old}: learning rates rise to those of the "
+            "longer training; one that is as long from the start ends otherwise"
+        )
     print(f"  resuming after step {trainer.steps_done}")
     with training_page(options.page, scene, trainer) as session:
-        if any(getattr(begun.train, name) != getattr(config, name) for name in MAY_GROW):
+        if longer:
             run.extend(config)
+        if options.keep not in (None, begun.keep):
+            run.set_keep(options.keep)
         run.rewind_log(trainer.steps_done)
         del state  # the trainer has copies
         return _train(run, scene, trainer, session, options)
@@ -287,7 +294,7 @@ def _train(
     from warpnerf.reports.limits import voxel_pixels, what_limits
     from warpnerf.training.held_out import HeldOut
 
-    keep = options.keep or run.read_config().keep
+    keep = run.read_config().keep
     held_out = None if options.eval_every is None else HeldOut(trainer, options.eval_every)
     log = None if options.log is None else run.open_log(options.log)
     reports: list[Progress] = []

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from warpnerf.checks import require_extra, require_whole
+from warpnerf.checks import InputError, require_extra, require_whole
 from warpnerf.cli.arguments import Settings, Usual
 from warpnerf.cli.view import PageOptions
 
@@ -35,7 +35,7 @@ class TrainOptions:
     and contracts as Mip-NeRF 360 does. Other options replace its values."""
     config: Path | None = None
     """Starting point instead of a preset: the config.json of a run, which is repeated, with its
-    scene, downscale and masks, but for what other options replace."""
+    scene, downscale, masks and split, but for what other options replace."""
     resume: Path | None = None
     """Resume the run in this folder, as it was begun; scene only if it has moved."""
     overwrite: bool = False
@@ -92,6 +92,28 @@ class TrainOptions:
         if self.log is not None and self.log != "csv":
             what = f"--log {self.log}"
             require_extra({"tensorboard": "tensorboardX"}.get(self.log, self.log), self.log, what)
+
+    def require_no_training(self, run: Path) -> None:
+        """Raise InputError where an option is for a training, and only views are left to look at.
+
+        Args:
+            run: The folder of the finished run.
+
+        Raises:
+            InputError: It would do nothing.
+        """
+        given = {
+            "keep": self.keep is not None,
+            "log": self.log is not None,
+            "eval-every": self.eval_every is not None,
+            "view": self.page is not None,
+        }
+        idle = [name for name, is_given in given.items() if is_given]
+        if idle:
+            raise InputError(
+                f"--{idle[0]} would do nothing: {run} has been trained and keeps its field alone, "
+                "of which only the views are left to look at; leave it out."
+            )
 
 
 USUAL = Usual(

@@ -83,16 +83,18 @@ def expanded(
         n = 0 if size is None else math.prod(size)
         if bits.dtype != np.uint8 or bits.ndim != 1 or name in whole:
             refuse(path, f"its bits of '{name}' are none")
-        kept = np.unpackbits(bits.astype(np.uint8), count=n)
+        misfit = f"its nodes of '{name}' do not fit each other"
         if (
             size is None
             or density.shape != size
             or bits.shape != (-(-n // 8),)
             or features.ndim != 2
             or not density.dtype == features.dtype == np.float32
-            or np.count_nonzero(kept) != len(features)
         ):
-            refuse(path, f"its nodes of '{name}' do not fit each other")
+            refuse(path, misfit)
+        kept = np.unpackbits(bits.astype(np.uint8), count=n)  # not before: sizes may be forged
+        if np.count_nonzero(kept) != len(features):
+            refuse(path, misfit)
         values = np.zeros((*size, 1 + features.shape[1]), np.float32)
         values[..., 0] = density
         values[kept.reshape(size).astype(bool), 1:] = features

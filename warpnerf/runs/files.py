@@ -5,9 +5,12 @@ Nothing else in the folder is touched. What each file is, run.py lists.
 
 from __future__ import annotations
 
+import json
 import re
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -75,6 +78,22 @@ def read_config(folder: Path) -> RunConfig:
     if config.scene.startswith("builtin:"):
         return config
     return msgspec.structs.replace(config, scene=str(folder / config.scene))
+
+
+def change_config(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Change values in config.json, and leave all others as they are.
+
+    Args:
+        folder: Of the run.
+        change: Is given what the file says, to change it in place.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    path = folder / "config.json"
+    content = json.loads(path.read_bytes())
+    change(content)
+    write_atomically(path, (json.dumps(content, indent=2) + "\n").encode())
 
 
 def stored_place(folder: Path, source: str) -> str:

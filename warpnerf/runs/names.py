@@ -48,12 +48,17 @@ def new_folder(source: str) -> Iterator[Path]:
     folder, number = first, 2
     while True:
         try:
-            folder.mkdir(parents=True)
+            folder.parent.mkdir(exist_ok=True)
+        except OSError as error:  # such as a link that leads nowhere
+            raise cannot_write(str(folder.parent), error) from error
+        try:
+            folder.mkdir()
             break
-        except FileExistsError:  # of one that was begun in the same second
-            folder, number = first.with_name(f"{first.name}-{number}"), number + 1
         except OSError as error:
-            raise cannot_write(str(folder), error) from error
+            if os.path.lexists(folder):  # of one that was begun in the same second
+                folder, number = first.with_name(f"{first.name}-{number}"), number + 1
+            elif folder.parent.is_dir():  # else one that stayed empty took it away just now
+                raise cannot_write(str(folder), error) from error
     try:
         yield folder
     finally:

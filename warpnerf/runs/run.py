@@ -1,6 +1,6 @@
 """A run's folder: what was requested, how it went, what came out.
 
-config.json                  scene, downscale, masks, content distance used, training configuration
+config.json                  scene, downscale, masks, split, what is kept, training configuration
 log.jsonl                    a line for each progress report
 log.csv, tensorboard/        the same, by --log
 curves.png                   loss and PSNR over steps and seconds, once it is finished
@@ -243,12 +243,20 @@ class Run:
         Raises:
             InputError: It cannot be written.
         """
-        path = self.folder / "config.json"
+        longer = {name: getattr(config, name) for name in MAY_GROW}
         with self._writing():
-            content = json.loads(path.read_bytes())
-            content["train"] |= {name: getattr(config, name) for name in MAY_GROW}
-            write_atomically(path, (json.dumps(content, indent=2) + "\n").encode())
+            # First: a field beside a longer training would be taken for what that came to.
             (self.folder / "field.safetensors").unlink(missing_ok=True)
+            run_files.change_config(self.folder, lambda content: content["train"].update(longer))
+
+    def set_keep(self, keep: Keep) -> None:
+        """Let config.json say what is kept of a run that is resumed with another --keep.
+
+        Raises:
+            InputError: It cannot be written.
+        """
+        with self._writing():
+            run_files.change_config(self.folder, lambda content: content.update(keep=keep))
 
     def open_log(self, kind: LogKind) -> Log:
         """Begin a log besides log.jsonl, or continue one.
@@ -374,9 +382,11 @@ class Run:
 
     def way_on(self) -> str:
         """How to resume, or that there is nothing to resume from: half a sentence."""
-        if self.last_step is None:
-            return f"nothing was saved yet{self._aside()}"
-        return f"continue after step {self.last_step} with: {self.resume_command}"
+        if self.last_step is not None:
+            return f"continue after step {self.last_step} with: {self.resume_command}"
+        if self.results:
+            return f"the field is saved; continue with: {self.resume_command}"
+        return f"nothing was saved yet{self._aside()}"
 
     def _aside(self) -> str:
         """Where the run is that this one replaces, as long as it has saved nothing."""
@@ -390,9 +400,10 @@ class Run:
             yield
         except OSError as error:
             said = f"{self.folder} cannot be written: {error.strerror or error}; make room or give "
-            if self.last_step is None:
+            if not self.results:
                 raise InputError(f"{said}access, and begin again: {self.way_on()}.") from error
-            raise InputError(f"{said}access, then {self.way_on()}") from error
+            then = "; " if self.last_step is None else ", then "
+            raise InputError(f"{said}access{then}{self.way_on()}") from error
 
 
 def _first_whole(paths: list[Path], load: Callable[[Path], T]) -> tuple[Path, T, list[str]]:

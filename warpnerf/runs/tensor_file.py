@@ -57,7 +57,7 @@ def _safetensors(
             "shape": tensor.shape,
             "data_offsets": offsets,
         }
-        pieces.append(np.ascontiguousarray(tensor).data.cast("B"))
+        pieces.append(np.ascontiguousarray(tensor).reshape(-1).view(np.uint8).data)
     text = json.dumps(table).encode()
     text += b" " * (-len(text) % 8)
     return [len(text).to_bytes(8, "little"), text, *pieces]

@@ -160,6 +160,24 @@ class TrainingState:
         """
         require_same_config(self.config, config)
 
+    def require_longer(self, config: TrainConfig) -> None:
+        """Raise InputError unless a schedule leaves something to train.
+
+        Args:
+            config: How to resume, with a limit raised.
+
+        Raises:
+            InputError: A limit is reached all the same: another, or one raised too little.
+        """
+        for name, done in (("steps", self.progress.step), ("time_limit", self.progress.seconds)):
+            limit = getattr(config, name)
+            if limit is not None and done >= limit:
+                option = "--" + name.replace("_", "-")
+                raise InputError(
+                    f"{name} is {limit}, which the training to be resumed has reached, so that it "
+                    f"would be no longer; raise {option} above {math.ceil(done)}."
+                )
+
 
 def require_same_config(begun: TrainConfig, asked: TrainConfig) -> None:
     """Raise InputError unless a configuration would continue what another has begun.
@@ -178,6 +196,16 @@ def require_same_config(begun: TrainConfig, asked: TrainConfig) -> None:
             f"{name} is {new}, but the training to be resumed has {old}, and the result "
             f"would be that of neither; leave {name} as it was, or start a new training."
         )
+
+
+def raised(begun: TrainConfig, asked: TrainConfig) -> list[str]:
+    """The fields of MAY_GROW that a resumed training raises.
+
+    Args:
+        begun: Of the training to be resumed.
+        asked: How to resume it.
+    """
+    return [name for name, new, _ in differences(asked, begun) if name in MAY_GROW]
 
 
 def differences(ours: TrainConfig, theirs: TrainConfig) -> Iterator[tuple[str, Any, Any]]:
