@@ -210,7 +210,7 @@ def assert_trained(outcome: Outcome, *warnings: str) -> None:
     """A whole run, with a line of warning for each of these words and no other."""
     said = outcome.out + outcome.err
     assert outcome.code == 0, said
-    assert not _own_lines(outcome.err)
+    assert not _own_lines(outcome.err), _own_lines(outcome.err)
     assert (outcome.run / "metrics.json").is_file()
     assert len(list((outcome.run / "test").glob("*.png"))) == 1
     lines = [line for line in outcome.out.splitlines() if "warning" in line]

@@ -60,6 +60,8 @@ def serve() -> int:
             os.environ.update(asked["env"])
             os.chdir(asked["cwd"])
             tempfile.tempdir = None  # is asked of the variables again
+            if "warp" in sys.modules:  # its folder of precompiled headers is the parent's
+                sys.modules["warp"].config.use_precompiled_headers = False
             redirect(asked["out"], asked["err"])
             sys.argv = ["warpnerf", *asked["arguments"]]
             return start()
