@@ -69,7 +69,7 @@ NARROWEST = 24
 HELP_ALL = "--help-all"
 """Lists all options of a subcommand, --help those that are used often."""
 
-NO_NAMES = (errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL)
+NO_NAMES = (errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL, errno.EISDIR, errno.ENOTDIR)
 """What the system says of names that cannot be those of files."""
 
 LONGEST = 1200
