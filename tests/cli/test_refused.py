@@ -79,3 +79,12 @@ def test_names_that_cannot_be_those_of_files(
     monkeypatch.setattr(command, "_parsed", fail)
     assert main(["runs"]) == code
     assert capsys.readouterr().err.startswith("warpnerf: error: x: so; ")
+
+
+def test_refusals_are_short_and_steer_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    """Whatever words they quote."""
+    assert main(["inspect", "\u202e\x1b[2J" + "x" * 70_000]) == BAD_INPUT
+    said = capsys.readouterr().err
+    assert len(said) < 1300 and said[:-1].isprintable() and "\\u202e\\x1b[2J" in said
+    assert main(["eval", "run", "--device", "x" * 70_000]) == BAD_INPUT
+    assert len(capsys.readouterr().err) < 1300

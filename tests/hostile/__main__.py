@@ -38,7 +38,15 @@ class Harness:
         self.base.mkdir()
         scene = make_scene(self.base)
         (self.base / "path.json").write_text(PATH)
-        words = ["train", str(scene), "--output", str(self.base / "run"), *TINY]
+        words = [
+            "train",
+            str(scene),
+            "--output",
+            str(self.base / "run"),
+            *TINY,
+            "--keep",
+            "checkpoint",
+        ]
         self._quietly(words)
         calls = python_calls.targets(self.base)
         base = self.base

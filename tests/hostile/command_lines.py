@@ -52,7 +52,7 @@ def case(rng: random.Random, folder: Path, base: Path) -> Case:
         else:
             words += [flag + rng.choice(("x", ".", "-", "_")), rng.choice(WORDS)]
     words = [w for w in words if "\0" not in w]
-    values = [*words, *(word.partition("=")[2] for word in words)]
+    values = ["run/visibility.safetensors", *words, *(word.partition("=")[2] for word in words)]
     written = ("out", *(w for w in values if w and not w.startswith(("-", "/", "."))))
     keep = {"run", "scene", "."}
     case = Case(words=words, written=tuple(w for w in written if w not in keep and len(w) < 200))

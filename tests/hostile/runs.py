@@ -11,7 +11,11 @@ from tests.hostile.scene_files import PLACES, bytes_changed
 from tests.hostile.values import mutated
 from tests.support.cli_process import TINY
 
+SEEN = "run/visibility.safetensors"
+"""What an export keeps for the next."""
+
 NAMES = (
+    "visibility.safetensors",
     *("config.json", "log.jsonl", "metrics.json", "field.safetensors", "test.png", ".lock"),
     *("checkpoint", "test", "previous", "scene", "next", "scene/pose.json", "test/000.png"),
 )
@@ -97,8 +101,8 @@ def case(rng: random.Random, folder: Path, base: Path) -> Case:
                 ["render", "run", "--seconds", "0.1", "--size", "8", "6", "--output", "out"],
                 ("out",),
             ),
-            (["export", "run", "out.ply", "--level", "0.01", "--unseen"], ("out.ply",)),
-            (["export", "run", "out.npz"], ("out.npz",)),
+            (["export", "run", "out.ply", "--level", "0.01", "--unseen"], ("out.ply", SEEN)),
+            (["export", "run", "out.npz"], ("out.npz", SEEN)),
             (["runs", "."], ()),
             (["runs", ".", "--clean"], ("run",)),
         )

@@ -188,3 +188,10 @@ def test_damaged_files_are_no_obstacle(folder: Path) -> None:
     (folder / "a" / "log.jsonl").write_text("\n\n[1]\n")
     (run,) = runs_in(folder / "a")
     assert (run.step, run.metrics, run.is_finished) == (0, {}, False)
+
+
+def test_a_folder_that_is_named_as_a_checkpoint_is_left_alone(tmp_path: Path) -> None:
+    run = made(tmp_path / "a", wn.PRESETS["fast"], fraction=1.0, psnr=None)
+    (run / "checkpoint-00000080.safetensors").mkdir()
+    assert main(["runs", str(tmp_path), "--clean"]) == 0
+    assert [path.name for path in run.glob("checkpoint-*")] == ["checkpoint-00000080.safetensors"]

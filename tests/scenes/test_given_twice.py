@@ -95,3 +95,12 @@ def test_points_that_do_not_fit_the_memory_are_named(
     monkeypatch.setattr(colmap_points, "_of_bytes", full)
     with pytest.raises(InputError, match=r"points3D.bin: has 1e-06 GB, more than the memory"):
         load_scene(folder)
+
+
+def test_a_shape_of_booleans(tmp_path: Path) -> None:
+    """Python takes True for 1, and NumPy does not always."""
+    file = write_llff(tmp_path / "scene")
+    header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (True, 17), }"
+    file.write_bytes(b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + bytes(136))
+    with pytest.raises(InputError, match=r"has the shape \[True, 17\]; save it again"):
+        load_scene(tmp_path / "scene")

@@ -164,6 +164,11 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "nan near": ({"near": float("nan")}, "near must be"),
     "far": ({"far": 0.01}, "far must lie beyond near"),
     "shift": ({"density_shift": float("inf")}, "density_shift must be finite"),
+    "content distance of text": (
+        {"content_distance": "far"},
+        "content_distance must be a tensor or numbers, not 'far'",
+    ),
+    "background of nothing": ({"background": None}, "background must be a tensor or numbers"),
     "scaling": ({"scaling": "cubic"}, "scaling must be one of none, quadratic, clamped"),
     "content": ({"content_distance": 0.0}, "content_distance must be above 0"),
     "nan content": ({"content_distance": float("nan")}, "content_distance must be above 0"),

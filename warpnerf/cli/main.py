@@ -69,8 +69,11 @@ NARROWEST = 24
 HELP_ALL = "--help-all"
 """Lists all options of a subcommand, --help those that are used often."""
 
-NO_NAMES = (errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL)
+NO_NAMES = (errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL, errno.EISDIR, errno.ENOTDIR)
 """What the system says of names that cannot be those of files."""
+
+LONGEST = 1200
+"""Characters of a refusal."""
 
 NOT_LOADED = re.compile("load the shared library|map segment|shared object|many open files")
 """What Warp and Python say where a library cannot be loaded."""
@@ -183,6 +186,16 @@ def _later(command: Callable[..., int]) -> Callable[..., Call]:
     return bound
 
 
+def _one_line(sentence: str) -> str:
+    """A sentence without characters that would steer a terminal, and without its middle where words
+    of the command line make it long."""
+    if len(sentence) > LONGEST:
+        sentence = f"{sentence[: LONGEST - 400]} ... {sentence[-300:]}"
+    return "".join(
+        c if c.isprintable() else c.encode("unicode_escape", "replace").decode() for c in sentence
+    )
+
+
 def _not_loaded(error: Exception) -> str:
     """That a library cannot be loaded, as a sentence."""
     why = " ".join(str(error).split())[:200].rstrip(".")
@@ -226,7 +239,7 @@ def main(arguments: list[str] | None = None) -> int:
         arguments = [_meant(arguments[at - 1], word) for at, word in enumerate(arguments)]
         return _parsed(arguments)
     except InputError as error:
-        print(f"warpnerf: error: {error}", file=sys.stderr)
+        print(f"warpnerf: error: {_one_line(str(error))}", file=sys.stderr)
         return BAD_INPUT
     except (MemoryError, RuntimeError, ImportError) as error:
         if NOT_LOADED.search(str(error)):
@@ -241,7 +254,7 @@ def main(arguments: list[str] | None = None) -> int:
         )
         return BAD_INPUT
     except (OSError, FloatingPointError) as error:
-        print(f"warpnerf: error: {_said(error)}", file=sys.stderr)
+        print(f"warpnerf: error: {_one_line(_said(error))}", file=sys.stderr)
         return BAD_INPUT if getattr(error, "errno", None) in NO_NAMES else FAILED
     except Stopped as stopped:
         print("stopped", file=sys.stderr)

@@ -33,7 +33,7 @@ def read_words(read: Callable[[], Result], name: str | None, shows_help: bool) -
     Args:
         read: Reads them by tyro, which prints what is wrong in a box and exits.
         name: Of the subcommand; None: there is none.
-        shows_help: Whether help is wanted, which is laid out for the terminal.
+        shows_help: Whether help is requested, which is laid out for the terminal.
 
     Returns:
         What ``read`` returns.
@@ -95,4 +95,4 @@ def sentence(box: str, name: str | None) -> str:
 
 def _short(text: str, most: int = LONGEST) -> str:
     text = printable(text)
-    return text if len(text) <= most else text[: most - 3] + "..."
+    return text if len(text) <= most else f"{text[: most - 4]}...{text[-1]}"

@@ -163,6 +163,8 @@ def remove_checkpoints(run: RunSummary) -> int:
         if not _summary(run.folder).is_finished:  # another one has begun there meanwhile
             return 0
         for path in [*files.checkpoints(run.folder), run.folder / files.VISIBILITY]:
+            if path.is_dir():  # none of the run's, whatever its name
+                continue
             with suppress(FileNotFoundError):
                 size = path.stat().st_size
                 path.unlink()

@@ -23,6 +23,7 @@ from warpnerf.torch.tensors import (
     require_constant,
     require_dense,
     require_grid,
+    require_numbers,
 )
 
 MAX_STEPS = {torch.float32: MOST_LINEAR, torch.float64: 10**9}
@@ -146,6 +147,8 @@ def render_rays(
         )
     require_dense("background", background)
     require_dense("content_distance", content_distance)
+    require_numbers("background", background)
+    require_numbers("content_distance", content_distance)
     behind = torch.as_tensor(background, dtype=raw.dtype, device=raw.device).detach()
     if behind.shape not in ((3,), (len(rays[0]), 3)) or not bool(behind.isfinite().all()):
         raise InputError(

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from warpnerf.checks import InputError
+from warpnerf.checks import InputError, said
 from warpnerf.config import MAX_VOXELS
 from warpnerf.model.interface import Model, loader
 
@@ -68,9 +68,22 @@ def require_constant(field: str, value: Any) -> None:
         )
 
 
+def require_numbers(field: str, value: Any) -> None:
+    """Raise InputError unless a value is a tensor, a number, or an array of numbers."""
+    if isinstance(value, torch.Tensor):
+        return
+    try:
+        array = np.asarray(value)
+    except ValueError:  # lists of different lengths
+        array = np.array(None)
+    if array.dtype.kind not in "fiu":
+        raise InputError(f"{field} must be a tensor or numbers, not {said(value)}.")
+
+
 def corner_of(field: str, value: Sequence[float] | torch.Tensor) -> np.ndarray:
     """A corner of the box, [3] float64."""
     require_dense(field, value)
+    require_numbers(field, value)
     corner = np.asarray(
         value.detach().cpu() if isinstance(value, torch.Tensor) else value, dtype=np.float64
     )

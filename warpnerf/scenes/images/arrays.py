@@ -58,7 +58,7 @@ def read_header(stream: IO[bytes], what: str) -> Header:
         raise InputError(
             f"{what}: is not readable as an array of numbers (it holds {dtype}); save floats."
         )
-    if any(length < 0 for length in shape):
+    if any(type(length) is not int or length < 0 for length in shape):  # True is an int, too
         raise InputError(f"{what}: has the shape {list(shape)}; save it again.")
     return Header(shape, dtype, fortran)
 
