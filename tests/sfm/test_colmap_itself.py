@@ -220,7 +220,7 @@ def test_train_estimates_the_poses_first_and_only_once(tmp_path: Path, photos: P
     assert f"registered {N} of {N} photographs" in first.out
     config = json.loads((first.run / "config.json").read_text())
     assert config["scene"] == "scene"
-    again = trained(photos, "--overwrite", folder=tmp_path)
+    again = trained(photos, "--keep", "checkpoint", "--overwrite", folder=tmp_path)
     assert again.code == 0, again.err
     assert "are in" in again.out and "registered" not in again.out
     resumed = command("train", "--resume", first.run, folder=tmp_path, limit=None)
