@@ -22,6 +22,7 @@ from tests.hostile import command_lines, python_calls, runs, scene_files
 from tests.hostile.running import Case, outcome
 from tests.support.cli_process import TINY, make_scene
 from tests.support.command_server import redirect
+from warpnerf.runtime.signals import Stopped
 
 Make = Callable[[random.Random, Path], Case]
 PATH = """{"warpnerf_path": 1, "width": 8, "height": 6, "keys": [
@@ -116,6 +117,7 @@ def main() -> int:
     parser.add_argument("--cases", type=int, default=3000)
     parser.add_argument("--only", help="a family")
     parser.add_argument("--number", type=int, help="of the case of that family, as it is reported")
+    parser.add_argument("--log", type=Path, help="a file that names each case before it is run")
     options = parser.parse_args()
     failed: Counter[str] = Counter()
     tried: Counter[str] = Counter()
@@ -125,13 +127,20 @@ def main() -> int:
         chosen = harness.order(options.cases)
         if options.only:
             chosen = [options.only] * (1 if options.number is not None else options.cases)
-        for family in chosen:
-            number = tried[family] if options.number is None else options.number
-            tried[family] += 1
-            case, wrong = harness.attempt(family, options.seed, number)
-            if wrong is not None:
-                failed[family] += 1
-                print(f"{family} {number}: {case}\n    {wrong}", flush=True)
+        try:
+            for family in chosen:
+                number = tried[family] if options.number is None else options.number
+                tried[family] += 1
+                if options.log is not None:
+                    with options.log.open("a") as log:
+                        log.write(f"{family} {number}\n")
+                case, wrong = harness.attempt(family, options.seed, number)
+                if wrong is not None:
+                    failed[family] += 1
+                    print(f"{family} {number}: {case}\n    {wrong}", flush=True)
+        except (KeyboardInterrupt, Stopped):
+            print("stopped", flush=True)
+            failed["stopped"] += 1
     seconds = time.monotonic() - begin
     print(f"{sum(tried.values())} cases in {seconds:.0f} s, {failed.total()} failed {dict(failed)}")
     return 1 if failed else 0

@@ -9,7 +9,14 @@ from typing import NamedTuple, get_args
 import numpy as np
 import torch
 
-from warpnerf.checks import InputError, require_at_least, require_one_of, require_positive
+from warpnerf.checks import (
+    InputError,
+    require_at_least,
+    require_finite,
+    require_one_of,
+    require_positive,
+    said,
+)
 from warpnerf.config import Scaling
 from warpnerf.model.interface import Model
 from warpnerf.model.models import model_of
@@ -109,12 +116,11 @@ def render_rays(
     require_at_least("near", near, 0.0)
     if far is not None and not far > near:
         raise InputError(f"far must lie beyond near, not at {far}.")
-    if not math.isfinite(density_shift):
-        raise InputError(f"density_shift must be finite, not {density_shift}.")
+    require_finite("density_shift", density_shift)
     if isinstance(model, str):
         model = model_of(model)
     if not isinstance(model, Model):
-        raise InputError(f"model must be a name or a model, not {model!r}.")
+        raise InputError(f"model must be a name or a model, not {said(model)}.")
     require_grid(raw, model)
     weights = flat_head(list(layers), model, raw)
     if raw.shape[3] < model.n_floats:
