@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -182,6 +183,14 @@ def test_of_another_field_the_visibility_is_computed_again(tmp_path: Path) -> No
     file.write_bytes(file.read_bytes()[:-40] + bytes(40))  # damaged
     found = visibility_file.cached_visibility(ball_field(), views, file)
     np.testing.assert_array_equal(found.light, first.light)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes in folders")
+def test_a_pipe_in_place_of_the_cache_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "seen.safetensors")
+    views = ball_scene().views
+    found = visibility_file.cached_visibility(ball_field(), views, tmp_path / "seen.safetensors")
+    assert found.light.any() and (tmp_path / "seen.safetensors").is_fifo()
 
 
 def test_a_link_in_place_of_the_cache_is_left_alone(tmp_path: Path) -> None:

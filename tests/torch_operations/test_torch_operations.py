@@ -163,7 +163,7 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "near": ({"near": -1.0}, "near must be"),
     "nan near": ({"near": float("nan")}, "near must be"),
     "far": ({"far": 0.01}, "far must lie beyond near"),
-    "shift": ({"density_shift": float("inf")}, "density_shift must be finite"),
+    "shift": ({"density_shift": float("inf")}, "density_shift must be a finite number"),
     "content distance of text": (
         {"content_distance": "far"},
         "content_distance must be a tensor or numbers, not 'far'",

@@ -36,14 +36,14 @@ def cached_visibility(
         field: What is looked at.
         views: From where, at least one.
         file: The cache, written where it is missing or of something else; None: there is none. A
-            link, and a place that cannot be written to, is left alone.
+            link, a pipe, and a place that cannot be written to, is left alone.
         on_camera: Called with the number of cameras that are done.
 
     Returns:
         What they see.
     """
     file = None if file is None else Path(file)
-    if file is None or file.is_symlink():
+    if file is None or file.is_symlink() or (file.exists() and not file.is_file()):
         return computed.visibility(field, views, on_camera)
     digest = _digest(field, views)
     kept = _read(file, digest, field.lattice.size)
@@ -87,7 +87,10 @@ def _read(file: Path, digest: str, size: tuple[int, int, int]) -> Visibility | N
     if header.get("of") != digest:
         return None
     n_nodes = int(np.prod(size))
-    there = np.unpackbits(tensors["nodes"], count=n_nodes).astype(bool).reshape(size)
     light, colour = np.zeros(size, np.float32), np.zeros((*size, 3), np.float32)
-    light[there], colour[there] = tensors["light"], tensors["colour"]
+    try:
+        there = np.unpackbits(tensors["nodes"], count=n_nodes).astype(bool).reshape(size)
+        light[there], colour[there] = tensors["light"], tensors["colour"]
+    except (KeyError, ValueError, IndexError, TypeError):  # not as they were written here
+        return None
     return Visibility(light=light, colour=colour)
