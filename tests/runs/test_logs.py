@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import sys
 import types
 from dataclasses import replace
@@ -170,3 +171,18 @@ def test_test_views_have_to_be_there(tmp_path: Path) -> None:
     done = command("train", scene, *FEW, *options, folder=tmp_path)
     assert done.code == 2 and "eval_every is 10, but scene has no test views" in done.err
     assert not done.run.exists()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        *({"step": "5"}, {"step": -1}, {"step": True}, {"seconds": "x"}, {"seconds": None}),
+        *({"loss": []}, {"psnr": 1e300}, {"seen": 0.0}, {"seen": float("nan")}, {"test_psnr": {}}),
+    ],
+)
+def test_a_line_that_is_no_report_is_left_out(changes: dict[str, object], tmp_path: Path) -> None:
+    good = {"step": 5, "seconds": 1.0, "loss": 0.1, "psnr": 20.0}
+    lines = [json.dumps(good), json.dumps(good | changes), "[1]", "{"]
+    (tmp_path / "log.jsonl").write_text("\n".join(lines))
+    (found,) = read_reports(tmp_path / "log.jsonl")
+    assert found["step"] == 5 and found["seen"] == 1.0

@@ -146,11 +146,29 @@ def read_reports(log: Path) -> list[dict[str, Any]]:
     for line in log.read_bytes().splitlines():
         try:
             report = json.loads(line)
-        except ValueError:  # cut off
+        except (ValueError, RecursionError):  # cut off
             continue
-        if isinstance(report, dict) and {"step", "seconds", "loss", "psnr"} <= report.keys():
-            found.append({"occupied": 1.0, "seen": 1.0, "test_psnr": None} | report)
+        if isinstance(report, dict):
+            whole = {"occupied": 1.0, "seen": 1.0, "test_psnr": None} | report
+            if _is_report(whole):
+                found.append(whole)
     return found
+
+
+def _is_report(report: Mapping[str, Any]) -> bool:
+    """Whether a line of log.jsonl, which anybody may have edited, holds a report's numbers."""
+    numbers: list[Any] = [
+        report.get(name) for name in ("seconds", "loss", "psnr", "occupied", "seen")
+    ]
+    if report["test_psnr"] is not None:
+        numbers.append(report["test_psnr"])
+    step = report.get("step")
+    return (
+        type(step) is int
+        and 0 <= step < 2**63
+        and all(type(number) in (int, float) and abs(number) < 1e30 for number in numbers)
+        and report["seen"] > 0.0
+    )
 
 
 def _line(report: Mapping[str, Any]) -> str:
