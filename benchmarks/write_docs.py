@@ -31,6 +31,8 @@ hold intervals of a median; ± is half of the range over seeds.
 RGB_TODAY = ", today with `--model rgb`"
 """What commands need since trainings take another model by default."""
 
+MARCHED_TODAY = ", today with `fast sampler=march` for `fast`"
+
 
 def page(folder: Path = RESULTS) -> str:
     """The text of docs/benchmarks.md, by the records of a folder."""
@@ -323,6 +325,45 @@ def extents(records: Records) -> str:
     )
 
 
+def resampling(records: Records) -> str:
+    parts = []
+    for record in (records[f"presets_{name}"] for name in ("resampled", "resampled_door")):
+        compared = "; ".join(
+            f"{place(scene)} "
+            + " and ".join(
+                f"{row['psnr']:.2f} dB (SSIM {row['ssim']:.3f}, {row['samples_per_ray']:.0f}"
+                " samples a ray)"
+                for row in of(record["rows"], scene=scene)
+            )
+            for scene in values(record["rows"], "scene")
+        )
+        parts.append(f"After {record['time_limit']:.0f} s in turns: {compared}.")
+    return text(
+        f"""`fast` with marched rays, and with resampled ones, on cores that other programs used as
+        well. {" ".join(parts)}""",
+        records.source("presets_resampled", MARCHED_TODAY),
+        records.source("presets_resampled_door", MARCHED_TODAY),
+    )
+
+
+def calibration(records: Records) -> str:
+    record, parts = records["calibration"], []
+    for scene in values(record["rows"], "scene"):
+        found = of(record["rows"], scene=scene)
+        posed, coloured = (
+            float(np.mean([row[key] - row["psnr"] for row in found]))
+            for key in ("posed", "coloured")
+        )
+        moved = float(np.median([row["moved"] for row in found]))
+        parts.append(f"{place(scene)} {posed:+.2f} and {coloured:+.2f} dB ({moved:.1f} pixels)")
+    return text(
+        f"""After {record["steps"]} steps of `fast` with {record["voxels"]:,} voxels, the pose of
+        each test view, or its colours, is fitted to its photograph. Mean gain there, and by how
+        many pixels poses move, as median: {"; ".join(parts)}.""",
+        records.source("calibration"),
+    )
+
+
 def machine(records: Records) -> str:
     start, disk, frames = (records[name] for name in ("footprint", "photos_on_disk", "rendering"))
     memory, (width, height) = start["memory"], disk["size"]
@@ -413,6 +454,8 @@ SECTIONS: dict[str, Callable[[Records], str]] = {
     "Models": models,
     "Where the time of a training goes": training,
     "Extent and content distance": extents,
+    "Resampled steps": resampling,
+    "Poses and exposures": calibration,
     "Start, memory, rendering": machine,
     "Exports": exports,
     "Viewer and nerfbaselines": served,
