@@ -6,7 +6,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from tests.cli.test_command import TINY, run
+from tests.support.tiny_runs import TINY, run
 from warpnerf.checks import InputError
 from warpnerf.cli.loss_options import chosen_losses
 from warpnerf.config import LossConfig, TrainConfig

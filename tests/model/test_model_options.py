@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.cli.test_command import TINY, run
+from tests.support.tiny_runs import TINY, run
 from warpnerf.checks import InputError
 from warpnerf.cli.model_options import chosen_model
 from warpnerf.model.interface import Model

@@ -6,7 +6,7 @@ LEFT_OUT = "runs/test_compact.py::test_features_of_free_space_and_of_untrained_n
 CELLS = "runs/test_compact.py::test_nodes_of_a_cell_are_all_that_samples_in_it_read"
 WHOLE = "runs/test_compact.py::test_what_half_precision_cannot_hold_stays_whole"
 FINISHES = (
-    "runs/test_run.py::test_killed_while_it_finishes_the_last_checkpoint_or_the_field_is_whole"
+    "runs/test_saves.py::test_killed_while_it_finishes_the_last_checkpoint_or_the_field_is_whole"
 )
 WITHHELD = "scenes/test_split.py::test_what_is_withheld"
 SIDE = "scenes/test_split.py::test_a_sector_is_side_by_side_whatever_the_names"

@@ -14,8 +14,8 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from tests.runs.test_run import new_run, run_with, state_of
 from tests.support.cli_process import command, make_scene
+from tests.support.faulty_saves import new_run, run_with, state_of
 from warpnerf.checks import InputError
 from warpnerf.cli.main import main
 from warpnerf.runs.logs import read_reports

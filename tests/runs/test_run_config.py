@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.runs.test_run import new_run, run_with
+from tests.support.faulty_saves import new_run, run_with
 from tests.training.test_determinism import small_scene
 from warpnerf.checks import InputError
 from warpnerf.config import TrainConfig

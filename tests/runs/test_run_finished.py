@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.runs.test_run import (
+from tests.support.faulty_saves import (
     KILLED,
     Faults,
     calls_of,
