@@ -64,21 +64,28 @@ def checked_arguments(function: Function) -> Function:
     """Check the types of a function's arguments, as its annotations have them, when it is called.
 
     What annotations name need not be known where the function is: public names of the package are
-    looked up. Arguments whose annotations are not understood are not checked.
+    looked up. Arguments whose annotations are not understood are not checked. Arrays that stand for
+    a list or a number become that.
     """
     signature = inspect.signature(function)
 
     @wraps(function)
     def called(*args: Any, **kwargs: Any) -> Any:
-        given = signature.bind(*args, **kwargs).arguments
+        try:
+            given = signature.bind(*args, **kwargs)
+        except TypeError:
+            return function(*args, **kwargs)  # which says what is missing, and of what
         hints = _argument_hints(function)
-        for name, value in given.items():
+        for name, value in given.arguments.items():
             if name not in hints:
                 continue
-            several = signature.parameters[name].kind is inspect.Parameter.VAR_POSITIONAL
-            for one in value if several else (value,):
-                _require_argument(f"{function.__name__}: {name}", one, hints[name])
-        return function(*args, **kwargs)
+            what, hint = f"{function.__name__}: {name}", hints[name]
+            if signature.parameters[name].kind is inspect.Parameter.VAR_POSITIONAL:
+                value = tuple(_argument(what, one, hint) for one in value)
+            else:
+                value = _argument(what, value, hint)
+            given.arguments[name] = value
+        return function(*given.args, **given.kwargs)
 
     return called  # type: ignore[return-value]
 
@@ -93,13 +100,17 @@ WAYS = {
 """How to come by what is wanted."""
 
 
-def _require_argument(what: str, value: Any, hint: Any) -> None:
-    listed = value.tolist() if isinstance(value, np.ndarray) and value.ndim else value
-    if not (fits(value, hint) or fits(listed, hint)):
+def _argument(what: str, value: Any, hint: Any) -> Any:
+    """An argument as its function takes it."""
+    listed = value.tolist() if isinstance(value, np.ndarray) else value
+    if fits(listed, hint) and not fits(value, hint):
+        value = listed
+    elif not fits(value, hint):
         way_out = next((f"; {WAYS[name]}" for name in WAYS if name in in_words(hint)), "")
         raise InputError(f"{what} must be {in_words(hint)}, not {said(value)}{way_out}.")
     if isinstance(value, str | os.PathLike) and "\0" in os.fsdecode(value):
         raise InputError(f"{what} has a character of code 0, which no name has; leave it out.")
+    return value
 
 
 @cache
@@ -199,12 +210,13 @@ def in_words(hint: Any) -> str:
     """A type as sentences name it."""
     origin, inner = get_origin(hint), get_args(hint)
     if origin in (Union, UnionType):
-        return " or ".join(in_words(one) for one in inner)
+        return " or ".join(dict.fromkeys(in_words(one) for one in inner))
     if origin is Literal:
         return f"one of {', '.join(map(str, inner))}" if len(inner) > 1 else str(inner[0])
     if origin is tuple:
-        count = "" if inner[1:] == (...,) else f"{len(inner)} "
-        return f"a list of {count}values, each {in_words(inner[0])}"
+        if inner[1:] == (...,):
+            return f"a list, each {in_words(inner[0])}"
+        return f"a list of {len(inner)} values, each {in_words(inner[0])}"
     if origin in (list, Sequence):
         return f"a list, each {in_words(inner[0])}"
     if origin in (dict, Mapping):

@@ -78,6 +78,19 @@ def test_far_splats_do_not_cost_the_near_ones_their_place() -> None:
     np.testing.assert_allclose(places, centres[1:], atol=1e-4)
 
 
+def test_what_the_format_cannot_hold_is_said(caplog: pytest.LogCaptureFixture) -> None:
+    made = some_splats()
+    centres, scales = made.centres.copy(), made.scales.copy()
+    centres[0], scales[1] = 1e9, 2000.0
+    with caplog.at_level("INFO"):
+        splats_spz(made)
+    assert not caplog.text
+    with caplog.at_level("INFO"):
+        splats_spz(replace(made, centres=centres, scales=scales))
+    assert "1 of 300 splats lie too far out for .spz and are left out" in caplog.text
+    assert "1 of 300 splats are larger than .spz has sizes for, and made smaller" in caplog.text
+
+
 @pytest.mark.parametrize("unit", [1e-6, 1e6])
 def test_units_that_the_format_has_not_are_refused(unit: float) -> None:
     made = some_splats()

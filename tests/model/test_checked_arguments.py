@@ -38,11 +38,21 @@ def example(
 def test_what_fits_is_passed_on() -> None:
     given = {"names": {"a": 1}, "weights": np.ones(3), "then": print, "unknown": object()}
     assert example("a", (1, 2), 3, kind="b", **given) == "a (1, 2) (3,) b"  # type: ignore[arg-type]
-    assert example(Path("a"), np.array([1, 2])) == "a [1 2] () a"  # type: ignore[arg-type]
+    assert example(Path("a"), np.array([1, 2])) == "a [1, 2] () a"  # type: ignore[arg-type]
     assert list(inspect.signature(example).parameters)[:3] == ["path", "size", "rest"]
     assert example.__doc__ == "Say that it was called."
-    with pytest.raises(TypeError, match="unexpected keyword"):
+    with pytest.raises(TypeError, match=r"example\(\) got an unexpected keyword"):
         example("a", other=1)  # type: ignore[call-arg]
+    with pytest.raises(TypeError, match=r"example\(\) missing 1 required"):
+        example()  # type: ignore[call-arg]
+
+
+def test_arrays_that_stand_for_numbers_become_these() -> None:
+    @checked_arguments
+    def taken(level: float, size: tuple[int, int] | None = None) -> tuple[Any, Any]:
+        return level, size or "none"
+
+    assert taken(np.array(1.5), np.array([4, 3])) == (1.5, [4, 3])  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

@@ -239,7 +239,7 @@ def test_reality_columns_of_a_template(tmp_path: Path) -> None:
         ("001.png,", "001.png,wide,", "line 3: x: 'wide' is no finite number; export"),
         ("001.png,", "001.png", "line 3: has 15 columns, but the header 16; export"),
         (",45.0,", ",-1.0,", "line 2: f: -1 is no focal length; export"),
-        ("001.png", "000.png", "1 rows are of a photograph that another one is of; remove"),
+        ("001.png", "000.png", "1 cameras are of a photograph that another one is of; remove"),
         ("001.png,", "001.png,1e300,", "line 3: x, y, alt: holds numbers beyond"),
     ],
 )

@@ -26,8 +26,12 @@ POSES = ring(16)
     ("split", "test", "note"),
     [
         ("all", [], "no photograph is withheld for testing: all 16 are trained on"),
-        (5, [0, 5, 10, 15], "4 of 16 photographs, every 5th by name (first: images/0.png)"),
-        (2, [0, 2, 4, 6, 8, 10, 12, 14], "8 of 16 photographs, every 2nd (first: images/0.png)"),
+        (5, [0, 5, 10, 15], "4 of 16 photographs, one in 5 by name (first: images/0.png)"),
+        (
+            2,
+            [0, 2, 4, 6, 8, 10, 12, 14],
+            "8 of 16 photographs, one in 2 by name (first: images/0.png)",
+        ),
         (("11.png", "images/3.png"), [3, 11], "2 of 16 photographs, those of the list (first: "),
         ("sector", [0, 1], "2 of 16 photographs, a sector, side by side (first: images/0.png)"),
     ],

@@ -138,6 +138,34 @@ def test_two_clicks_measure_a_distance(field: Field) -> None:
         page.wait(lambda page: "/measure/0" in removed(page))
 
 
+def test_of_two_runs_at_once_nothing_is_measured(field: Field) -> None:
+    """A click would not tell which of them is meant."""
+    with serving(field, field) as session, PageClient(session.server.get_port()) as page:
+        page.look_from(opencv(ring(5)[0]))
+        page.wait_for_size(80, 60)
+        put(page, "Runs", "divided")
+        put(page, "Measure", True)
+        page.wait(lambda page: page.messages.get("ScenePointerEnableMessage"))
+        click(page, (-0.5, -4.0, 0.1), (0.0, 1.0, 0.0))
+        page.wait(lambda page: "nothing is measured" in session._ruler._said.content)
+        assert not session._ruler.points
+
+
+def test_nothing_is_clipped_in_normalised_device_coordinates(field: Field) -> None:
+    """What is near the camera is where these begin."""
+    in_ndc = replace(field, steps=replace(field.steps, in_ndc=True))
+    for shown, clips in ((field, True), (in_ndc, False)):
+        panel = ("Clip before", clips)
+        with serving(shown) as session, PageClient(session.server.get_port()) as page:
+            page.wait(lambda page: page.messages.get("GuiSliderMessage"))
+            sliders = page.messages["GuiSliderMessage"]
+            (slider,) = (m for m in sliders if m["props"]["label"] == panel[0])
+            updates = page.messages.get("GuiUpdateMessage", [])
+            hidden = [m for m in updates if m["uuid"] == slider["uuid"]]
+            seen = hidden[-1]["updates"]["visible"] if hidden else slider["props"]["visible"]
+            assert seen == panel[1]
+
+
 def removed(page: PageClient) -> set[str]:
     return {message["name"] for message in page.messages.get("RemoveSceneNodeMessage", [])}
 

@@ -50,7 +50,7 @@ class TrainOptions:
     file without a name in the output folder, gone at the end), or by what is free."""
     split: str | None = None
     """Photographs that are withheld for testing: all (none is withheld, all are trained on), a
-    number (every so-manieth), sector (an eighth, side by side), or a file that names one a line. By
+    number N (every Nth), sector (an eighth, side by side), or a file that names one a line. By
     default as the scene says, else every 8th."""
     eval_views: Literal["all", "none"] | int = "all"
     """Test views that are rendered and measured at the end: all, none, or so many, spread.

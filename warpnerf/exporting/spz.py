@@ -9,6 +9,7 @@ versions read, too.
 from __future__ import annotations
 
 import gzip
+import logging
 import math
 import struct
 
@@ -17,6 +18,8 @@ import numpy as np
 from warpnerf.checks import InputError
 from warpnerf.exporting.quaternions import quaternions, to_y
 from warpnerf.exporting.splats import FIRST_HARMONIC, Splats
+
+log = logging.getLogger(__name__)
 
 MAGIC, VERSION = 0x5053474E, 2
 
@@ -69,6 +72,7 @@ def splats_spz(splats: Splats, up: np.ndarray | None = None) -> list[bytes]:
     bits = min(FINEST, math.floor(math.log2(LARGEST / max(float(reach[kept].max()), 1e-30))))
     if bits < 0:
         raise InputError("the scene is too large for .spz; write .splat.ply.")
+    _say_losses(int((~kept).sum()), int((logs[kept] > largest_scale).any(axis=1).sum()), len(kept))
     fixed = np.round(points[kept] * 2.0**bits).astype("<i4")
     positions = fixed.view(np.uint8).reshape(-1, 3, 4)[:, :, :3]
     coefficients = (splats.rgb[kept] - 0.5) / FIRST_HARMONIC
@@ -83,6 +87,14 @@ def splats_spz(splats: Splats, up: np.ndarray | None = None) -> list[bytes]:
     header = struct.pack("<IIIBBBB", MAGIC, VERSION, int(kept.sum()), 0, bits, 0, 0)
     content = b"".join([header, *(part.tobytes() for part in parts)])
     return [gzip.compress(content, mtime=0)]
+
+
+def _say_losses(dropped: int, cut: int, n: int) -> None:
+    """Log what the format cannot hold."""
+    if dropped:
+        log.info(f"{dropped} of {n} splats lie too far out for .spz and are left out")
+    if cut:
+        log.info(f"{cut} of {n} splats are larger than .spz has sizes for, and made smaller")
 
 
 def turned(rotations: np.ndarray, turn: np.ndarray) -> np.ndarray:

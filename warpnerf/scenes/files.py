@@ -120,6 +120,30 @@ def _as_clause(message: str) -> str:
     return message[0].lower() + message[1:].replace(" - at ", ", at ")
 
 
+def read_names(path: Path, option: str = "") -> list[str]:
+    """Read a list of photographs: a name on each line; empty lines do not count.
+
+    Args:
+        path: Of the file.
+        option: What named it, for sentences.
+
+    Raises:
+        InputError: It is no text.
+    """
+    require_regular_file(path)
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        named = f"{option} {path}" if option else f"{path}"
+        raise InputError(f"{named}: cannot be read as text ({error}); mend or remove it.") from None
+    return [line.strip() for line in lines if line.strip()]
+
+
+def plain_name(name: str) -> str:
+    """A photograph's name in a list, with / between folders, and no ./ before it."""
+    return name.replace("\\", "/").removeprefix("./")
+
+
 def require_regular_file(path: Path) -> None:
     """Refuse what is missing, folders, and pipes and devices, which would block or never end.
 

@@ -9,10 +9,10 @@ from typing import Literal
 import numpy as np
 
 from warpnerf.checks import InputError, require_whole, said
-from warpnerf.scenes.files import by_number, printable
+from warpnerf.scenes.files import by_number, plain_name, printable, read_names
 
 Split = Literal["all", "sector"] | int | tuple[str, ...]
-"""all: none is withheld; sector: an eighth that stand side by side; a number: every so-manieth, by
+"""all: none is withheld; sector: an eighth that stand side by side; a number N: every Nth, by
 name from the first; names: these."""
 
 SECTOR = 8
@@ -57,11 +57,7 @@ def read_split(text: str | Split | list[str]) -> Split:
             f"--split must be all, sector, a number of at least 2, or a file with a photograph's "
             f"name on each line, not {said(text)}."
         )
-    try:
-        lines = [line.strip() for line in path.read_text(encoding="utf-8-sig").splitlines()]
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"--split {path}: cannot be read as text ({error}); mend it.") from None
-    names = tuple(dict.fromkeys(line for line in lines if line))
+    names = tuple(dict.fromkeys(read_names(path, "--split")))
     if not names:
         raise InputError(f"--split {path}: names no photograph; name one on each line.")
     return names
@@ -92,7 +88,7 @@ def withheld(
         chosen, how = _sector(names, poses), "a sector, side by side"
     else:
         chosen = set(sorted(names, key=by_number)[:: int(split)])
-        how = f"every {split}th by name" if split > 3 else f"every {('2nd', '3rd')[int(split) - 2]}"
+        how = f"one in {split} by name"
     if len(chosen) == n:
         raise InputError(
             f"--split withholds all {n} photographs, and none is left to train on; withhold fewer."
@@ -107,7 +103,8 @@ def _listed(split: tuple[str, ...], names: Sequence[str]) -> set[str]:
     for name in names:
         files.setdefault(Path(name).name, []).append(name)
     chosen = set()
-    for given in split:
+    for listed in split:
+        given = plain_name(listed)
         found = [given] if given in names else files.get(Path(given).name, [])
         if len(found) != 1:
             what = "no photograph of the scene" if not found else f"{len(found)} photographs"

@@ -35,6 +35,7 @@ class Panel:
         content_distance: float,
         names: Sequence[str],
         training: bool,
+        clips: bool,
         viewpoint_of: Callable[[int], Viewpoint | None],
         changed: Callable[[], None],
     ) -> None:
@@ -49,6 +50,7 @@ class Panel:
             content_distance: Scene units.
             names: Of the one or two subjects.
             training: Whether there is time to be shared with a training.
+            clips: Whether what is near can be left out: not in normalised device coordinates.
             viewpoint_of: Where the page of a client looks from.
             changed: Called when something was set.
         """
@@ -73,7 +75,7 @@ class Panel:
             slider.on_update(lambda _: setattr(self, "share", _kept(slider.value, 0.05, 0.9)))
         if stage.cameras:
             self._add_cameras()
-        self._add_crop(box)
+        self._add_crop(box, clips)
         self._add_path()
 
     def _set(self, **changes: Any) -> None:
@@ -151,7 +153,7 @@ class Panel:
             if event.client is not None and name.value in cameras:
                 stand_in(event.client, cameras[name.value], self._world)
 
-    def _add_crop(self, box: tuple[np.ndarray, np.ndarray]) -> None:
+    def _add_crop(self, box: tuple[np.ndarray, np.ndarray], clips: bool) -> None:
         gui = self._server.gui
         with gui.add_folder("Crop box", expand_by_default=False):
             cropped = gui.add_checkbox("Crop", False, hint="to cells of two voxels")
@@ -168,6 +170,7 @@ class Panel:
             clip = gui.add_slider(
                 "Clip before", 0.0, 2.0, 0.02, 0.0, hint="what is nearer, in content distances"
             )
+            clip.visible = clips
 
         @clip.on_update
         def _(_: Any) -> None:

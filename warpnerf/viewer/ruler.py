@@ -73,8 +73,9 @@ class Ruler:
 
     def _clicked(self, event: Any) -> None:
         """A page says through which ray, in viser's world."""
-        if self._settings().layout == "side by side" and len(self._painter.subjects) > 1:
-            self._said.content = "Of two runs side by side nothing is measured: show one of them."
+        both = self._settings().layout in ("side by side", "divided")
+        if both and len(self._painter.subjects) > 1:
+            self._said.content = "Of two runs at once nothing is measured: show one of them."
             return
         origin = np.asarray(event.ray_origin, np.float64)
         direction = np.asarray(event.ray_direction, np.float64)

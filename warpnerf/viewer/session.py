@@ -127,6 +127,7 @@ class Session:
                 content_distance,
                 [subject.name for subject in subjects],
                 training,
+                not any(subject.field().steps.in_ndc for subject in subjects),
                 lambda client_id: getattr(self._pages.get(client_id), "viewpoint", None),
                 self._news.set,
             )

@@ -8,15 +8,19 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from warpnerf.checks import InputError
+from warpnerf.scenes.cameras.lens import Lens
 from warpnerf.scenes.files import IMAGE_SUFFIXES, exists, printable
 from warpnerf.scenes.formats.assemble import POSED, assemble
 from warpnerf.scenes.formats.frame import Frame
 from warpnerf.scenes.formats.llff import ENDINGS
+from warpnerf.scenes.images.depths import DepthFile
 from warpnerf.scenes.images.masks import without_masks
 from warpnerf.scenes.images.photographs import Keeping
 from warpnerf.scenes.scene import Scene
@@ -161,17 +165,17 @@ def scaled(
     return {**there, "w": size[0], "h": size[1]}
 
 
-def scaled_note(frames: Sequence[Frame], stated: Sequence[tuple[int, int]]) -> list[str]:
+def _scaled_note(frames: Sequence[Frame], stated: Sequence[tuple[int, int] | None]) -> list[str]:
     """That photographs are of another size than their lenses were for.
 
     Args:
         frames: Whose lenses ``scaled`` may have scaled.
-        stated: The size that each of them was for.
+        stated: The size that each of them was for; None: any.
     """
     other = [
         (frame.name, size, (frame.lens.values["w"], frame.lens.values["h"]))
         for frame, size in zip(frames, stated, strict=True)
-        if (frame.lens.values["w"], frame.lens.values["h"]) != size
+        if size is not None and (frame.lens.values["w"], frame.lens.values["h"]) != size
     ]
     if not other:
         return []
@@ -196,25 +200,81 @@ class Reading:
     """What for testing; None: every 8th."""
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PosedCamera:
+    """What another program knows of a photograph."""
+
+    c2w: np.ndarray
+    """[3, 4], OpenGL axes, scene units."""
+    lens: Lens
+    """For the photograph as it is there."""
+    stated: tuple[int, int] | None = None
+    """Width and height that the lens was for, before ``scaled``; None: any."""
+    depth: DepthFile | None = None
+    """True depth; None: not known."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Entry:
+    """A camera in the file of another program."""
+
+    name: str
+    """Of its photograph, as the file has it."""
+    place: str
+    """Where in the file it is."""
+    read: Callable[[Path], PosedCamera]
+    """The camera, given the photograph; called where that is there."""
+
+
 def scene_of(
-    folder: Path,
     file: Path,
-    frames: Sequence[Frame],
+    entries: Sequence[Entry],
+    photographs: Photographs,
     reading: Reading,
-    *,
-    notes: Sequence[str] = (),
-    warnings: Sequence[str] = (),
+    say: Callable[[], tuple[Sequence[str], Sequence[str]]] = lambda: ((), ()),
 ) -> Scene:
-    """The scene of another program's cameras, every 8th of them for testing."""
+    """The scene of another program's cameras, every 8th of them for testing.
+
+    Args:
+        file: Where they are.
+        entries: All of them.
+        photographs: Of the scene.
+        reading: How these are read.
+        say: Called once all cameras are read: more notes, and more warnings.
+
+    Raises:
+        InputError: No photograph is there, or several cameras are of one.
+    """
+    frames: list[Frame] = []
+    stated: list[tuple[int, int] | None] = []
+    missing: list[str] = []
+    for entry in entries:
+        path = photographs.find(entry.name, entry.place)
+        if path is None:
+            missing.append(entry.name)
+            continue
+        camera = entry.read(path)
+        name, c2w = photographs.name(path), camera.c2w
+        frames.append(Frame(name=name, path=path, c2w=c2w, lens=camera.lens, depth=camera.depth))
+        stated.append(camera.stated)
+    twice = len(frames) - len({frame.name for frame in frames})
+    if twice:
+        raise InputError(
+            f"{file}: {twice} cameras are of a photograph that another one is of; remove them, and "
+            "export again."
+        )
+    warnings = photographs.missing(file, len(entries), missing)
+    few, many = photographs.unposed(file, {frame.path for frame in frames})
+    notes, more = say()
     scene = assemble(
-        folder=folder,
+        folder=photographs.folder,
         file=file,
         frames=frames,
         splits={},
-        warnings=warnings,
+        warnings=[*warnings, *many, *more],
         downscale=reading.downscale,
         masks=reading.masks,
         keeping=reading.keeping,
         withhold=reading.withhold,
     )
-    return replace(scene, notes=(*notes, *scene.notes))
+    return replace(scene, notes=(*notes, *few, *_scaled_note(frames, stated), *scene.notes))

@@ -66,7 +66,7 @@ def load_scene(
         threads: That read photographs; None: one per usable core. Built-in scenes are drawn by all
             cores.
         split: What is withheld for testing: "all": nothing, all photographs are trained on; a
-            number: every so-manieth, by name from the first; "sector": an eighth, of cameras side
+            number N: every Nth, by name from the first; "sector": an eighth, of cameras side
             by side; names of photographs: these. None: as the scene says, else every 8th.
 
     Returns:

@@ -21,13 +21,13 @@ from warpnerf.scenes.cameras.lens import Lens
 from warpnerf.scenes.cameras.poses import check_pose
 from warpnerf.scenes.files import MAX_JSON_BYTES, printable, require_regular_file
 from warpnerf.scenes.formats.found_photographs import (
+    Entry,
     Photographs,
+    PosedCamera,
     Reading,
     scaled,
-    scaled_note,
     scene_of,
 )
-from warpnerf.scenes.formats.frame import Frame
 from warpnerf.scenes.images.images import image_size
 from warpnerf.scenes.scene import Scene
 
@@ -92,47 +92,27 @@ def load_metashape(file: Path, reading: Reading) -> Scene:
     Raises:
         InputError: The file is damaged, a lens is not modelled, or no photograph is there.
     """
-    folder = file.parent
     chunk, notes = _chunk(file)
     aligned, more = _aligned(file, chunk)
-    notes += more
     sensors = {sensor.get("id", ""): sensor for sensor in chunk.iterfind("sensors/sensor")}
-    photographs = Photographs(folder)
-    frames: list[Frame] = []
-    stated: list[tuple[int, int]] = []
-    missing: list[str] = []
-    poses = _poses(file, chunk, aligned)
-    poses, said = _on_the_ground(poses)
-    for camera, pose in zip(aligned, poses, strict=True):
-        label = camera.get("label", "")
-        place = _place(camera)
-        path = photographs.find(label, f"{file}: {place}")
-        if path is None:
-            missing.append(label)
-            continue
-        sensor = sensors.get(camera.get("sensor_id", ""))
-        if sensor is None:
-            raise InputError(f"{file}: {place}: its sensor is not in the file; export it again.")
-        lens, size = _lens(file, sensor, image_size(path))
-        c2w = check_pose(pose.tolist(), field=f"{file}: {place}: transform")
-        frames.append(Frame(name=photographs.name(path), path=path, c2w=c2w, lens=lens))
-        stated.append(size)
-    twice = {frame.name for frame in frames}
-    if len(twice) < len(frames):
-        raise InputError(
-            f"{file}: {len(frames) - len(twice)} cameras are of a photograph that another one is "
-            "of; remove them in Metashape, and export again."
-        )
-    warnings = photographs.missing(file, len(aligned), missing)
-    few, many = photographs.unposed(file, {frame.path for frame in frames})
-    return scene_of(
-        folder,
-        file,
-        frames,
-        reading,
-        notes=[*notes, *said, *few, *scaled_note(frames, stated)],
-        warnings=[*warnings, *many],
-    )
+    poses, turned = _on_the_ground(_poses(file, chunk, aligned))
+
+    def entry(camera: ElementTree.Element, pose: np.ndarray) -> Entry:
+        place = f"{file}: {_place(camera)}"
+
+        def read(path: Path) -> PosedCamera:
+            sensor = sensors.get(camera.get("sensor_id", ""))
+            if sensor is None:
+                raise InputError(f"{place}: its sensor is not in the file; export it again.")
+            lens, size = _lens(file, sensor, image_size(path))
+            c2w = check_pose(pose.tolist(), field=f"{place}: transform")
+            return PosedCamera(c2w=c2w, lens=lens, stated=size)
+
+        return Entry(name=camera.get("label", ""), place=place, read=read)
+
+    entries = [entry(camera, pose) for camera, pose in zip(aligned, poses, strict=True)]
+    photographs = Photographs(file.parent)
+    return scene_of(file, entries, photographs, reading, lambda: ([*notes, *more, *turned], ()))
 
 
 def _chunk(file: Path) -> tuple[ElementTree.Element, list[str]]:

@@ -16,13 +16,13 @@ from warpnerf.scenes.cameras.lens import Lens
 from warpnerf.scenes.cameras.poses import check_pose
 from warpnerf.scenes.files import exists, read_json
 from warpnerf.scenes.formats.found_photographs import (
+    Entry,
     Photographs,
+    PosedCamera,
     Reading,
     scaled,
-    scaled_note,
     scene_of,
 )
-from warpnerf.scenes.formats.frame import Frame
 from warpnerf.scenes.images.depths import DepthFile
 from warpnerf.scenes.images.images import image_size
 from warpnerf.scenes.scene import Scene
@@ -99,51 +99,37 @@ def load_polycam(cameras: Path, reading: Reading) -> Scene:
     folder = keyframes.parent if keyframes.name == "keyframes" else keyframes
     images = next(keyframes / name for name in IMAGES[cameras.name] if (keyframes / name).is_dir())
     photographs = Photographs(folder, among=images)
-    files = sorted(path for path in cameras.iterdir() if path.suffix == ".json")
-    frames: list[Frame] = []
-    stated: list[tuple[int, int]] = []
-    missing: list[str] = []
     other_depth: list[str] = []
-    for file in files:
-        path = photographs.find(file.stem, f"{file}")
-        if path is None:
-            missing.append(file.stem)
-            continue
-        camera = read_json(file, CameraFile)
-        pose = [[getattr(camera, f"t_{i}{j}") for j in range(4)] for i in range(3)]
-        values, size = _lens(file, camera)
-        shape = image_size(path)
-        values = scaled(values, size, shape)
-        depth = keyframes / "depth" / f"{file.stem}.png"
-        there = exists(depth)
-        if there and not _same_shape(image_size(depth), shape):
-            other_depth.append(depth.name)
-            there = False
-        frames.append(
-            Frame(
-                name=photographs.name(path),
-                path=path,
+
+    def entry(file: Path) -> Entry:
+        def read(path: Path) -> PosedCamera:
+            camera, shape = read_json(file, CameraFile), image_size(path)
+            pose = [[getattr(camera, f"t_{i}{j}") for j in range(4)] for i in range(3)]
+            values, size = _lens(file, camera)
+            values = scaled(values, size, shape)
+            depth = keyframes / "depth" / f"{file.stem}.png"
+            fits = exists(depth) and _same_shape(image_size(depth), shape)
+            if exists(depth) and not fits:
+                other_depth.append(depth.name)
+            return PosedCamera(
                 c2w=check_pose(pose, field=f"{file}: t_00 to t_23"),
                 lens=Lens(file=file, values=values, fields={name: KEYS[name] for name in values}),
-                depth=DepthFile(depth, MILLIMETRE) if there else None,
+                stated=size,
+                depth=DepthFile(depth, MILLIMETRE) if fits else None,
             )
-        )
-        stated.append(size)
-    warnings = photographs.missing(cameras, len(files), missing)
-    notes, without = photographs.unposed(cameras, {frame.path for frame in frames})
-    if other_depth:
-        warnings.append(
+
+        return Entry(name=file.stem, place=f"{file}", read=read)
+
+    def say() -> tuple[list[str], list[str]]:
+        if not other_depth:
+            return [], []
+        return [], [
             f"keyframes/depth: left out {len(other_depth)} depth maps of another shape than their "
             f"photographs (first: {other_depth[0]})"
-        )
-    return scene_of(
-        folder,
-        cameras,
-        frames,
-        reading,
-        notes=[*notes, *scaled_note(frames, stated)],
-        warnings=[*warnings, *without],
-    )
+        ]
+
+    files = sorted(path for path in cameras.iterdir() if path.suffix == ".json")
+    return scene_of(cameras, [entry(file) for file in files], photographs, reading, say)
 
 
 KEYS = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", "w": "width", "h": "height"}

@@ -19,8 +19,13 @@ from warpnerf.scenes.cameras.brown import brown_lens
 from warpnerf.scenes.cameras.lens import Lens
 from warpnerf.scenes.cameras.poses import check_pose
 from warpnerf.scenes.files import MAX_JSON_BYTES, printable, require_regular_file
-from warpnerf.scenes.formats.found_photographs import Photographs, Reading, scene_of
-from warpnerf.scenes.formats.frame import Frame
+from warpnerf.scenes.formats.found_photographs import (
+    Entry,
+    Photographs,
+    PosedCamera,
+    Reading,
+    scene_of,
+)
 from warpnerf.scenes.images.images import image_size
 from warpnerf.scenes.scene import Scene
 
@@ -79,29 +84,16 @@ def load_reality(file: Path, reading: Reading) -> Scene:
     Raises:
         InputError: The file is damaged, or no photograph is there.
     """
-    folder = file.parent
-    rows = _rows(file)
-    photographs = Photographs(folder)
-    frames: list[Frame] = []
-    missing: list[str] = []
-    for place, name, row in rows:
-        path = photographs.find(name, f"{file}: {place}")
-        if path is None:
-            missing.append(name)
-            continue
-        pose = _pose(row)
-        c2w = check_pose(pose.tolist(), field=f"{file}: {place}: x, y, alt")
-        lens = _lens(file, place, row, image_size(path))
-        frames.append(Frame(name=photographs.name(path), path=path, c2w=c2w, lens=lens))
-    names = {frame.name for frame in frames}
-    if len(names) < len(frames):
-        raise InputError(
-            f"{file}: {len(frames) - len(names)} rows are of a photograph that another one is of; "
-            "remove them."
-        )
-    warnings = photographs.missing(file, len(rows), missing)
-    notes, without = photographs.unposed(file, {frame.path for frame in frames})
-    return scene_of(folder, file, frames, reading, notes=notes, warnings=[*warnings, *without])
+
+    def entry(place: str, name: str, row: Mapping[str, float]) -> Entry:
+        def read(path: Path) -> PosedCamera:
+            c2w = check_pose(_pose(row).tolist(), field=f"{file}: {place}: x, y, alt")
+            return PosedCamera(c2w=c2w, lens=_lens(file, place, row, image_size(path)))
+
+        return Entry(name=name, place=f"{file}: {place}", read=read)
+
+    entries = [entry(*row) for row in _rows(file)]
+    return scene_of(file, entries, Photographs(file.parent), reading)
 
 
 def _rows(file: Path) -> list[tuple[str, str, dict[str, float]]]:

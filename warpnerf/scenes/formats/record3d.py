@@ -18,13 +18,13 @@ from warpnerf.scenes.cameras.lens import Lens
 from warpnerf.scenes.cameras.poses import check_pose
 from warpnerf.scenes.files import MAX_JSON_BYTES, read_json
 from warpnerf.scenes.formats.found_photographs import (
+    Entry,
     Photographs,
+    PosedCamera,
     Reading,
     scaled,
-    scaled_note,
     scene_of,
 )
-from warpnerf.scenes.formats.frame import Frame
 from warpnerf.scenes.images.images import image_size
 from warpnerf.scenes.scene import Scene
 
@@ -90,41 +90,28 @@ def load_record3d(file: Path, reading: Reading) -> Scene:
     shared = None if per_frame else _shared_lens(file, data.K)
     images = next(folder / name for name in FOLDERS if (folder / name).is_dir())
     photographs = Photographs(folder, among=images)
-    frames: list[Frame] = []
-    stated: list[tuple[int, int]] = []
-    missing: list[str] = []
-    for number, pose in enumerate(data.poses):
+
+    def entry(number: int) -> Entry:
         place = f"{file}: $.poses[{number}]"
-        path = photographs.find(str(number), place)
-        if path is None:
-            missing.append(f"{images.name}/{number}.jpg")
-            continue
-        if shared is not None:
-            values, key = shared, "K"
-        else:
-            key = f"perFrameIntrinsicCoeffs[{number}]"
-            values = _lens(file, key, per_frame[number])
-        values = scaled(values, (data.w, data.h), image_size(path))
-        fields = {name: f"$.{name if name in ('w', 'h') else key}" for name in values}
-        frames.append(
-            Frame(
-                name=photographs.name(path),
-                path=path,
-                c2w=_pose(place, pose),
+
+        def read(path: Path) -> PosedCamera:
+            if shared is not None:
+                values, key = shared, "K"
+            else:
+                key = f"perFrameIntrinsicCoeffs[{number}]"
+                values = _lens(file, key, per_frame[number])
+            values = scaled(values, (data.w, data.h), image_size(path))
+            fields = {name: f"$.{name if name in ('w', 'h') else key}" for name in values}
+            return PosedCamera(
+                c2w=_pose(place, data.poses[number]),
                 lens=Lens(file=file, values=values, fields=fields),
+                stated=(data.w, data.h),
             )
-        )
-        stated.append((data.w, data.h))
-    warnings = photographs.missing(file, len(data.poses), missing)
-    notes, without = photographs.unposed(file, {frame.path for frame in frames})
-    return scene_of(
-        folder,
-        file,
-        frames,
-        reading,
-        notes=[*notes, *scaled_note(frames, stated), *_depth_note(folder)],
-        warnings=[*warnings, *without],
-    )
+
+        return Entry(name=f"{images.name}/{number}", place=place, read=read)
+
+    entries = [entry(number) for number in range(len(data.poses))]
+    return scene_of(file, entries, photographs, reading, lambda: (_depth_note(folder), ()))
 
 
 def _shared_lens(file: Path, k: list[float]) -> dict[str, float]:

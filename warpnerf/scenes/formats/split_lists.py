@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from warpnerf.checks import InputError
-from warpnerf.scenes.files import exists, printable, require_regular_file
+from warpnerf.scenes.files import exists, plain_name, printable, read_names
 
 LISTS = {"train_list.txt": "train", "test_list.txt": "test", "validation_list.txt": "val"}
 """Files in a scene's folder, as nerfstudio names them, and the split that each holds."""
@@ -35,19 +35,12 @@ def read_split_lists(
     """
     splits: dict[str, set[str]] = {}
     warnings, told = [], []
-    known = {_plain(name): name for name in of_model}
+    known = {plain_name(name): name for name in of_model}
     for file, split in LISTS.items():
         path = folder / file
         if not exists(path):
             continue
-        require_regular_file(path)
-        try:
-            lines = [line.strip() for line in path.read_text(encoding="utf-8-sig").splitlines()]
-        except (OSError, UnicodeDecodeError) as error:
-            raise InputError(
-                f"{path}: cannot be read as text ({error}); mend or remove it."
-            ) from None
-        listed = {_named(line, known) for line in lines if line}
+        listed = {_named(line, known) for line in read_names(path)}
         if not listed:
             warnings.append(f"{file}: is empty, and not used")
             continue
@@ -80,9 +73,5 @@ def read_split_lists(
 
 def _named(line: str, known: Mapping[str, str]) -> str:
     """The photograph that a line names, by the model's name; the line itself where it is none."""
-    name = _plain(line)
+    name = plain_name(line)
     return known.get(name) or known.get(name.removeprefix("images/")) or line
-
-
-def _plain(name: str) -> str:
-    return name.replace("\\", "/").removeprefix("./")
