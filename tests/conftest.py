@@ -24,9 +24,11 @@ if "WARP_CACHE_PATH" in os.environ:
 
 compile_as_tests_do()
 
+# As shells have them for what runs in the background; commands under test would inherit it.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    # As shells have it for what runs in the background; commands under test would inherit it.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:  # nohup
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from warpnerf.evaluation.near_field import NEAR_SHARE
-from warpnerf.viewer.painter import KINDS, LAYOUTS, Settings
+from warpnerf.viewer.painter import KINDS, LAYOUTS, Settings, Subject
 from warpnerf.viewer.recorder import FILE_NAME, Recorder, preview
 from warpnerf.viewer.stage import Stage, stand_in
 from warpnerf.viewer.viewpoint import Viewpoint, World
@@ -33,9 +33,8 @@ class Panel:
         settings: Settings,
         box: tuple[np.ndarray, np.ndarray],
         content_distance: float,
-        names: Sequence[str],
+        subjects: Sequence[Subject],
         training: bool,
-        clips: bool,
         viewpoint_of: Callable[[int], Viewpoint | None],
         changed: Callable[[], None],
     ) -> None:
@@ -48,9 +47,8 @@ class Panel:
             settings: To begin with.
             box: Corners that a crop box stays within, [3] each, scene units.
             content_distance: Scene units.
-            names: Of the one or two subjects.
+            subjects: One or two.
             training: Whether there is time to be shared with a training.
-            clips: Whether what is near can be left out: not in normalised device coordinates.
             viewpoint_of: Where the page of a client looks from.
             changed: Called when something was set.
         """
@@ -66,8 +64,8 @@ class Panel:
         self._changed = changed
         self._recorder = Recorder()
         gui = server.gui
-        gui.set_panel_label(f"warpnerf: {' | '.join(names)}")
-        self._add_pictures(len(names))
+        gui.set_panel_label(f"warpnerf: {' | '.join(subject.name for subject in subjects)}")
+        self._add_pictures(len(subjects))
         if training:
             slider = gui.add_slider(
                 "Time for pictures", 0.05, 0.9, 0.05, SHARE, hint="share of it, from training"
@@ -75,7 +73,7 @@ class Panel:
             slider.on_update(lambda _: setattr(self, "share", _kept(slider.value, 0.05, 0.9)))
         if stage.cameras:
             self._add_cameras()
-        self._add_crop(box, clips)
+        self._add_crop(box, any(subject.field().steps.in_ndc for subject in subjects))
         self._add_path()
 
     def _set(self, **changes: Any) -> None:
@@ -153,7 +151,7 @@ class Panel:
             if event.client is not None and name.value in cameras:
                 stand_in(event.client, cameras[name.value], self._world)
 
-    def _add_crop(self, box: tuple[np.ndarray, np.ndarray], clips: bool) -> None:
+    def _add_crop(self, box: tuple[np.ndarray, np.ndarray], in_ndc: bool) -> None:
         gui = self._server.gui
         with gui.add_folder("Crop box", expand_by_default=False):
             cropped = gui.add_checkbox("Crop", False, hint="to cells of two voxels")
@@ -170,7 +168,7 @@ class Panel:
             clip = gui.add_slider(
                 "Clip before", 0.0, 2.0, 0.02, 0.0, hint="what is nearer, in content distances"
             )
-            clip.visible = clips
+            clip.visible = not in_ndc  # whose rays are not cut at distances
 
         @clip.on_update
         def _(_: Any) -> None:

@@ -125,9 +125,8 @@ class Session:
                 settings,
                 box,
                 content_distance,
-                [subject.name for subject in subjects],
+                subjects,
                 training,
-                not any(subject.field().steps.in_ndc for subject in subjects),
                 lambda client_id: getattr(self._pages.get(client_id), "viewpoint", None),
                 self._news.set,
             )
