@@ -25,7 +25,6 @@ from warpnerf.training.warmup import rendering_kernels, training_kernels, warm_u
     ("contraction", "scaling", "model"),
     [
         ("none", "none", SMALL),
-        ("none", "quadratic", SMALL),
         ("none", "clamped", SMALL),
         ("linf", "clamped", SMALL),
         ("ndc", "clamped", SMALL),

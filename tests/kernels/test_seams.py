@@ -324,9 +324,9 @@ def test_training_in_another_space(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     config = TrainConfig(
         model="rgb",
         loss=SQUARED,
-        steps=300,
+        steps=240,
         rays_per_step=200,
-        threads=2,
+        threads=1,
         background="black",
         coarse_steps=0,
         grid=grid,

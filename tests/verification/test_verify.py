@@ -121,6 +121,10 @@ def coarse_bound_when_packed(method: Callable[..., Any]) -> Callable[..., Any]:
     return bound
 
 
+passed: set[tuple[str, ...]] = set()
+"""Words of checks that do not fail where nothing is spoilt."""
+
+
 @pytest.mark.parametrize(
     ("method", "spoil", "words"),
     [
@@ -165,7 +169,9 @@ def test_each_can_fail(
     launch_unoptimised(monkeypatch)
     if not any("per_sample" in word for word in words):
         monkeypatch.setattr(checks, "VIEW_DEPENDENT", (SMALL,))
-    assert failing(device, *words) == set()
+    if tuple(words) not in passed:
+        assert failing(device, *words) == set()
+        passed.add(tuple(words))
     monkeypatch.setattr(ProblemKernels, method, spoil(getattr(ProblemKernels, method)))
     spoilt = failing(device, *words)
     assert all(any(word in name for name in spoilt) for word in words)
