@@ -20,6 +20,7 @@ from warpnerf.evaluation.metrics import (
     has_flip,
     psnr,
     ssim,
+    truth,
 )
 from warpnerf.evaluation.near_field import (
     NEAR_SHARE,
@@ -220,12 +221,3 @@ def require_measurable(scene: Scene, split: str) -> None:
                 f"{scene.views[index].name} is {camera.width} x {camera.height} pixels, but SSIM "
                 f"needs {SSIM_WINDOW} x {SSIM_WINDOW}; use larger images, or no --downscale."
             )
-
-
-def truth(view: View, background: tuple[float, float, float]) -> np.ndarray:
-    """A view's photograph over a background, [H, W, 3] float64 in [0, 1]."""
-    image = view.image.astype(np.float64) / 255.0
-    if image.shape[2] == 3:
-        return image
-    alpha = image[..., 3:]
-    return alpha * image[..., :3] + (1.0 - alpha) * np.array(background)

@@ -13,7 +13,7 @@ import numpy as np
 
 from warpnerf.evaluation.floater_metrics import near_density
 from warpnerf.evaluation.light import Light, measure_light
-from warpnerf.evaluation.metrics import psnr, ssim
+from warpnerf.evaluation.metrics import psnr, ssim, truth
 from warpnerf.evaluation.near_field import near_masses
 from warpnerf.evaluation.sight import can_tell_sight, surfaces, training_views_that_see
 from warpnerf.rendering.rays import camera_rays
@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 
 SEEN_BY = (1, 2)
 """Training views, at least, that see the surfaces of the pixels that are measured."""
+
+TRAINING_VIEWS = 8
+"""That are rendered, at most."""
 
 NEAREST = 0.01
 """In content distances: a rendered depth counts as no nearer than this, for its inverse."""
@@ -80,6 +83,9 @@ class Measures:
     """Mean optical depth around the training cameras where no surface is; None: not known."""
     angles: tuple[ViewAngle, ...]
     """Of each view."""
+    training_psnr: float
+    """Mean PSNR of up to TRAINING_VIEWS training views, spread, dB: what only these saw may rise in
+    it while test views fall."""
     left_out: tuple[str, ...]
     """What could not be measured, a sentence each."""
 
@@ -123,6 +129,7 @@ class Measures:
             for low, group in self._classes().items()
         ]
         parts.append(table_text(["angle to the nearest training camera", "views", "PSNR"], rows))
+        parts.append(f"PSNR of training views: {self.training_psnr:.2f}")
         masses = sorted(self.near_mass.items(), key=lambda pair: -pair[1])
         worst = ", ".join(f"{name} {mass:.4f}" for name, mass in masses[:3])
         parts.append(f"most optical depth near training cameras: {worst}")
@@ -228,6 +235,8 @@ class Measuring:
         on_progress("what is near each camera")
         names = [scene.views[index].name for index in scene.splits["train"]]
         masses = [mass / n for mass, n in near_masses(field, scene)]
+        on_progress("training views")
+        fits = training_psnr(field, scene)
         density = None
         if scene.first_hit is not None:
             density = near_density(field, scene.training_cameras, scene.first_hit)
@@ -237,8 +246,20 @@ class Measuring:
             near_mass=dict(zip(names, masses, strict=True)),
             near_density=density,
             angles=tuple(self._angles),
+            training_psnr=fits,
             left_out=tuple(left_out),
         )
+
+
+def training_psnr(field: Field, scene: Scene) -> float:
+    """Mean PSNR of up to TRAINING_VIEWS training views, spread, dB."""
+    indices = scene.splits["train"]
+    found = []
+    for index in indices[:: -(-len(indices) // TRAINING_VIEWS)]:
+        view = scene.views[index]
+        rgb = np.clip(field.render(view.camera).rgb, 0.0, 1.0)
+        found.append(psnr(rgb, truth(view, field.background), view.mask))
+    return float(np.mean(found))
 
 
 def depth_errors(depth: np.ndarray, truth: np.ndarray, nearest: float) -> dict[str, float]:
