@@ -18,17 +18,20 @@ def test_a_table_and_a_plan(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     plan = tmp_path / "plan.png"
     assert (
         inspect_command(
-            InspectOptions(scene=str(tmp_path / "scene"), output=plan), {"threads": ("3",)}
+            InspectOptions(scene=str(tmp_path / "scene"), output=plan, plots=tmp_path / "plots"),
+            {"threads": ("3",)},
         )
         == 0
     )
-    said = capsys.readouterr().out
+    said, _, plots = capsys.readouterr().out.partition(f"wrote {tmp_path / 'plots'}")
+    assert "sampling.png" in plots
     assert said.startswith("scene\n  format")
     assert "on 3 CPU threads" in said
     assert said.endswith(f"wrote {plan}\n")
     with Image.open(plan) as picture:
         assert picture.size > (1000, 500)
-    assert {path.name for path in tmp_path.iterdir()} == {"scene", "plan.png"}
+    assert {path.name for path in tmp_path.iterdir()} == {"scene", "plan.png", "plots"}
+    assert {path.name for path in (tmp_path / "plots").iterdir()} == {"cameras.png", "sampling.png"}
 
 
 def test_json(tmp_path: Path) -> None:

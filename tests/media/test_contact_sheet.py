@@ -14,7 +14,7 @@ from PIL import Image
 from tests.support.tiny_fields import tiny_field
 from tests.training.test_determinism import small_scene
 from warpnerf.config import TrainConfig
-from warpnerf.evaluation.evaluate import truth
+from warpnerf.evaluation.metrics import truth
 from warpnerf.media import contact_sheet as module
 from warpnerf.media.contact_sheet import MAX_WIDTH, SheetRow, contact_sheet, spread
 from warpnerf.media.filming import depth_range

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from warpnerf.media.curves import _TEST, SIZE, CurvePoint, _round_numbers, _running_mean, curves
+from warpnerf.media.curves import _TEST, SIZE, CurvePoint, curves, running_mean
+from warpnerf.media.plots import _round_numbers
 
 
 def point(step: int, test: float | None = None) -> CurvePoint:
@@ -31,8 +32,8 @@ def test_a_single_report_is_drawn() -> None:
 def test_the_mean_runs_through_the_middle() -> None:
     line = np.linspace(0.0, 1.0, 200)
     noise = 0.1 * (-1.0) ** np.arange(200)
-    np.testing.assert_allclose(_running_mean(line), line, atol=1e-12)
-    assert np.abs(_running_mean(line + noise) - line)[10:-10].max() < 0.02
+    np.testing.assert_allclose(running_mean(line), line, atol=1e-12)
+    assert np.abs(running_mean(line + noise) - line)[10:-10].max() < 0.02
 
 
 @pytest.mark.parametrize(("low", "high"), [(0.0, 4000.0), (17.3, 31.2), (-3.0, -2.9), (0.0, 1e-9)])

@@ -29,6 +29,7 @@ import heads
 import host_command
 import host_exports
 import host_formats
+import host_measures
 import host_output
 import host_runs
 import host_scenes
@@ -62,6 +63,7 @@ MUTANTS = (
     *host_scenes.MUTANTS,
     *host_formats.MUTANTS,
     *host_output.MUTANTS,
+    *host_measures.MUTANTS,
     *host_runs.MUTANTS,
     *host_command.MUTANTS,
     *host_exports.MUTANTS,

@@ -9,7 +9,7 @@ import pytest
 
 from tests.support.tiny_scenes import camera_at, ring, tiny_scene
 from warpnerf import GridConfig, TrainConfig
-from warpnerf.scenes.cameras.overlap import in_picture, views_of_content
+from warpnerf.scenes.cameras.overlap import in_picture, overlap_along_rays, views_of_content
 from warpnerf.scenes.scene import Scene
 from warpnerf.training.extent import content_distances
 
@@ -83,3 +83,16 @@ def test_where_many_look_around_and_see_the_same_gradients_are_scaled_less_far()
         assert content_distances(scene, own)[1] == [4.0] * n_cameras
         assert content_distances(scene, replace(auto, content_distance=3.0))[1] == [3.0] * n_cameras
     assert shares[0] == 1.0 and 0.5 < shares[1] < 1.0 and shares[-1] == 0.5
+
+
+def test_overlap_along_rays_of_two_cameras_side_by_side() -> None:
+    """Close to them each sees its own; far away both see all, and rays thin out by the square."""
+    lens = {"width": 40, "height": 30, "fx": 40.0, "fy": 40.0, "cx": 20.0, "cy": 15.0}
+    poses = [np.eye(4), np.eye(4)]
+    poses[1][0, 3] = 1.0
+    found = overlap_along_rays([camera_at(pose, **lens) for pose in poses], 1.0)
+    assert found.distances[[0, -1]] == pytest.approx([0.01, 100.0])
+    assert found.cameras[0] == 1.0 and found.cameras[-1] == 2.0
+    assert (np.diff(found.cameras) >= 0.0).all()
+    scaled = found.density * found.distances**2 / 40.0**2
+    assert scaled[0] == pytest.approx(1.0) and scaled[-1] == pytest.approx(2.0, rel=0.02)

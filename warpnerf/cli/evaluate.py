@@ -18,6 +18,7 @@ def eval_command(
     masks: Path | None = None,
     split: Literal["test", "train", "val", "all"] = "test",
     lpips: Path | None = None,
+    measures: bool = False,
     json: Path | None = None,
     device: str = "cpu",
     threads: int | None = None,
@@ -31,6 +32,9 @@ def eval_command(
         split: Which views.
         lpips: Weights of LPIPS, to measure it as well; warpnerf/evaluation/lpips.py describes the
             file.
+        measures: Also measure what takes longer: where light is absorbed before and behind the true
+            surfaces, figures of what training views see, density near each camera. Those of a run's
+            own test views are added to its metrics.json.
         json: Also write the figures to this file.
         device: cpu, cuda, cuda:1, ...
         threads: CPU threads; by default one per usable core.
@@ -63,8 +67,12 @@ def eval_command(
     views = config.as_trained(views)
     require_measurable(views, split)
     with ProgressBar("first view") as bar:
-        result = evaluate(field, views, split, lpips=distance, on_progress=bar.report)
+        result = evaluate(
+            field, views, split, lpips=distance, on_progress=bar.report, measures=measures
+        )
     print(result)
+    if result.measures is not None and scene is None and masks is None and split == "test":
+        run.add_measures(result.measures)
     if json is not None:
         write_json(json, result.to_json())
     return 0

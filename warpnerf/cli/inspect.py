@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from warpnerf.checks import InputError, cannot_write
 from warpnerf.cli.arguments import SceneName, Settings, Usual
@@ -13,6 +13,9 @@ from warpnerf.cli.given import NOTHING, Given
 from warpnerf.cli.machine import require_writable, write_json
 from warpnerf.presets import DEFAULT_PRESETS, PRESETS
 from warpnerf.runtime.memory import usable_cores
+
+if TYPE_CHECKING:
+    from warpnerf.scenes.scene import Scene
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,6 +27,9 @@ class InspectOptions:
     builtin:room-sparse."""
     output: Path | None = None
     """FILE.png for a plan: cameras, box and content distance from above and the side."""
+    plots: Path | None = None
+    """Folder for two plots: how many cameras see a point, and how densely it is sampled, by its
+    distance from a camera."""
     json: Path | None = None
     """Also write all of it to this file."""
     downscale: int = 1
@@ -67,6 +73,8 @@ def inspect_command(options: InspectOptions, given: Annotated[Given, USUAL] = NO
         if not output.parent.is_dir():
             raise InputError(f"--output {output}: its folder does not exist; make it first.")
     require_writable(json)
+    if options.plots is not None and options.plots.exists() and not options.plots.is_dir():
+        raise InputError(f"--plots {options.plots} is a file; name a folder.")
     configs = {
         name: begun_with(
             configured(PRESETS[name], given, options.model_options, options.loss), given
@@ -96,4 +104,24 @@ def inspect_command(options: InspectOptions, given: Annotated[Given, USUAL] = NO
         except OSError as error:
             raise cannot_write(f"--output {output}", error) from error
         print(f"wrote {output}")
+    if options.plots is not None:
+        _write_plots(found.scene, options.plots)
     return 0
+
+
+def _write_plots(scene: Scene, folder: Path) -> None:
+    """Write plots of how cameras share what they see.
+
+    Raises:
+        InputError: They cannot be written.
+    """
+    from warpnerf.media.overlap_plots import overlap_plots
+    from warpnerf.media.pictures import write_png
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, picture in overlap_plots(scene).items():
+            write_png(folder / name, picture)
+            print(f"wrote {folder / name}")
+    except OSError as error:
+        raise cannot_write(f"--plots {folder}", error) from error

@@ -20,6 +20,7 @@ import tyro
 from warpnerf import __version__
 from warpnerf.checks import InputError, way_out
 from warpnerf.cli.arguments import flags_of, registry, with_help
+from warpnerf.cli.compare import compare_command
 from warpnerf.cli.demo import demo_command
 from warpnerf.cli.evaluate import eval_command
 from warpnerf.cli.export import export_command
@@ -45,6 +46,7 @@ Call = Callable[[], int]
 
 COMMANDS: dict[str, Callable[..., int]] = {
     "demo": demo_command,
+    "compare": compare_command,
     "inspect": inspect_command,
     "pose": pose_command,
     "train": train_command,
@@ -57,10 +59,10 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "warmup": warmup_command,
 }
 
-PATHS = ("--output", "--resume", "--config", "--scene", "--masks", "--json")
+PATHS = ("--output", "--resume", "--config", "--scene", "--masks", "--json", "--plots")
 """Options whose value may be any name."""
 
-TAKES_A_SCENE = ("train", "inspect", "pose")
+TAKES_A_SCENE = ("train", "inspect", "pose", "compare")
 """Subcommands whose first word is a folder of a scene, or of photographs."""
 
 NARROWEST = 24

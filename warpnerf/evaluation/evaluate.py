@@ -6,12 +6,13 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from warpnerf.checked import checked_arguments
 from warpnerf.checks import InputError
+from warpnerf.evaluation.measures import Measures, Measuring
 from warpnerf.evaluation.metrics import (
     SSIM_WINDOW,
     alike_where_masked,
@@ -19,6 +20,7 @@ from warpnerf.evaluation.metrics import (
     has_flip,
     psnr,
     ssim,
+    truth,
 )
 from warpnerf.evaluation.near_field import (
     NEAR_SHARE,
@@ -80,6 +82,8 @@ class Evaluation:
     """In the scene's order."""
     near_field: NearField
     """Of floaters."""
+    measures: Measures | None = None
+    """What takes longer; None: it was not measured."""
 
     @property
     def mean(self) -> dict[str, float]:
@@ -94,12 +98,18 @@ class Evaluation:
 
     def to_json(self) -> str:
         """Metrics as JSON: {"mean": {"psnr": ..., ...}, "floaters": {...}, "images": [{"name": ...,
-        ...}, ...]}."""
+        ...}, ...], "measures": {...}}, the last where they were measured."""
         images = [
             {key: value for key, value in vars(image).items() if value is not None}
             for image in self.images
         ]
-        content = {"mean": self.mean, "floaters": self.near_field.to_dict(), "images": images}
+        content: dict[str, Any] = {
+            "mean": self.mean,
+            "floaters": self.near_field.to_dict(),
+            "images": images,
+        }
+        if self.measures is not None:
+            content["measures"] = self.measures.to_dict()
         return json.dumps(content, indent=2) + "\n"
 
     def __str__(self) -> str:
@@ -113,7 +123,8 @@ class Evaluation:
         rows = [cells(image.name, partial(getattr, image)) for image in self.images]
         rows.append(cells("mean", mean.get))
         table = table_text(["image", *(HEADINGS[key][0] for key in mean)], rows)
-        return "\n".join([table, str(self.near_field), *self._fog()])
+        more = [] if self.measures is None else ["", str(self.measures)]
+        return "\n".join([table, str(self.near_field), *self._fog(), *more])
 
     def _fog(self) -> list[str]:
         """That views are fog: what the field has close to their cameras hides what they show."""
@@ -136,6 +147,7 @@ def evaluate(
     on_image: Callable[[View, np.ndarray, Rendering], None] | None = None,
     lpips: Distance | None = None,
     on_progress: Callable[[float, str], None] = lambda done, words: None,
+    measures: bool = False,
 ) -> Evaluation:
     """Evaluate a field: render a split's views and compare them with the photographs.
 
@@ -147,6 +159,7 @@ def evaluate(
             and its rendering.
         lpips: A ``warpnerf.evaluation.lpips.Lpips``, if LPIPS is wanted.
         on_progress: Called with the share that is done, in (0, 1], and what was last, in words.
+        measures: Whether to measure what takes longer as well: see ``Measures``.
 
     Returns:
         Figures of each image and their means, and what hangs in front of the training cameras.
@@ -158,6 +171,7 @@ def evaluate(
     images = []
     within = NEAR_SHARE * scene.content_distance
     views = [scene.views[index] for index in require_split(scene, split)]
+    measuring = Measuring(field, scene, split) if measures else None
     for number, view in enumerate(views, 1):
         rendering = field.render(view.camera)
         target = truth(view, field.background)
@@ -182,10 +196,16 @@ def evaluate(
         )
         if on_image is not None:
             on_image(view, target, rendering)
+        if measuring is not None:
+            measuring.add(view, target, rendering)
         on_progress(number / (len(views) + 1), f"view {number} of {len(views)}")
     near_field = measure_near_field(field, scene)
+    so_far = len(views) / (len(views) + 1)
+    found = None
+    if measuring is not None:
+        found = measuring.finish(lambda words: on_progress(so_far, words))
     on_progress(1.0, "what is near the cameras")
-    return Evaluation(images=tuple(images), near_field=near_field)
+    return Evaluation(images=tuple(images), near_field=near_field, measures=found)
 
 
 def require_measurable(scene: Scene, split: str) -> None:
@@ -201,12 +221,3 @@ def require_measurable(scene: Scene, split: str) -> None:
                 f"{scene.views[index].name} is {camera.width} x {camera.height} pixels, but SSIM "
                 f"needs {SSIM_WINDOW} x {SSIM_WINDOW}; use larger images, or no --downscale."
             )
-
-
-def truth(view: View, background: tuple[float, float, float]) -> np.ndarray:
-    """A view's photograph over a background, [H, W, 3] float64 in [0, 1]."""
-    image = view.image.astype(np.float64) / 255.0
-    if image.shape[2] == 3:
-        return image
-    alpha = image[..., 3:]
-    return alpha * image[..., :3] + (1.0 - alpha) * np.array(background)

@@ -1,23 +1,21 @@
 """Floaters, measured against a truth that is known: density where there can be none.
 
-``first_hit`` stands for that truth: origins [n, 3] and unit directions [n, 3] to the distance of
-the first surface along each ray, [n], scene units; as in ``warpnerf.scenes.builtin.room``.
+``first_hit`` stands for that truth, as ``Scene.first_hit``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from warpnerf.rendering.field import Field
 from warpnerf.scenes.cameras.camera import Camera
+from warpnerf.scenes.scene import FirstHit
 
 N_DIRECTIONS = 2000
 """Rays around a camera."""
-
-FirstHit = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 def clearance(camera: Camera, first_hit: FirstHit) -> float:

@@ -12,6 +12,7 @@ import numpy as np
 
 from warpnerf.checks import InputError, require_extra
 from warpnerf.runtime.memory import usable_cores
+from warpnerf.scenes.scene import View
 
 SSIM_WINDOW = 11
 """Pixels along the edge of SSIM's window."""
@@ -21,6 +22,15 @@ MAX_PSNR = 120.0
 
 _RADIUS = SSIM_WINDOW // 2
 _SIGMA = 1.5
+
+
+def truth(view: View, background: tuple[float, float, float]) -> np.ndarray:
+    """A view's photograph over a background, [H, W, 3] float64 in [0, 1]."""
+    image = view.image.astype(np.float64) / 255.0
+    if image.shape[2] == 3:
+        return image
+    alpha = image[..., 3:]
+    return alpha * image[..., :3] + (1.0 - alpha) * np.array(background)
 
 
 def psnr(rgb: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None) -> float:

@@ -8,12 +8,14 @@ photographed again, views from further back show as well what hangs in front of 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from warpnerf.evaluation.metrics import psnr
+from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.scene import Scene
 
 if TYPE_CHECKING:
@@ -85,16 +87,14 @@ def measure_near_field(field: Field, scene: Scene) -> NearField:
             that can be photographed again also gives PSNR of cameras pulled back.
     """
     within = NEAR_SHARE * scene.content_distance
-    steps = replace(field.steps, far=within, transmittance_min=0.0)
-    close_by = replace(field, steps=steps, proposal=None)  # all matter that is there
     mass, near, n_rays = 0.0, 0, 0
-    for whole in scene.training_cameras:
-        camera = whole.downscaled(whole.block_for(MAX_PIXELS))
-        transmittance = 1.0 - close_by.render(camera).opacity
-        mass -= float(np.log(np.maximum(transmittance, MIN_TRANSMITTANCE)).sum(dtype=np.float64))
-        seen = field.render(camera)
+    for camera, (of_camera, n) in zip(
+        scene.training_cameras, near_masses(field, scene), strict=True
+    ):
+        mass += of_camera
+        seen = field.render(_coarse(camera))
         near += int(ends_within(seen, within).sum())
-        n_rays += transmittance.size
+        n_rays += n
     pulled = pulled_psnr(field, scene)
     return NearField(
         within=within,
@@ -104,6 +104,26 @@ def measure_near_field(field: Field, scene: Scene) -> NearField:
         pulled_psnr=float(np.mean(pulled)) if pulled else None,
         pulled_views=len(pulled) or None,
     )
+
+
+def near_masses(field: Field, scene: Scene) -> Iterator[tuple[float, int]]:
+    """Optical depth before each training camera up to NEAR_SHARE content distances.
+
+    Returns:
+        The sum over a camera's rays of the integral of sigma, and how many rays these are.
+    """
+    within = NEAR_SHARE * scene.content_distance
+    steps = replace(field.steps, far=within, transmittance_min=0.0)
+    close_by = replace(field, steps=steps, proposal=None)  # all matter that is there
+    for camera in scene.training_cameras:
+        transmittance = 1.0 - close_by.render(_coarse(camera)).opacity
+        depths = np.log(np.maximum(transmittance, MIN_TRANSMITTANCE))
+        yield 0.0 - float(depths.sum(dtype=np.float64)), transmittance.size
+
+
+def _coarse(camera: Camera) -> Camera:
+    """The camera with about MAX_PIXELS pixels, at most."""
+    return camera.downscaled(camera.block_for(MAX_PIXELS))
 
 
 def ends_within(seen: Rendering, distance: float) -> np.ndarray:

@@ -25,6 +25,7 @@ def evaluate_into(
     split: str,
     writing: Callable[[], AbstractContextManager[None]],
     on_progress: Callable[[float, str], None],
+    measures: bool = False,
 ) -> Evaluation:
     """Measure a split, and write metrics.json, its pictures, and a sheet of a few of them.
 
@@ -38,6 +39,7 @@ def evaluate_into(
         split: Which of them.
         writing: Is entered whenever files are written, and says what to do where they cannot be.
         on_progress: As of ``evaluate``.
+        measures: As of ``evaluate``.
     """
     views = [scene.views[index] for index in require_split(scene, split)]
     files = picture_files([view.name for view in views])
@@ -54,7 +56,7 @@ def evaluate_into(
 
     with writing():
         (folder / "test").mkdir(exist_ok=True)
-    result = evaluate(field, scene, split, picture, on_progress=on_progress)
+    result = evaluate(field, scene, split, picture, on_progress=on_progress, measures=measures)
     rows = [
         SheetRow(
             name=image.name,

@@ -32,6 +32,7 @@ import msgspec
 from warpnerf.checks import InputError, cannot_write
 from warpnerf.config import TrainConfig
 from warpnerf.evaluation.evaluate import Evaluation
+from warpnerf.evaluation.measures import Measures
 from warpnerf.media.curves import CurvePoint, curves
 from warpnerf.media.pictures import write_png
 from warpnerf.rendering.field import Field
@@ -368,17 +369,31 @@ class Run:
         scene: Scene,
         split: str,
         on_progress: Callable[[float, str], None] = lambda done, words: None,
+        measures: bool = False,
     ) -> Evaluation:
         """Measure a split, and write metrics.json, its pictures, and a sheet of a few of them.
 
         All show depths in the same colours, over the range of the true depths where they are known
         for all views, else of what their cameras see. `on_progress` is called with the share
-        that is done, in (0, 1], and what was last, in words.
+        that is done, in (0, 1], and what was last, in words. `measures` is that of ``evaluate``.
 
         Raises:
             InputError: They cannot be written.
         """
-        return evaluate_into(self.folder, field, scene, split, self._writing, on_progress)
+        return evaluate_into(self.folder, field, scene, split, self._writing, on_progress, measures)
+
+    def add_measures(self, measures: Measures) -> None:
+        """Add measures of the test views to metrics.json; nothing where there is none.
+
+        Raises:
+            InputError: It cannot be written.
+        """
+        path = self.folder / "metrics.json"
+        if not path.exists():
+            return
+        with self._writing():
+            content = json.loads(path.read_bytes()) | {"measures": measures.to_dict()}
+            write_atomically(path, (json.dumps(content, indent=2) + "\n").encode())
 
     def way_on(self) -> str:
         """How to resume, or that there is nothing to resume from: half a sentence."""

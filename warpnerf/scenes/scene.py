@@ -14,6 +14,10 @@ from warpnerf.optim_config import SceneKind
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.cameras.observations import Observations
 
+FirstHit = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""From origins [n, 3] and unit directions [n, 3] to the distance of the first surface along each
+ray, [n], scene units; as ``warpnerf.scenes.builtin.room.first_hit``."""
+
 
 class ImageFile(Protocol):
     """A photograph that is not kept in memory."""
@@ -189,6 +193,8 @@ class Scene:
     photograph: Callable[[Camera], np.ndarray | None] | None = None
     """What another camera sees, [H, W, 3] uint8 rgb, or None where it cannot stand; for scenes that
     can be photographed again."""
+    first_hit: FirstHit | None = None
+    """The true distance of the first surface along rays, for scenes that can be traced."""
 
     def __post_init__(self) -> None:
         """Refuse what nothing can be trained on.

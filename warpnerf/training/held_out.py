@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from warpnerf.checks import InputError, require_whole
-from warpnerf.evaluation.evaluate import truth
-from warpnerf.evaluation.metrics import psnr
+from warpnerf.evaluation.metrics import psnr, truth
 from warpnerf.scenes.scene import Scene
 from warpnerf.training.state import Progress
 

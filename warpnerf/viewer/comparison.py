@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from warpnerf.checks import InputError
-from warpnerf.evaluation.evaluate import truth
-from warpnerf.evaluation.metrics import psnr
+from warpnerf.evaluation.metrics import psnr, truth
 from warpnerf.media.contact_sheet import spread
 from warpnerf.media.pictures import dimmed, to_bytes
 from warpnerf.scenes.scene import Scene, View

@@ -407,4 +407,5 @@ def room_scene(downscale: int = 1, *, sparse: bool = False) -> Scene:
             "views, which look in, out and close, at no common point",
         ),
         photograph=once_more,
+        first_hit=first_hit,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,6 +14,12 @@ CAMERAS = 64
 
 PIXELS = 48
 """Of each of them, at most, spread evenly."""
+
+FEW_CAMERAS, FEW_PIXELS = 32, 20
+"""The same, where many distances are looked at."""
+
+REACH, POINTS = 100.0, 61
+"""Distances along rays: from 1 / REACH to REACH content distances, so many."""
 
 
 def in_picture(camera: Camera, points: np.ndarray) -> np.ndarray:
@@ -55,9 +62,51 @@ def views_of_content(cameras: Sequence[Camera], distances: np.ndarray) -> float:
     return float(np.median(np.sum([in_picture(camera, places) for camera in cameras], axis=0)))
 
 
-def _content(camera: Camera, distance: float) -> np.ndarray:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RayOverlap:
+    """What a point on a ray has of all cameras, by its distance from the ray's own."""
+
+    distances: np.ndarray
+    """[n] scene units, in equal ratios."""
+    cameras: np.ndarray
+    """[n] how many cameras have the point in their pictures, mean over points."""
+    density: np.ndarray
+    """[n] pixels' rays of all cameras per area across them, mean over points: 1 / scene unit^2.
+    With samples at even distances, times one in so many scene units, samples per volume."""
+
+
+def overlap_along_rays(cameras: Sequence[Camera], content_distance: float) -> RayOverlap:
+    """Overlap along the cameras' rays, whatever hides one thing behind another.
+
+    Philip & Deschaintre 2023, figure 4: near a camera hardly any other sees what it sees, and it
+    alone samples that space as 1 / distance^2.
+
+    Args:
+        cameras: At least one; their distortion is left out of account.
+        content_distance: The middle of the distances, scene units.
+    """
+    distances = content_distance * np.geomspace(1.0 / REACH, REACH, POINTS)
+    spread = cameras[:: -(-len(cameras) // FEW_CAMERAS)]
+    places = np.stack(
+        [np.concatenate([_content(c, t, FEW_PIXELS) for c in spread]) for t in distances]
+    )
+    flat = places.reshape(-1, 3)
+    counts, density = np.zeros(len(flat)), np.zeros(len(flat))
+    for camera in cameras:
+        seen = np.flatnonzero(in_picture(camera, flat))
+        squared = np.sum((flat[seen] - camera.position) ** 2, axis=1)
+        counts[seen] += 1.0
+        density[seen] += camera.fx * camera.fy / np.maximum(squared, distances[0] ** 2)
+    return RayOverlap(
+        distances=distances,
+        cameras=counts.reshape(POINTS, -1).mean(axis=1),
+        density=density.reshape(POINTS, -1).mean(axis=1),
+    )
+
+
+def _content(camera: Camera, distance: float, n_pixels: int = PIXELS) -> np.ndarray:
     """Points at a distance from a camera, on rays of pixels spread over its image, [n, 3]."""
-    block = camera.block_for(PIXELS)
+    block = camera.block_for(n_pixels)
     u, v = np.meshgrid(
         np.arange(block // 2, camera.width, block) + 0.5,
         np.arange(block // 2, camera.height, block) + 0.5,

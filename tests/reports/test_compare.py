@@ -1,0 +1,209 @@
+"""A comparison made tiny: trainings that are cut and go on, the report, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import get_args
+
+import pytest
+
+from warpnerf.checks import InputError
+from warpnerf.cli.compare import CompareOptions, compare_command
+from warpnerf.config import GridConfig, LossConfig, Scaling, TrainConfig
+from warpnerf.model.models import Rgb
+from warpnerf.reports.compare import require_comparable, write_comparison
+from warpnerf.reports.comparison import FIGURES, Row, candidates_of, sentences, value_at
+from warpnerf.reports.experiment import MOMENTS, Candidate, Capture, Experiment
+from warpnerf.reports.paired import paired_difference
+from warpnerf.scenes.formats.load import load_scene
+from warpnerf.scenes.scene import Scene
+from warpnerf.training import trainer as training
+
+CONFIG = TrainConfig(
+    model=Rgb(), loss=LossConfig(), steps=16, threads=1, grid=GridConfig(voxels=4000)
+)
+
+
+@pytest.fixture(scope="module")
+def room() -> Scene:
+    return load_scene("builtin:room-sparse", downscale=8)
+
+
+def experiment(folder: Path, scene: Scene, n_seeds: int = 2) -> Experiment:
+    """Of two scalings."""
+    candidates = [
+        Candidate(name="plain", config=replace(CONFIG, scaling="none")),
+        Candidate(name="scaled", config=replace(CONFIG, scaling="clamped"), against="plain"),
+    ]
+    capture = Capture(scene=scene, source="builtin:room-sparse", downscale=8)
+    return Experiment(folder, capture, candidates, n_seeds)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory, room: Scene) -> Experiment:
+    """One that was never interrupted."""
+    made = experiment(tmp_path_factory.mktemp("experiments") / "whole", room)
+    made.begin()
+    for candidate, seed in made.trials:
+        assert made.train(candidate, seed)
+    return made
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """What must not depend on interruptions."""
+    kinds = ("runs/*/field.safetensors", "runs/*/metrics.json", "moments/*/*.npz")
+    paths = [path for kind in kinds for path in folder.glob(kind)]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(paths)}
+
+
+def test_cut_anywhere_it_ends_with_the_same_bits(
+    finished: Experiment, room: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each training is stopped once, by a process that does not know the others."""
+    updates = 0
+    update = training.Trainer.update
+
+    def counted(self: training.Trainer) -> None:
+        nonlocal updates
+        updates += 1
+        update(self)
+
+    monkeypatch.setattr(training.Trainer, "update", counted)
+    for _ in range(2 * len(finished.trials)):
+        again = experiment(tmp_path / "cut", room)
+        again.begin()
+        for number, (candidate, seed) in enumerate(again.trials):
+            before, fresh = updates, not again.run(candidate, seed).checkpoints
+            most = before + 3 + 2 * number if fresh else 10**9
+            if not again.train(candidate, seed, lambda most=most: updates >= most):
+                break
+    assert contents(tmp_path / "cut") == contents(finished.folder)
+    assert len(contents(finished.folder)) == 4 + 4 + 2 * len(MOMENTS)
+    done = updates
+    assert all(again.train(candidate, seed) for candidate, seed in again.trials)
+    assert updates == done
+
+
+def test_the_report_is_one_file_and_says_what_figures_say(finished: Experiment) -> None:
+    rows = write_comparison(finished)
+    names = {path.name for path in finished.folder.iterdir()}
+    assert {"report.html", "figures.json", "moments.png", "cameras.png", "curves.png"} <= names
+    page = (finished.folder / "report.html").read_text()
+    assert not re.search(r"(src|href)=\"(?!data:|#)", page) and "$" not in page.split("<script>")[0]
+    assert page.count("data:image/jpeg") == 3 * 3  # photograph and two configurations
+    record = json.loads((finished.folder / "figures.json").read_text())
+    plain, scaled = record["configurations"]
+    metrics = [finished.metrics(finished.candidates[0], seed) for seed in (0, 1)]
+    assert plain["figures"]["psnr"]["values"] == [m["mean"]["psnr"] for m in metrics if m]
+    assert set(scaled["figures"]) == set(FIGURES) == set(scaled["differences"])
+    for name, difference in scaled["differences"].items():
+        means = (side["figures"][name]["mean"] for side in (scaled, plain))
+        mine, theirs = means
+        assert difference["mean"] == pytest.approx(mine - theirs, abs=1e-12)
+        assert difference["low"] <= difference["mean"] <= difference["high"]
+    assert plain["differences"] == {} and record["sentences"] == sentences(rows)
+    assert all(sentence.split(" (")[0][:40] in page for sentence in record["sentences"])
+
+
+def row(values: dict[str, list[float]], against: dict[str, list[float]] | None = None) -> Row:
+    differences = {n: paired_difference(v, against[n]) for n, v in values.items() if against}
+    name, other = ("b", "a") if against else ("a", None)
+    candidate = Candidate(name=name, config=CONFIG, against=other)
+    return Row(candidate=candidate, values=values, seconds=[1.0] * 3, differences=differences)
+
+
+def test_a_sentence_tells_better_from_worse_and_from_chance() -> None:
+    plain = {"psnr": [20.0] * 3, "front_train": [0.5] * 3, "near_mass": [0.1] * 3}
+    other = {
+        "psnr": [21.0, 21.1, 20.9],
+        "front_train": [0.6, 0.61, 0.59],
+        "near_mass": [0.0, 0.3, 0.1],
+    }
+    said, caution = sentences([row(plain), row(other, plain)])
+    assert said.startswith("b against a: better in PSNR (+1.00, ")
+    assert "worse in light in front, training rays (+0.1000" in said
+    assert "no significant difference in optical depth near cameras" in said
+    assert "by Student's t" in caution
+    single = replace(row({"psnr": [21.0]}, {"psnr": [20.0]}), seconds=[1.0])
+    (said,) = sentences([single])
+    assert said.startswith("One seed")
+
+
+def test_each_is_compared_with_the_first_scaling_of_its_own_kind() -> None:
+    keys = [("fast", field, scaling) for field in ("dense", "vm") for scaling in get_args(Scaling)]
+    found = candidates_of(dict.fromkeys(keys, CONFIG))
+    against = {candidate.name: candidate.against for candidate in found}
+    assert against["fast-vm-clamped"] == "fast-vm-none" and against["fast-vm-none"] is None
+    alone = candidates_of({("fast", None, "none"): CONFIG, ("quality", None, "none"): CONFIG})
+    assert [candidate.against for candidate in alone] == [None, "fast-none"]
+
+
+def test_figures_that_a_capture_lacks_are_none() -> None:
+    assert value_at({"mean": {"psnr": 3}}, ("mean", "psnr")) == 3.0
+    assert value_at({"mean": {}}, ("mean", "psnr")) is None
+    assert value_at({}, ("measures", "seen", "2", "psnr")) is None
+
+
+def test_a_folder_of_something_else_is_refused(finished: Experiment, room: Scene) -> None:
+    with pytest.raises(InputError, match=r"another comparison: its seeds is 2, not 3; name a new"):
+        experiment(finished.folder, room, n_seeds=3).begin()
+    other = experiment(finished.folder, room)
+    longer = replace(other.candidates[1], config=replace(CONFIG, steps=17))
+    other.candidates = (other.candidates[0], longer)
+    with pytest.raises(InputError, match=r"its configurations\.scaled\.steps is 16, not 17"):
+        other.begin()
+    with pytest.raises(InputError, match=r"holds other files \(plain-seed-0\)"):
+        experiment(finished.folder / "runs", room).begin()
+    with pytest.raises(InputError, match="cannot be written"):
+        experiment(finished.folder / "figures.json" / "x", room).begin()
+
+
+def test_too_few_test_views_are_refused(room: Scene) -> None:
+    for n, words in ((0, "no test views"), (1, "one test view")):
+        fewer = replace(room, splits={**room.splits, "test": room.splits["test"][:n]})
+        with pytest.raises(InputError, match=f"{words}, and .* by --split"):
+            require_comparable(fewer)
+
+
+@pytest.mark.parametrize(
+    ("options", "given", "words"),
+    [
+        ({"scalings": ("none", "clampd")}, {}, "--scalings: 'clampd' is none of .* clamped"),
+        ({"scalings": ("none", "none")}, {}, "--scalings: none is given twice"),
+        ({"fields": ("cube",)}, {}, "--fields: 'cube' is none of dense, vm, hash"),
+        ({"presets": ()}, {}, "--presets has no value"),
+        ({"seeds": 0}, {}, "--seeds must be a whole number of at least 1"),
+        ({}, {"seed": ("3",)}, "--seed: compare takes several, by --seeds"),
+        ({"split": "all"}, {}, "no test views"),
+    ],
+)
+def test_bad_input_is_refused_before_anything_is_written(
+    tmp_path: Path, options: dict, given: dict, words: str
+) -> None:
+    room = {"scene": "builtin:room-sparse", "downscale": 8, "output": tmp_path / "out"}
+    with pytest.raises(InputError, match=words):
+        compare_command(CompareOptions(**room, **options), given)
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_command_trains_reports_and_continues(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = CompareOptions(
+        scene="builtin:room-sparse",
+        downscale=8,
+        output=tmp_path / "out",
+        scalings=("none", "clamped"),
+        seeds=1,
+        loss=("distortion=0", "entropy=0", "opacity=0"),
+    )
+    given = {"steps": ("4",), "model": ("rgb",), "threads": ("1",), "grid.voxels": ("4000",)}
+    assert compare_command(options, given) == 0
+    first = capsys.readouterr().out
+    assert "2 of 2  fast-clamped      0" in first and "One seed" in first
+    assert (tmp_path / "out" / "report.html").stat().st_size > 10_000
+    assert compare_command(options, given) == 0
+    assert "steps/s" not in capsys.readouterr().out

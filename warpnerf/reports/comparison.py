@@ -1,0 +1,253 @@
+"""Comparisons of configurations: what an experiment's figures say, in numbers and in sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from warpnerf.config import Scaling
+from warpnerf.config_json import config_to_json
+from warpnerf.reports.experiment import Candidate, Experiment
+from warpnerf.reports.paired import CONFIDENCE, Difference, paired_difference
+from warpnerf.runs.logs import read_reports
+
+
+@dataclass(frozen=True, kw_only=True)
+class Figure:
+    """A figure that is compared."""
+
+    heading: str
+    """With its unit."""
+    path: tuple[str, ...]
+    """Where metrics.json has it."""
+    better: int
+    """1: more is better; -1: less is; 0: neither by itself."""
+    digits: int
+    """Behind the point."""
+
+
+FIGURES = {
+    "psnr": Figure(heading="PSNR [dB]", path=("mean", "psnr"), better=1, digits=2),
+    "ssim": Figure(heading="SSIM", path=("mean", "ssim"), better=1, digits=4),
+    "training_psnr": Figure(
+        heading="PSNR of training views [dB]",
+        path=("measures", "training_psnr"),
+        better=0,
+        digits=2,
+    ),
+    "pulled_psnr": Figure(
+        heading="PSNR of views pulled back [dB]",
+        path=("floaters", "pulled_psnr"),
+        better=1,
+        digits=2,
+    ),
+    "seen_psnr": Figure(
+        heading="PSNR where two training views see [dB]",
+        path=("measures", "seen", "2", "psnr"),
+        better=1,
+        digits=2,
+    ),
+    "coverage": Figure(
+        heading="coverage there", path=("measures", "seen", "2", "coverage"), better=1, digits=4
+    ),
+    "seen_depth_error": Figure(
+        heading="depth error there [scene units]",
+        path=("measures", "seen", "2", "depth_error"),
+        better=-1,
+        digits=4,
+    ),
+    "front_test": Figure(
+        heading="light in front, test rays",
+        path=("measures", "light", "test", "front"),
+        better=-1,
+        digits=4,
+    ),
+    "behind_test": Figure(
+        heading="light behind, test rays",
+        path=("measures", "light", "test", "behind"),
+        better=-1,
+        digits=4,
+    ),
+    "front_train": Figure(
+        heading="light in front, training rays",
+        path=("measures", "light", "train", "front"),
+        better=-1,
+        digits=4,
+    ),
+    "behind_train": Figure(
+        heading="light behind, training rays",
+        path=("measures", "light", "train", "behind"),
+        better=-1,
+        digits=4,
+    ),
+    "near_mass": Figure(
+        heading="optical depth near cameras", path=("floaters", "near_mass"), better=-1, digits=4
+    ),
+    "near_density": Figure(
+        heading="optical depth where nothing is",
+        path=("measures", "near_density"),
+        better=-1,
+        digits=4,
+    ),
+}
+"""By name; docs/metrics.md has their formulas. A capture has those that can be measured there."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """What a configuration came to."""
+
+    candidate: Candidate
+    """Which."""
+    values: dict[str, list[float]]
+    """By figure, of each seed."""
+    seconds: list[float]
+    """Of training, of each seed."""
+    differences: dict[str, Difference]
+    """By figure, from that which it is compared with; none where it is compared with none."""
+
+
+def candidates_of(
+    configs: Mapping[tuple[str, str | None, Scaling], Any],
+) -> list[Candidate]:
+    """Configurations by preset, field and scaling, each compared with one of them.
+
+    That is the one with the first scaling, of the same preset and field; of a single scaling, the
+    first of all.
+
+    Args:
+        configs: In the order in which they are to stand; a field of None is the preset's own.
+    """
+    names = {key: "-".join(part for part in key if part is not None) for key in configs}
+    first, scalings = next(iter(configs)), list(dict.fromkeys(key[2] for key in configs))
+    found = []
+    for key, config in configs.items():
+        against = (key[0], key[1], scalings[0]) if len(scalings) > 1 else first
+        other = None if against == key else names[against]
+        found.append(Candidate(name=names[key], config=config, against=other))
+    return found
+
+
+def compare_figures(experiment: Experiment) -> list[Row]:
+    """The figures of an experiment that has finished, and their paired differences."""
+    values: dict[str, dict[str, list[float]]] = {}
+    for candidate in experiment.candidates:
+        found = [experiment.metrics(candidate, seed) for seed in experiment.seeds]
+        known = {
+            name: [value_at(metrics, figure.path) for metrics in found]
+            for name, figure in FIGURES.items()
+        }
+        values[candidate.name] = {
+            name: [value for value in of_seeds if value is not None]
+            for name, of_seeds in known.items()
+            if None not in of_seeds
+        }
+    rows = []
+    for candidate in experiment.candidates:
+        own, differences = values[candidate.name], {}
+        if candidate.against is not None:
+            others = values[candidate.against]
+            differences = {
+                name: paired_difference(own[name], others[name]) for name in own if name in others
+            }
+        seconds = []
+        for seed in experiment.seeds:
+            reports = read_reports(experiment.run(candidate, seed).folder / "log.jsonl")
+            seconds.append(float(reports[-1]["seconds"]) if reports else 0.0)
+        rows.append(Row(candidate=candidate, values=own, seconds=seconds, differences=differences))
+    return rows
+
+
+def value_at(tree: Any, path: Sequence[str]) -> float | None:
+    """A number in metrics.json; None where it has none."""
+    for name in path:
+        tree = tree.get(name) if isinstance(tree, dict) else None
+    return float(tree) if isinstance(tree, int | float) else None
+
+
+def sentences(rows: Sequence[Row]) -> list[str]:
+    """What differs significantly and what does not, a sentence for each, and a caution."""
+    said = []
+    n_seeds, n_compared = 1, 0
+    for row in rows:
+        if row.candidate.against is None:
+            continue
+        n_seeds = len(row.seconds)
+        n_compared += len(row.differences)
+        if n_seeds > 1:
+            said.append(f"{row.candidate.name} against {row.candidate.against}: {_verdict(row)}.")
+    if n_seeds < 2:
+        return ["One seed: differences have no interval, and none can be called significant."]
+    if n_compared:
+        said.append(
+            f"{CONFIDENCE:.0%} intervals of the mean difference over {n_seeds} seeds, by Student's "
+            "t; they say nothing of other captures. Without any effect, about "
+            f"{max(1, round((1.0 - CONFIDENCE) * n_compared))} of {n_compared} differences would "
+            "look significant."
+        )
+    return said
+
+
+def _verdict(row: Row) -> str:
+    """Figures that are better, worse, changed and not significantly different, in words."""
+    groups: dict[str, list[str]] = {"better in": [], "worse in": [], "changed in": []}
+    rest = []
+    for name, difference in row.differences.items():
+        figure = FIGURES[name]
+        if not difference.significant:
+            rest.append(figure.heading.partition(" [")[0])
+            continue
+        how = {1: "better in", -1: "worse in", 0: "changed in"}[
+            int(np.sign(difference.mean)) * figure.better
+        ]
+        groups[how].append(
+            f"{figure.heading.partition(' [')[0]} ({in_words(difference, figure.digits)})"
+        )
+    parts = [f"{how} {', '.join(names)}" for how, names in groups.items() if names]
+    if rest:
+        parts.append(f"no significant difference in {', '.join(rest)}")
+    return "; ".join(parts)
+
+
+def in_words(difference: Difference, digits: int) -> str:
+    """A difference and its interval."""
+    text = f"{difference.mean:+.{digits}f}"
+    if difference.low is None or difference.high is None:
+        return text
+    return f"{text}, {difference.low:+.{digits}f} to {difference.high:+.{digits}f}"
+
+
+def figures_to_json(experiment: Experiment, rows: Sequence[Row]) -> dict[str, Any]:
+    """What figures.json says."""
+    capture = experiment.capture
+    return {
+        "scene": capture.source,
+        "downscale": capture.downscale,
+        "seeds": list(experiment.seeds),
+        "confidence": CONFIDENCE,
+        "sentences": sentences(rows),
+        "configurations": [
+            {
+                "name": row.candidate.name,
+                "against": row.candidate.against,
+                "train": config_to_json(row.candidate.config),
+                "seconds": row.seconds,
+                "figures": {
+                    name: {
+                        "values": values,
+                        "mean": float(np.mean(values)),
+                        "half_range": float(np.ptp(values)) / 2.0,
+                    }
+                    for name, values in row.values.items()
+                },
+                "differences": {
+                    name: asdict(difference) | {"significant": difference.significant}
+                    for name, difference in row.differences.items()
+                },
+            }
+            for row in rows
+        ],
+    }

@@ -1,0 +1,273 @@
+"""Experiments: configurations times seeds, each a run in a folder, that end where they were cut.
+
+experiment.json             what is trained: capture, configurations, seeds
+runs/CONFIGURATION-seed-K/  a run, as ``warpnerf train`` leaves it, with measures in metrics.json
+moments/CONFIGURATION/K.npz one camera's rendering at a few moments of the training with seed 0
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warpnerf.checks import InputError, cannot_write
+from warpnerf.config import TrainConfig
+from warpnerf.config_json import config_to_json
+from warpnerf.rendering.field import Field, Rendering
+from warpnerf.runs.run import Run
+from warpnerf.scenes.cameras.camera import Camera
+from warpnerf.scenes.files import read_json
+from warpnerf.scenes.scene import Scene
+from warpnerf.scenes.split import Split
+from warpnerf.training.coarse import prepare_trainer
+from warpnerf.training.plan import resolve
+from warpnerf.training.state import Progress
+from warpnerf.training.trainer import Trainer
+from warpnerf.writing import write_atomically
+
+MOMENTS = (0.125, 0.3125, 0.5, 1.0)
+"""Shares of a training after which a camera is rendered: 500, 1250, 2000 and 4000 of 4000 steps, as
+in Philip & Deschaintre 2023, figure 6."""
+
+MOMENT_PIXELS = 320 * 240
+"""Of these renderings, at most, about."""
+
+RECORD = "experiment.json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Capture:
+    """What all configurations are trained on."""
+
+    scene: Scene
+    """As it was read; it has test views."""
+    source: str
+    """Where from: an absolute path, or a built-in name."""
+    downscale: int = 1
+    """As for ``load_scene``."""
+    masks: str | None = None
+    """Absolute path of the folder of masks that was given."""
+    split: Split | None = None
+    """As for ``load_scene``."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Candidate:
+    """A configuration that is compared."""
+
+    name: str
+    """Also of its folders."""
+    config: TrainConfig
+    """Its seed counts for nothing."""
+    against: str | None = None
+    """The name of that which it is compared with."""
+
+
+class Experiment:
+    """Trainings of configurations times seeds in a folder."""
+
+    def __init__(
+        self, folder: Path, capture: Capture, candidates: Sequence[Candidate], n_seeds: int
+    ) -> None:
+        """Name all; nothing is read or written yet."""
+        self.folder, self.capture = folder, capture
+        self.candidates, self.seeds = tuple(candidates), tuple(range(n_seeds))
+
+    @property
+    def trials(self) -> list[tuple[Candidate, int]]:
+        """Configurations and seeds, in the order of their trainings: seed by seed."""
+        return [(candidate, seed) for seed in self.seeds for candidate in self.candidates]
+
+    def begin(self) -> None:
+        """Make the folder, or go on in it.
+
+        Raises:
+            InputError: It holds another experiment or other files, or cannot be written to.
+        """
+        path = self.folder / RECORD
+        wanted = json.loads(json.dumps(self._record()))
+        if path.exists():
+            found = read_json(path, dict[str, Any])
+            if any(found.get(name) != wanted[name] for name in wanted):
+                raise InputError(
+                    f"--output {self.folder} holds another comparison: its "
+                    f"{_difference(found, wanted)}; name a new folder."
+                )
+            return
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            others = sorted(path.name for path in self.folder.iterdir())
+        except OSError as error:
+            raise cannot_write(f"--output {self.folder}", error) from error
+        if others:
+            raise InputError(
+                f"--output {self.folder} holds other files ({others[0]}); name a new folder."
+            )
+        try:
+            write_atomically(path, (json.dumps(wanted, indent=2) + "\n").encode())
+        except OSError as error:
+            raise cannot_write(f"--output {self.folder}", error) from error
+
+    def _record(self) -> dict[str, Any]:
+        return {
+            "scene": self.capture.source,
+            "downscale": self.capture.downscale,
+            "masks": self.capture.masks,
+            "split": self.capture.split,
+            "seeds": len(self.seeds),
+            "configurations": {
+                candidate.name: config_to_json(candidate.config) for candidate in self.candidates
+            },
+        }
+
+    def run(self, candidate: Candidate, seed: int) -> Run:
+        """The folder of a training."""
+        return Run(self.folder / "runs" / f"{candidate.name}-seed-{seed}")
+
+    def metrics(self, candidate: Candidate, seed: int) -> dict[str, Any] | None:
+        """metrics.json of a training; None: it has not finished."""
+        path = self.run(candidate, seed).folder / "metrics.json"
+        if not path.exists():
+            return None
+        return read_json(path, dict[str, Any])
+
+    def train(
+        self,
+        candidate: Candidate,
+        seed: int,
+        stop: Callable[[], bool] = lambda: False,
+        on_progress: Callable[[float, str], None] = lambda done, words: None,
+    ) -> bool:
+        """Train to the end and measure, from where it was cut; nothing where both are done.
+
+        Args:
+            candidate: What is trained.
+            seed: With which seed.
+            stop: Whether to save and end early.
+            on_progress: Called with the share of the training that is done, and a few words.
+
+        Returns:
+            Whether all is done.
+
+        Raises:
+            InputError: The folder cannot be written to, or another process trains there.
+            FloatingPointError: The loss is no longer finite.
+        """
+        if self.metrics(candidate, seed) is not None:
+            return True
+        run = self.run(candidate, seed)
+        run.folder.parent.mkdir(exist_ok=True)
+        with run.only_writer():
+            if not (run.folder / "field.safetensors").exists():
+                trainer = self._trainer(run, candidate, seed)
+                moments = _Moments(trainer, self._moments(candidate)) if seed == 0 else None
+                if trainer.steps_done == 0 and moments is not None:
+                    moments.discard()
+
+                def report(progress: Progress) -> None:
+                    run.log(progress)
+                    on_progress(progress.fraction, str(progress))
+
+                trainer.run(
+                    report,
+                    run.save_checkpoint,
+                    stop,
+                    None if moments is None else moments.after_update,
+                    checkpoint_when_done=False,
+                )
+                if trainer.fraction < 1.0:
+                    return False
+                run.save_field(trainer.field(), keep_checkpoints=False)
+                run.draw_curves(self.capture.scene.name)
+                del trainer, moments
+            self._measure(run, candidate, on_progress)
+        return True
+
+    def field(self, candidate: Candidate, seed: int) -> Field:
+        """The field of a training that has finished."""
+        config = candidate.config
+        return self.run(candidate, seed).load_field(config.device, config.threads)[0]
+
+    def moments(self, candidate: Candidate) -> list[Rendering]:
+        """Renderings at MOMENTS of the training with seed 0, as many as there are."""
+        found = []
+        for k in range(len(MOMENTS)):
+            path = self._moments(candidate) / f"{k}.npz"
+            if path.exists():
+                with np.load(path) as arrays:
+                    found.append(Rendering(**{name: arrays[name] for name in arrays.files}))
+        return found
+
+    def _moments(self, candidate: Candidate) -> Path:
+        return self.folder / "moments" / candidate.name
+
+    def _trainer(self, run: Run, candidate: Candidate, seed: int) -> Trainer:
+        """A trainer that begins, or that goes on from the run's last checkpoint."""
+        capture = self.capture
+        if run.checkpoints:
+            state, _ = run.load_state()
+            run.rewind_log(state.progress.step)
+            return Trainer(capture.scene, state.config, state)
+        config = replace(candidate.config, seed=seed)
+        plan = resolve(capture.scene, config)
+        trainer = prepare_trainer(capture.scene, plan)
+        distance, found = trainer.plan.content_distance, trainer.observed is not None
+        of_scene = (capture.source, capture.downscale, distance)
+        run.create(trainer.scene, *of_scene, config, capture.masks, found, "field", capture.split)
+        return trainer
+
+    def _measure(
+        self, run: Run, candidate: Candidate, on_progress: Callable[[float, str], None]
+    ) -> None:
+        config = candidate.config
+        field, _ = run.load_field(config.device, config.threads)
+        scene = run.read_config().as_trained(self.capture.scene)
+        run.evaluate(field, scene, "test", on_progress, measures=True)
+
+
+class _Moments:
+    """Renders a camera when so much of a training is done, which that does not change by a bit."""
+
+    def __init__(self, trainer: Trainer, folder: Path) -> None:
+        self._trainer, self._folder = trainer, folder
+        self._camera = camera_of_moments(trainer.scene)
+
+    def discard(self) -> None:
+        """Remove what another beginning of the training has left."""
+        for path in self._folder.glob("*.npz"):
+            path.unlink()
+
+    def after_update(self) -> None:
+        """Render, where a moment has come for the first time."""
+        for k, share in enumerate(MOMENTS):
+            path = self._folder / f"{k}.npz"
+            if self._trainer.fraction < share or path.exists():
+                continue
+            seen = self._trainer.field().render(self._camera)
+            file = BytesIO()
+            np.savez_compressed(file, **asdict(seen))
+            self._folder.mkdir(parents=True, exist_ok=True)
+            write_atomically(path, file.getvalue())
+
+
+def camera_of_moments(scene: Scene) -> Camera:
+    """The camera that is rendered during trainings: the middle one of the training views."""
+    cameras = scene.training_cameras
+    camera = cameras[len(cameras) // 2]
+    return camera.downscaled(camera.block_for(MOMENT_PIXELS))
+
+
+def _difference(found: Any, wanted: Any, where: str = "") -> str:
+    """Half a sentence on the first value in which a record is not what it should be."""
+    if not (isinstance(found, dict) and isinstance(wanted, dict)):
+        return f"{where} is {json.dumps(found)}, not {json.dumps(wanted)}"
+    if where and list(found) != list(wanted):
+        return f"{where} has {', '.join(found)}, not {', '.join(wanted)}"
+    name = next(name for name in wanted if found.get(name) != wanted[name])
+    return _difference(found.get(name), wanted[name], f"{where}.{name}".removeprefix("."))
