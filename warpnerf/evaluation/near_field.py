@@ -8,7 +8,7 @@ photographed again, views from further back show as well what hangs in front of 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,7 +17,8 @@ from warpnerf.evaluation.metrics import psnr
 from warpnerf.scenes.scene import Scene
 
 if TYPE_CHECKING:
-    from warpnerf.rendering.field import Field, Rendering
+    from warpnerf.rendering.composite import AnyField
+    from warpnerf.rendering.field import Rendering
 
 NEAR_SHARE = 0.1
 """What counts as near, in content distances of the scene."""
@@ -70,7 +71,7 @@ class NearField:
         return said
 
 
-def measure_near_field(field: Field, scene: Scene) -> NearField:
+def measure_near_field(field: AnyField, scene: Scene) -> NearField:
     """Measure floaters: what hangs in front of the training cameras.
 
     near_mass = mean over rays of the integral of sigma dt over t < within = mean of -log T(within)
@@ -85,8 +86,7 @@ def measure_near_field(field: Field, scene: Scene) -> NearField:
             that can be photographed again also gives PSNR of cameras pulled back.
     """
     within = NEAR_SHARE * scene.content_distance
-    steps = replace(field.steps, far=within, transmittance_min=0.0)
-    close_by = replace(field, steps=steps, proposal=None)  # all matter that is there
+    close_by = field.up_to(within)
     mass, near, n_rays = 0.0, 0, 0
     for whole in scene.training_cameras:
         camera = whole.downscaled(whole.block_for(MAX_PIXELS))
@@ -113,7 +113,7 @@ def ends_within(seen: Rendering, distance: float) -> np.ndarray:
     return np.asarray((seen.opacity >= 0.5) & (seen.depth < distance * seen.opacity))
 
 
-def pulled_psnr(field: Field, scene: Scene) -> list[float]:
+def pulled_psnr(field: AnyField, scene: Scene) -> list[float]:
     """PSNR of training cameras moved straight back, where the scene can be photographed from there.
 
     Returns:
