@@ -37,6 +37,9 @@ SHARES = (0.25, 0.5, 0.75, 1.0)
 LEAST = 0.1
 """Share of an edge that a split leaves at either side, at least."""
 
+ROUNDING = 1e-9
+"""Of sums of weights."""
+
 MOST = 4096
 """Blocks."""
 
@@ -169,6 +172,8 @@ def _quantile(values: np.ndarray, weights: np.ndarray, share: float, ends: np.nd
     if weights.sum() > 0.0:
         order = np.argsort(values, kind="stable")
         total = np.cumsum(weights[order])
-        at = float(values[order[np.searchsorted(total, share * total[-1])]])
+        last = int(np.searchsorted(total, share * total[-1] * (1.0 - ROUNDING)))
+        pair = values[order[last : last + 2]]
+        at = float(pair.mean())  # in the middle of a gap
     edge = LEAST * (high - low)
     return float(np.clip(at, low + edge, high - edge))
