@@ -35,6 +35,7 @@ def composite_of(fields: list[Field], cells: np.ndarray = CELLS) -> CompositeFie
     return CompositeField(
         cells=cells,
         members=[partial(lambda field: field, field) for field in fields],
+        surroundings=fields[0].surroundings,
         background=fields[0].background,
         transmittance_min=0.0,
         workers=fields[0].workers,

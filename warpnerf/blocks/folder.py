@@ -168,6 +168,7 @@ class BlockFolder:
         return CompositeField(
             cells=self.cells,
             members=[partial(fields.of, number) for number in range(len(self))],
+            surroundings=(np.array(self.config.box_min), np.array(self.config.box_max)),
             background=first.background,
             transmittance_min=first.steps.transmittance_min,
             workers=first.workers,

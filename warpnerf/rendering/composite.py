@@ -35,12 +35,21 @@ class CompositeField:
     lower faces belong to them, the upper ones do not."""
     members: Sequence[Member]
     """[n] the field of each cell; all have one background."""
+    surroundings: tuple[np.ndarray, np.ndarray]
+    """Corners, [3] scene units, of a box around what they hold."""
     background: tuple[float, float, float]
     """rgb in [0, 1], seen where rays pass through."""
     transmittance_min: float
     """A ray ends where less light than this would pass."""
     workers: Workers
     """The device that all are on."""
+    near: float = 0.0
+    """Nothing is seen that is nearer, scene units."""
+
+    @property
+    def in_ndc(self) -> bool:
+        """Whether steps are lengths in normalised device coordinates: never."""
+        return False
 
     def cropped(self, low: Sequence[float], high: Sequence[float]) -> CompositeField:
         """Crop to a box: rays see nothing outside of it.
@@ -66,6 +75,17 @@ class CompositeField:
         )
         kept = np.flatnonzero((cells[:, 0] < cells[:, 1]).all(axis=1))
         return replace(self, cells=cells[kept], members=[self.members[int(k)] for k in kept])
+
+    def beyond(self, distance: float) -> CompositeField:
+        """All that is not nearer than a distance, see ``Field.beyond``.
+
+        Args:
+            distance: From where rays begin, scene units.
+
+        Returns:
+            The same fields, from there on.
+        """
+        return replace(self, near=max(self.near, distance))
 
     def up_to(self, distance: float) -> CompositeField:
         """All that is nearer than a distance, see ``Field.up_to``.
@@ -155,6 +175,7 @@ class CompositeField:
             Indices [m] of rays, the number of a cell, and their ends there, [m, 2] scene units.
         """
         enter, leave = crossings(self.cells, origins, directions)
+        enter = np.maximum(enter, self.near)
         enter[enter >= leave] = np.inf
         order = np.argsort(enter, axis=0, kind="stable")
         for number in range(len(self.cells)):

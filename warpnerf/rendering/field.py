@@ -69,6 +69,16 @@ class Field:
         """The voxel lattice: its nodes and the space that they fill."""
         return self.storage.lattice
 
+    @property
+    def surroundings(self) -> tuple[np.ndarray, np.ndarray]:
+        """Corners, [3] scene units, of a box around what it holds."""
+        return self.lattice.surroundings
+
+    @property
+    def in_ndc(self) -> bool:
+        """Whether its steps are lengths in normalised device coordinates."""
+        return self.steps.in_ndc
+
     def copied_to(self, device: wp.Device) -> Field:
         """A deep copy: the same field with arrays of its own.
 
@@ -170,6 +180,19 @@ class Field:
         between = self._array(ends.clip(0.0, 1e30), vec2)
         dark = replace(self, background=(0.0, 0.0, 0.0))
         return self._rendering(dark._render(*rays, origins, between), (len(origins),))
+
+    def beyond(self, distance: float) -> Field:
+        """All of the field that is not nearer than a distance.
+
+        Args:
+            distance: From where rays begin, scene units.
+
+        Returns:
+            A field with the same storage.
+        """
+        if distance <= self.steps.near:
+            return self
+        return replace(self, steps=replace(self.steps, near=distance))
 
     def up_to(self, distance: float) -> Field:
         """All of the field that is nearer than a distance, marched, also what hardly any light
