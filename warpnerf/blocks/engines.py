@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import socket
 import subprocess
+import time
+import uuid
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +19,12 @@ from warpnerf.runtime.memory import usable_cores
 
 LOST = -9
 """Exit code of a job whose worker is gone."""
+
+POLL = 0.2
+"""Seconds from one look of a worker at its training to the next."""
+
+STOPPING = 60.0
+"""Seconds that trainings have to save and to stop."""
 
 CONNECT_SECONDS = 5.0
 """To reach the address of a cluster."""
@@ -113,6 +122,7 @@ class RayEngine:
                 "one by ray start --head, of the same version, or leave the option out."
             ) from None
         self._ray = ray
+        self._stop: Path | None = None
         cores = int(ray.cluster_resources().get("CPU", 1))
         self.threads = min(2, cores) if threads is None else threads
         self.slots = max(1, cores // self.threads) if workers is None else workers
@@ -121,7 +131,9 @@ class RayEngine:
 
     def start(self, work: Work) -> Any:
         """Queue a training; Ray gives it to a worker with enough cores."""
-        return self._run.remote(list(work.arguments), str(work.log))
+        if self._stop is None:
+            self._stop = work.log.with_name(f".stop-{uuid.uuid4().hex}")
+        return self._run.remote(list(work.arguments), str(work.log), str(self._stop))
 
     def ended(self, started: Any) -> int | None:
         """Its exit code; LOST where its worker is gone."""
@@ -134,35 +146,38 @@ class RayEngine:
             return LOST
 
     def stop(self, started: Iterable[Any]) -> None:
-        """Interrupt all, and wait."""
+        """Have the workers tell them, and wait."""
         waiting = list(started)
-        for job in waiting:
-            self._ray.cancel(job)
-        if waiting:
-            self._ray.wait(waiting, num_returns=len(waiting))
+        if waiting and self._stop is not None:
+            self._stop.touch()
+            self._ray.wait(waiting, num_returns=len(waiting), timeout=STOPPING)
+            self._stop.unlink(missing_ok=True)
 
     def close(self) -> None:
         """Leave the cluster; one that was started here ends."""
         self._ray.shutdown()
 
 
-def run_on_worker(arguments: list[str], log: str) -> int:
-    """Run a training on a worker, and stop it when the worker is interrupted.
+def run_on_worker(arguments: list[str], log: str, stop: str) -> int:
+    """Run a training on a worker.
 
     Args:
         arguments: Words after ``warpnerf``.
         log: See ``Work``.
+        stop: A file; once it is there the training is told to save and to stop. Ray has no way to
+            say so that leaves a worker's processes the time for it.
 
     Returns:
         The training's exit code.
     """
     process = child.start(arguments, Path(log))
-    try:
-        return process.wait()
-    except KeyboardInterrupt:
-        process.send_signal(signal.SIGTERM)
-        process.wait()
-        raise
+    told = False
+    while process.poll() is None:
+        if not told and os.path.exists(stop):  # noqa: PTH110, whose way out raises
+            process.terminate()
+            told = True
+        time.sleep(POLL)
+    return process.returncode
 
 
 def _require_reachable(address: str) -> None:
