@@ -184,8 +184,13 @@ def _first_of_folder(folder: Path, how: dict[str, Any]) -> Scene:
 
 
 def _load_builtin(name: str, downscale: int) -> Scene:
+    rooms = re.fullmatch(r"building-(\d{1,9})", name)
+    if rooms is not None:
+        from warpnerf.scenes.builtin.building import building_scene
+
+        return building_scene(int(rooms[1]), downscale=downscale)
     if name not in BUILTIN_NAMES:
-        known = " and ".join(BUILTIN + known for known in BUILTIN_NAMES)
+        known = ", ".join(BUILTIN + known for known in (*BUILTIN_NAMES, "building-N"))
         raise InputError(f"{BUILTIN}{name}: no such built-in scene; there are {known}.")
     from warpnerf.scenes.builtin.room import (
         room_scene,  # a ray tracer: loaded only where it is used
