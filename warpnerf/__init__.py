@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from warpnerf.model.storage_kinds import Dense, Hash, Vm
     from warpnerf.optim_config import OptimConfig
     from warpnerf.presets import PRESETS
+    from warpnerf.rendering.composite import CompositeField
     from warpnerf.rendering.field import Field, Rendering
     from warpnerf.reports.demonstration import Demo, demo
     from warpnerf.runs.checkpoint import (
@@ -90,6 +91,7 @@ _HOMES = {
     "Surface": "exporting.surface",
     "extract_surface": "exporting.surface",
     "Field": "rendering.field",
+    "CompositeField": "rendering.composite",
     "Rendering": "rendering.field",
     "render_stills": "media.filming",
     "render_video": "media.filming",
@@ -148,6 +150,7 @@ __all__ = [  # noqa: RUF022 (grouped by home, as above)
     "Surface",
     "extract_surface",
     "Field",
+    "CompositeField",
     "Rendering",
     "render_stills",
     "render_video",

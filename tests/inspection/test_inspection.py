@@ -239,7 +239,7 @@ def test_fewer_updates_cost_less_by_their_nodes(tmp_path: Path) -> None:
     def seconds(voxels: int, *shares: float) -> float:
         grid = GridConfig(voxels=voxels, grow_at=())
         config = TrainConfig(grid=grid, optim=OptimConfig(accumulate_at=shares))
-        return inspection._cost(scene, config, 1).seconds
+        return inspection.cost_of(scene, config, 1).seconds
 
     saved = [seconds(n) - seconds(n, 0.5) for n in (10**6, 2 * 10**6)]
     assert saved[0] > 0.0

@@ -93,7 +93,7 @@ MUTANTS = [
     of_host("in picture: the middle", OVERLAP, "camera.cx + camera.fx * x", "0.5 * camera.width + camera.fx * x", OFFSET),
     of_host("in picture: upside down", OVERLAP, "camera.cy - camera.fy * y", "camera.cy + camera.fy * y", OFFSET),
     of_host("in picture: a fisheye as a plane", OVERLAP, "np.arctan2(aside, -z) / aside", "-1.0 / z", WIDE),
-    of_host("content behind", OVERLAP, "return camera.position + distance *", "return camera.position - distance *", CIRCLE),
+    of_host("content behind", OVERLAP, "camera.position + along", "camera.position - along", CIRCLE),
     of_host("focus: along the axes", FOCUS, "np.eye(3) - axes[:, :, None]", "np.eye(3) + axes[:, :, None]", AXES),
     of_host("focus: nearly parallel", FOCUS, "least < NEARLY_PARALLEL", "least < 0.0", PARALLEL),
     of_host("focus: spread", FOCUS, "centres - centres.mean(axis=0), mean", "centres, mean", MEETING),

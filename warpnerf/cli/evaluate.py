@@ -39,8 +39,8 @@ def eval_command(
         device: cpu, cuda, cuda:1, ...
         threads: CPU threads; by default one per usable core.
     """
+    from warpnerf.blocks.folder import open_trained
     from warpnerf.evaluation.evaluate import evaluate, require_measurable
-    from warpnerf.runs.run import Run
     from warpnerf.runs.scene import path_of
     from warpnerf.scenes.formats.load import load_scene
 
@@ -50,7 +50,7 @@ def eval_command(
         from warpnerf.evaluation.lpips import Lpips
 
         distance = Lpips(lpips)
-    run = Run(folder)
+    run = open_trained(folder)
     config = run.read_config()
     field, notes = run.load_field(device, threads)
     for note in notes:

@@ -8,6 +8,7 @@ import io
 import logging
 import os
 import re
+import shlex
 import shutil
 import sys
 import warnings
@@ -20,6 +21,7 @@ import tyro
 from warpnerf import __version__
 from warpnerf.checks import InputError, way_out
 from warpnerf.cli.arguments import flags_of, registry, with_help
+from warpnerf.cli.blocks import blocks_command, train_blocks_command
 from warpnerf.cli.compare import compare_command
 from warpnerf.cli.demo import demo_command
 from warpnerf.cli.evaluate import eval_command
@@ -50,6 +52,8 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "inspect": inspect_command,
     "pose": pose_command,
     "train": train_command,
+    "blocks": blocks_command,
+    "train-blocks": train_blocks_command,
     "eval": eval_command,
     "render": render_command,
     "export": export_command,
@@ -62,7 +66,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
 PATHS = ("--output", "--resume", "--config", "--scene", "--masks", "--json", "--plots")
 """Options whose value may be any name."""
 
-TAKES_A_SCENE = ("train", "inspect", "pose", "compare")
+TAKES_A_SCENE = ("train", "inspect", "pose", "compare", "blocks")
 """Subcommands whose first word is a folder of a scene, or of photographs."""
 
 NARROWEST = 24
@@ -146,6 +150,9 @@ def _parsed(words: list[str]) -> int:
     everything = HELP_ALL in words or not {"--help", "-h"} & {*words}
     split = [part for word in words for part in word.split("=", maxsplit=1)]
     begin = PRESETS.get(dict(pairwise(split)).get("--preset", "fast"))
+    if name == "train-blocks" and "--" in words:  # what follows is for another command
+        at = words.index("--")
+        words = [*words[:at], f"--train-options={shlex.join(words[at + 1 :])}"]
     if name is not None:
         _require_known(name, words[1:])
         words = ["--help" if word == HELP_ALL else word for word in words]

@@ -17,7 +17,7 @@ from warpnerf.runtime.progress import ProgressBar
 
 if TYPE_CHECKING:
     from warpnerf.media.recorded_path import RecordedPath
-    from warpnerf.runs.config import RunConfig
+    from warpnerf.runs.config import TrainedScene
     from warpnerf.scenes.cameras.camera import Camera
     from warpnerf.scenes.scene import Scene, View
 
@@ -76,7 +76,7 @@ class RenderOptions:
         """Whether pictures are rendered, and no video."""
         return self.stills is not None or self.photographs is not None
 
-    def recorded(self, scene: str | None, config: RunConfig) -> RecordedPath | None:
+    def recorded(self, scene: str | None, config: TrainedScene) -> RecordedPath | None:
         """The path that was recorded; None: it is of another kind.
 
         Args:
@@ -127,13 +127,13 @@ def render_command(
         device: cpu, cuda, cuda:1, ...
         threads: CPU threads; by default one per usable core.
     """
+    from warpnerf.blocks.folder import open_trained
     from warpnerf.media.filming import depth_range, render_stills, render_video
     from warpnerf.media.panels import Panels
     from warpnerf.media.video import require_alpha, video_file
-    from warpnerf.runs.run import Run
     from warpnerf.runs.scene import load_run_scene
 
-    run = Run(folder)
+    run = open_trained(folder)
     config = run.read_config()
     recorded = options.recorded(scene, config)
     path, stills, output = options.path, options.only_stills, options.output
@@ -203,7 +203,7 @@ def render_command(
     return 0
 
 
-def _recorded(path: str, transforms: Path | None, config: RunConfig) -> RecordedPath | None:
+def _recorded(path: str, transforms: Path | None, config: TrainedScene) -> RecordedPath | None:
     """The path in a file; None where the name of a kind of path is given."""
     from warpnerf.media.camera_path import PathKind
     from warpnerf.media.nerfstudio_path import TRANSFORMS, read_nerfstudio_path

@@ -42,13 +42,13 @@ def view_command(
         device: cpu, cuda, cuda:1, ...
         threads: CPU threads; by default one per usable core.
     """
-    from warpnerf.runs.run import Run
+    from warpnerf.blocks.folder import open_trained
     from warpnerf.viewer.server import require_place
     from warpnerf.viewer.view import open_view
 
     folders = [folder] if other is None else [folder, other]
     for one in folders:
-        Run(one).read_config()  # before any is loaded
+        open_trained(one).read_config()  # before any is loaded
     require_place(host, port)
     with open_view(
         folders, scene=scene, host=host, port=port, device=device, threads=threads

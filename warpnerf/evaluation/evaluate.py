@@ -32,6 +32,7 @@ from warpnerf.runtime.terminal import table_text
 from warpnerf.scenes.scene import Scene, View, require_split
 
 if TYPE_CHECKING:
+    from warpnerf.rendering.composite import CompositeField
     from warpnerf.rendering.field import Field, Rendering
 
 
@@ -141,7 +142,7 @@ class Evaluation:
 
 @checked_arguments
 def evaluate(
-    field: Field,
+    field: Field | CompositeField,
     scene: Scene,
     split: str = "test",
     on_image: Callable[[View, np.ndarray, Rendering], None] | None = None,

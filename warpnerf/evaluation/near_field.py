@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,7 +19,8 @@ from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.scene import Scene
 
 if TYPE_CHECKING:
-    from warpnerf.rendering.field import Field, Rendering
+    from warpnerf.rendering.composite import AnyField
+    from warpnerf.rendering.field import Rendering
 
 NEAR_SHARE = 0.1
 """What counts as near, in content distances of the scene."""
@@ -72,7 +73,7 @@ class NearField:
         return said
 
 
-def measure_near_field(field: Field, scene: Scene) -> NearField:
+def measure_near_field(field: AnyField, scene: Scene) -> NearField:
     """Measure floaters: what hangs in front of the training cameras.
 
     near_mass = mean over rays of the integral of sigma dt over t < within = mean of -log T(within)
@@ -106,15 +107,14 @@ def measure_near_field(field: Field, scene: Scene) -> NearField:
     )
 
 
-def near_masses(field: Field, scene: Scene) -> Iterator[tuple[float, int]]:
+def near_masses(field: AnyField, scene: Scene) -> Iterator[tuple[float, int]]:
     """Optical depth before each training camera up to NEAR_SHARE content distances.
 
     Returns:
         The sum over a camera's rays of the integral of sigma, and how many rays these are.
     """
     within = NEAR_SHARE * scene.content_distance
-    steps = replace(field.steps, far=within, transmittance_min=0.0)
-    close_by = replace(field, steps=steps, proposal=None)  # all matter that is there
+    close_by = field.up_to(within)
     for camera in scene.training_cameras:
         transmittance = 1.0 - close_by.render(_coarse(camera)).opacity
         depths = np.log(np.maximum(transmittance, MIN_TRANSMITTANCE))
@@ -133,7 +133,7 @@ def ends_within(seen: Rendering, distance: float) -> np.ndarray:
     return np.asarray((seen.opacity >= 0.5) & (seen.depth < distance * seen.opacity))
 
 
-def pulled_psnr(field: Field, scene: Scene) -> list[float]:
+def pulled_psnr(field: AnyField, scene: Scene) -> list[float]:
     """PSNR of training cameras moved straight back, where the scene can be photographed from there.
 
     Returns:

@@ -196,7 +196,7 @@ class Inspection:
                     f"training, {name}",
                     f"model {cost.plan.config.model.name}, rays {cost.plan.sampler.past}: about "
                     f"{cost.plan.memory / 2**30:.2g} GiB of memory; "
-                    f"very roughly {_duration(cost.seconds)} on {cost.threads} CPU threads",
+                    f"very roughly {duration(cost.seconds)} on {cost.threads} CPU threads",
                 )
             )
             rows.append((f"voxels, {name}", str(cost.plan.voxel_pixels)))
@@ -258,7 +258,7 @@ def inspect(
         focus=common_focus(scene.training_cameras),
         diagnostics=(*scene.warnings, *odd),
         costs={
-            name: _cost(scene, _with(config, content_distance, near), threads)
+            name: cost_of(scene, _with(config, content_distance, near), threads)
             for name, config in configs.items()
         },
     )
@@ -271,7 +271,17 @@ def _with(config: TrainConfig, content_distance: float | None, near: float) -> T
     return replace(config, march=replace(config.march, near=near)) if near else config
 
 
-def _cost(scene: Scene, config: TrainConfig, threads: int) -> Cost:
+def cost_of(scene: Scene, config: TrainConfig, threads: int) -> Cost:
+    """What a training would take.
+
+    Args:
+        scene: What is trained on.
+        config: How.
+        threads: CPU threads that it would have.
+
+    Raises:
+        InputError: The configuration cannot be resolved for the scene.
+    """
     plan, voxels = resolve(scene, config), config.grid.voxels
     in_ndc = plan.space.frustum is not None
     samples, occupied = SAMPLES_IN_NDC if in_ndc else SAMPLES_AND_OCCUPIED[plan.kind]
@@ -311,7 +321,8 @@ def _span(values: Sequence[float], digits: int = 4) -> str:
     return low if low == high else f"{low} to {high}"
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
+    """Seconds in words, rounded up: 40 s, 12 min, 1.7 h."""
     if seconds < 90.0:
         return f"{10.0 * math.ceil(seconds / 10.0):.0f} s"
     minutes = math.ceil(seconds / 60.0)

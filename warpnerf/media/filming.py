@@ -14,7 +14,7 @@ from warpnerf.media.camera_path import path_lens
 from warpnerf.media.panels import USUAL, Output, Panels
 from warpnerf.media.pictures import write_png
 from warpnerf.media.video import require_alpha, write_video
-from warpnerf.rendering.field import Field
+from warpnerf.rendering.composite import AnyField
 from warpnerf.scenes.cameras.camera import Camera
 
 N_LOOKS = 9
@@ -26,7 +26,7 @@ LOOK_SIZE = 96
 
 @checked_arguments
 def render_video(
-    field: Field,
+    field: AnyField,
     cameras: Sequence[Camera],
     path: str | Path,
     *,
@@ -74,7 +74,7 @@ def render_video(
 
 @checked_arguments
 def render_stills(
-    field: Field,
+    field: AnyField,
     cameras: dict[str, Camera],
     folder: str | Path,
     *,
@@ -110,7 +110,7 @@ def render_stills(
 
 
 def _panels(
-    field: Field,
+    field: AnyField,
     cameras: Sequence[Camera],
     depths: tuple[float, float] | None,
     show: Sequence[Output],
@@ -123,7 +123,7 @@ def _panels(
     return Panels(field=field, outputs=tuple(show), near=near, far=far, transparent=transparent)
 
 
-def depth_range(field: Field, cameras: Sequence[Camera]) -> tuple[float, float]:
+def depth_range(field: AnyField, cameras: Sequence[Camera]) -> tuple[float, float]:
     """Depths between which nearly all lies that some of the cameras see, scene units.
 
     That is the ``range_of`` the opaque pixels of all these cameras together, so that it serves a

@@ -11,6 +11,7 @@ import numpy as np
 
 from warpnerf.checks import InputError
 from warpnerf.media.pictures import above_legend, depth_colours, depth_picture, to_bytes
+from warpnerf.rendering.composite import AnyField, CompositeField
 from warpnerf.rendering.field import Field, Rendering
 from warpnerf.rendering.normals import normal_map
 from warpnerf.scenes.cameras.camera import Camera
@@ -27,7 +28,7 @@ CLEAR = 1e-4
 class Panels:
     """Which outputs of a rendering a picture shows, from left to right."""
 
-    field: Field
+    field: AnyField
     """What is looked at."""
     outputs: Sequence[Output] = USUAL
     """At least one, all different."""
@@ -48,9 +49,12 @@ class Panels:
             )
         if len({*self.outputs}) < len(self.outputs):
             raise InputError("what is shown is given twice; name each output once.")
+        if "normals" in self.outputs and isinstance(self.field, CompositeField):
+            raise InputError("normals are of one field, not of blocks; show those of a block.")
 
     @cached_property
     def _raw(self) -> np.ndarray:
+        assert isinstance(self.field, Field)
         return self.field.storage.raw_densities(self.field.workers)
 
     def picture(self, camera: Camera) -> np.ndarray:
@@ -85,6 +89,7 @@ class Panels:
         elif output == "opacity":
             shown = np.repeat(opacity, 3, axis=-1)
         else:
+            assert isinstance(self.field, Field)
             towards = 0.5 + 0.5 * normal_map(self.field, self._raw, camera, rendering)
             shown = towards if self.transparent else opacity * towards + (1.0 - opacity)
         if not self.transparent:

@@ -12,8 +12,10 @@ from warpnerf.checked import checked_arguments
 from warpnerf.inspection.inspection import Inspection
 from warpnerf.media.pictures import FAINT, INK, font
 from warpnerf.scenes.cameras.camera import Camera
+from warpnerf.scenes.cameras.focus import up_direction
 from warpnerf.scenes.cameras.observations import Observations
 from warpnerf.scenes.cameras.undistort import directions
+from warpnerf.scenes.scene import Scene
 
 _FINE = 2  # pixels are drawn twice as large, then averaged
 _PANEL = 640 * _FINE
@@ -96,6 +98,52 @@ def plan_picture(inspection: Inspection) -> np.ndarray:
             panel.dot(end, _SIGHT_END)
         if inspection.focus is not None:
             panel.cross(inspection.focus, INK)
+    return np.asarray(sheet.resize((size[0] // _FINE, size[1] // _FINE), Image.Resampling.BOX))
+
+
+def blocks_picture(scene: Scene, cores: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """Plot the blocks of a scene from above: cores with their numbers, margins, cameras.
+
+    Args:
+        scene: That was cut.
+        cores: [n, 2, 3] corners of the cores, scene units.
+        boxes: [n, 2, 3] the same with their margins.
+
+    Returns:
+        [H, W, 3] uint8.
+    """
+    direction = up_direction(scene.training_cameras)
+    up = int(np.abs(direction).argmax())
+    right, ahead = (up + 1) % 3, (up + 2) % 3
+    if direction[up] < 0.0:
+        right, ahead = ahead, right
+    points = np.concatenate([boxes.reshape(-1, 3), [c.position for c in scene.cameras]])
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    extent = 1.08 * float(np.ptp(points, axis=0)[[right, ahead]].max())
+    size = (_PANEL + 2 * _MARGIN, _HEADER + _PANEL + _MARGIN // 2)
+    sheet = Image.new("RGB", size, "white")
+    draw = ImageDraw.Draw(sheet)
+    draw.text((_MARGIN, 12 * _FINE), scene.name, INK, font(24 * _FINE))
+    legend: list[tuple[str, Colour]] = [
+        ("core", _BOX),
+        ("trained for", _WIDER),
+        ("training", _TRAIN),
+        ("test", _TEST),
+    ]
+    x = float(_MARGIN)
+    for text, colour in legend:
+        draw.text((x, 52 * _FINE), text, colour, font(15 * _FINE), anchor="lm")
+        x += draw.textlength(text, font(15 * _FINE)) + 26 * _FINE
+    panel = _Panel(draw, (_MARGIN, _HEADER), (right, ahead), (1.0, 1.0), middle, extent)
+    panel.frame("from above")
+    for box in boxes:
+        panel.box(box, _WIDER)
+    for number, core in enumerate(cores):
+        panel.box(core, _BOX)
+        panel.label(core.mean(axis=0), str(number))
+    for split, colour in (("train", _TRAIN), ("test", _TEST)):
+        for index in scene.splits[split]:
+            panel.camera(scene.views[index].camera, colour)
     return np.asarray(sheet.resize((size[0] // _FINE, size[1] // _FINE), Image.Resampling.BOX))
 
 
@@ -231,6 +279,10 @@ class _Panel:
         """A small disc."""
         (x, y), r = self._at(point), 2.0 * _FINE
         self._draw.ellipse((x - r, y - r, x + r, y + r), fill=colour)
+
+    def label(self, point: np.ndarray, text: str) -> None:
+        """Text around a point [3]."""
+        self._draw.text(self._at(point), text, _BOX, font(20 * _FINE), anchor="mm")
 
     def cross(self, point: np.ndarray, colour: Colour) -> None:
         """A plus sign."""

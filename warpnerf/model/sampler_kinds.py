@@ -34,14 +34,15 @@ class SamplerKind(ABC):
     """What it does to rays, for people: they are ..."""
 
     @abstractmethod
-    def part(self, load: Load) -> Any:
+    def part(self, load: Load, own: Any) -> Any:
         """The part that places them.
 
         Args:
             load: The kernels' modules, in the precision that is wanted.
+            own: The model's sampler.
 
         Returns:
-            ``warpnerf_kernels.base.parts.Sampler``; None: the model's own.
+            ``warpnerf_kernels.base.parts.Sampler``.
         """
 
     def samples_of(self, marched: float) -> float:
@@ -68,9 +69,21 @@ class Marched(SamplerKind):
     name: ClassVar[str] = "march"
     past: ClassVar[str] = "marched"
 
-    def part(self, load: Load) -> Any:
+    def part(self, load: Load, own: Any) -> Any:
         """The model's own."""
-        return None
+        return own
+
+
+@dataclass(frozen=True, kw_only=True)
+class Clipped(SamplerKind):
+    """The model's sampler between two distances of each ray: how parts of rays are rendered."""
+
+    name: ClassVar[str] = "clipped"
+    past: ClassVar[str] = "marched in part"
+
+    def part(self, load: Load, own: Any) -> Any:
+        """The model's own, cut."""
+        return load("sampling.clipped").clipped(own)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +93,7 @@ class AutoSampler(SamplerKind):
     name: ClassVar[str] = "auto"
     past: ClassVar[str] = "marched or resampled"
 
-    def part(self, load: Load) -> Any:
+    def part(self, load: Load, own: Any) -> Any:
         """None: it has to be decided first."""
         raise TypeError("a sampler that is auto has no kernels; see TrainConfig.sampler_in")
 
@@ -129,7 +142,7 @@ class Resampled(SamplerKind):
         """The storage of the proposal network: a small dense density grid."""
         return ProposedDensity(learning_rate=self.learning_rate_proposal)
 
-    def part(self, load: Load) -> Any:
+    def part(self, load: Load, own: Any) -> Any:
         """The kernels' sampler: intervals of each ray."""
         return load("sampling.resampled").INTERVALS
 
@@ -205,6 +218,7 @@ class ProposedDensity(Model):
 
 
 MARCHED = Marched()
+CLIPPED = Clipped()
 AUTO_SAMPLER = AutoSampler()
 
 SAMPLER_KINDS: dict[str, type[SamplerKind]] = {

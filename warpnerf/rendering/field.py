@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
-from warpnerf_kernels.base.types import real, vec3
+from warpnerf_kernels.base.types import real, vec2, vec3
 from warpnerf_kernels.launch import assembly
 
 from warpnerf.checked import checked_arguments
@@ -17,10 +17,11 @@ from warpnerf.fields.nodes import cells_within
 from warpnerf.fields.occupancy import FreeCells
 from warpnerf.fields.storage import Storage
 from warpnerf.model.interface import Model
-from warpnerf.rendering.proposal import Intervals, Proposal, Proposer
+from warpnerf.rendering.proposal import Proposal, Proposer
 from warpnerf.rendering.rays import camera_rays, rays_struct
 from warpnerf.rendering.render import RenderedRays, render_rays
-from warpnerf.rendering.steps import Steps
+from warpnerf.rendering.steps import ClippedSteps, Steps
+from warpnerf.rendering.structs import AnySteps
 from warpnerf.runtime.parallel import Workers
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.extent.space import reach_of_places
@@ -67,6 +68,16 @@ class Field:
     def lattice(self) -> Lattice:
         """The voxel lattice: its nodes and the space that they fill."""
         return self.storage.lattice
+
+    @property
+    def surroundings(self) -> tuple[np.ndarray, np.ndarray]:
+        """Corners, [3] scene units, of a box around what it holds."""
+        return self.lattice.surroundings
+
+    @property
+    def in_ndc(self) -> bool:
+        """Whether its steps are lengths in normalised device coordinates."""
+        return self.steps.in_ndc
 
     def copied_to(self, device: wp.Device) -> Field:
         """A deep copy: the same field with arrays of its own.
@@ -146,32 +157,91 @@ class Field:
             InputError: Shapes differ, or a direction is not of unit length.
         """
         require_rays(origins, directions)
-        device = self.workers.device
-        rays = (
-            wp.array(np.ascontiguousarray(origins, np.float32), dtype=vec3, device=device),
-            wp.array(np.ascontiguousarray(directions, np.float32), dtype=vec3, device=device),
-        )
+        rays = self._array(origins, vec3), self._array(directions, vec3)
         return self._rendering(self._render(*rays, places=origins), (len(origins),))
 
-    def _render(self, origins: wp.array, directions: wp.array, places: np.ndarray) -> RenderedRays:
-        """Look along rays from some places, [n, 3]."""
+    def render_between(
+        self, origins: np.ndarray, directions: np.ndarray, ends: np.ndarray
+    ) -> Rendering:
+        """Render parts of rays, over black: what the field holds between two distances.
+
+        The parts of a ray, composited, are the ray: where an end cuts a step, each part has its
+        share of it. With a proposal each part has intervals of its own.
+
+        Args:
+            origins: [n_rays, 3], scene units.
+            directions: [n_rays, 3] of unit length.
+            ends: [n_rays, 2] where each part begins and ends, scene units.
+
+        Returns:
+            rgb [n_rays, 3], depth [n_rays] and opacity [n_rays].
+        """
+        rays = self._array(origins, vec3), self._array(directions, vec3)
+        between = self._array(ends.clip(0.0, 1e30), vec2)
+        dark = replace(self, background=(0.0, 0.0, 0.0))
+        return self._rendering(dark._render(*rays, origins, between), (len(origins),))
+
+    def beyond(self, distance: float) -> Field:
+        """All of the field that is not nearer than a distance.
+
+        Args:
+            distance: From where rays begin, scene units.
+
+        Returns:
+            A field with the same storage.
+        """
+        if distance <= self.steps.near:
+            return self
+        return replace(self, steps=replace(self.steps, near=distance))
+
+    def up_to(self, distance: float) -> Field:
+        """All of the field that is nearer than a distance, marched, also what hardly any light
+        passes.
+
+        Args:
+            distance: From where rays begin, scene units.
+
+        Returns:
+            A field with the same storage.
+        """
+        steps = replace(self.steps, far=distance, transmittance_min=0.0)
+        return replace(self, steps=steps, proposal=None)
+
+    def _array(self, values: np.ndarray, dtype: type) -> wp.array:
+        values = np.ascontiguousarray(values, np.float32)
+        return wp.array(values, dtype=dtype, device=self.workers.device)
+
+    def _render(
+        self,
+        origins: wp.array,
+        directions: wp.array,
+        places: np.ndarray,
+        ends: wp.array | None = None,
+    ) -> RenderedRays:
+        """Look along rays from some places, [n, 3]; all the way, or between ends, [n_rays] vec2."""
         reach = reach_of_places(self.lattice.box_min, self.lattice.box_max, places)
         steps = self.steps.reaching(reach)
+        if ends is not None:  # from farther away a part is seen as far behind its box
+            further = (steps.n_linear - self.steps.n_linear) * steps.step
+            steps = replace(steps, far=steps.far + further)
         if self.proposal is None:
-            return self._walk(steps, origins, directions)
+            walked = steps if ends is None else ClippedSteps(steps=steps, ends=ends)
+            return self._walk(walked, origins, directions)
         n = origins.shape[0]
         proposer = Proposer(min(n, PROPOSED), self.proposal, steps, self.workers)
         seen = RenderedRays.room(n, self.workers)
         for begin in range(0, n, PROPOSED):
             some = slice(begin, min(begin + PROPOSED, n))
             rays = origins[some], directions[some]
-            proposer.run(self.free, rays_struct(assembly, *rays, *self._same_for_all))
+            proposer.run(
+                self.free,
+                rays_struct(assembly, *rays, *self._same_for_all),
+                ends=None if ends is None else ends[some],
+            )
             seen.write(begin, self._walk(proposer.intervals, *rays))
         return seen
 
-    def _walk(
-        self, steps: Steps | Intervals, origins: wp.array, directions: wp.array
-    ) -> RenderedRays:
+    def _walk(self, steps: AnySteps, origins: wp.array, directions: wp.array) -> RenderedRays:
         """Look along rays through given steps."""
         return render_rays(
             self.model,

@@ -112,7 +112,7 @@ def _parts_with(
     sampler: SamplerKind,
 ) -> Any:
     load, parts = loader(precision), parts_of(model, precision, stored)
-    parts = parts._replace(sampler=sampler.part(load) or parts.sampler)
+    parts = parts._replace(sampler=sampler.part(load, parts.sampler))
     losses = parts.losses
     if "huber" in kinds:
         losses = losses._replace(photometric=load("volume.loss").HUBER)

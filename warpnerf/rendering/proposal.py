@@ -240,14 +240,19 @@ class Proposer:
         self.gradients = proposal.gradients(workers) if learns else None
         """What ``learn`` has accumulated to since the last update; None: there is no way back."""
 
-    def run(self, free: FreeCells, rays: Any, anneal: float = 1.0) -> None:
+    def run(
+        self, free: FreeCells, rays: Any, anneal: float = 1.0, ends: wp.array | None = None
+    ) -> None:
         """Draw intervals of rays.
 
         Args:
             free: What of the field is skipped; so it is here.
             rays: A kernel's Rays.
             anneal: Power that histograms are raised to, (0, 1].
+            ends: [n_rays] vec2, distances that intervals lie between; None: near and far.
         """
+        if ends is not None:
+            self._guide.between = ends
         self._guide.free = free.struct
         self._workers.launch_owned(
             self._kernels.propose_forward,

@@ -20,6 +20,7 @@ from warpnerf.rendering.proposal import Intervals
 from warpnerf.rendering.rays import RayBatch, rays_struct
 from warpnerf.rendering.steps import Steps
 from warpnerf.rendering.structs import (
+    AnySteps,
     FieldStructs,
     most_samples,
     render_outputs_struct,
@@ -73,7 +74,7 @@ def render_rays(
     storage: Storage,
     weights: wp.array,
     free: FreeCells,
-    steps: Steps | Intervals,
+    steps: AnySteps,
     origins: wp.array,
     directions: wp.array,
     offsets: wp.array,

@@ -80,3 +80,24 @@ class Steps:
         march.n_linear = self.n_linear
         march.transmittance_min = self.transmittance_min
         return march
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ClippedSteps:
+    """The same steps, of which only those between two distances of each ray are sampled."""
+
+    steps: Steps
+    """Of whole rays."""
+    ends: Any
+    """[n_rays] ``warp.vec2f`` array, the two distances, scene units; a step that reaches over one
+    is shortened."""
+
+    @property
+    def near(self) -> float:
+        """Nothing is sampled nearer, scene units."""
+        return self.steps.near
+
+    @property
+    def far(self) -> float:
+        """Nothing is sampled at or beyond it, scene units."""
+        return self.steps.far

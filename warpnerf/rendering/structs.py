@@ -13,13 +13,16 @@ from warpnerf.config import Contraction, Jacobian, LossConfig, Scaling
 from warpnerf.fields.occupancy import FreeCells
 from warpnerf.fields.storage import Storage
 from warpnerf.model.interface import Model, loader
-from warpnerf.model.sampler_kinds import MARCHED, SamplerKind
+from warpnerf.model.sampler_kinds import CLIPPED, MARCHED, SamplerKind
 from warpnerf.model.spaces import part_of
 from warpnerf.model.storage_kinds import DENSE, StorageKind
 from warpnerf.rendering.losses import PHOTOMETRIC_ONLY, Objective, loss_struct, parts_with
 from warpnerf.rendering.proposal import Intervals
-from warpnerf.rendering.steps import Steps
+from warpnerf.rendering.steps import ClippedSteps, Steps
 from warpnerf.runtime.parallel import Workers
+
+AnySteps = Steps | ClippedSteps | Intervals
+"""How rays are marched, or where else their samples lie."""
 
 SCALINGS = {
     "none": gradscale.NONE,
@@ -53,7 +56,7 @@ class FieldStructs:
         storage: Storage,
         weights: wp.array,
         free: FreeCells,
-        steps: Steps | Intervals,
+        steps: AnySteps,
         workers: Workers,
     ) -> FieldStructs:
         """Those of a storage, in float32.
@@ -117,7 +120,7 @@ def render_params_struct(
     model: Model,
     precision: str,
     field: FieldStructs,
-    steps: Steps | Intervals,
+    steps: AnySteps,
     workers: Workers,
     *,
     objective: Objective = PHOTOMETRIC_ONLY,
@@ -155,19 +158,21 @@ def render_params_struct(
     return scene
 
 
-def sampler_of(steps: Steps | Intervals) -> SamplerKind:
-    """The kind that places samples: that of intervals, or a march."""
-    return steps.kind if isinstance(steps, Intervals) else MARCHED
+def sampler_of(steps: AnySteps) -> SamplerKind:
+    """The kind that places samples: that of intervals, or a march, of whole rays or parts."""
+    if isinstance(steps, Intervals):
+        return steps.kind
+    return CLIPPED if isinstance(steps, ClippedSteps) else MARCHED
 
 
-def most_samples(model: Model, steps: Steps | Intervals, length: float) -> int:
+def most_samples(model: Model, steps: AnySteps, length: float) -> int:
     """How many samples a ray can have; see ``Model.most_steps``."""
     if isinstance(steps, Intervals):
         return steps.kind.samples
-    return model.most_steps(steps, length)
+    return model.most_steps(steps.steps if isinstance(steps, ClippedSteps) else steps, length)
 
 
-def march_struct(model: Model, precision: str, steps: Steps | Intervals, workers: Workers) -> Any:
+def march_struct(model: Model, precision: str, steps: AnySteps, workers: Workers) -> Any:
     """The parameters of a model's sampler, as kernels take them.
 
     Args:
@@ -182,6 +187,14 @@ def march_struct(model: Model, precision: str, steps: Steps | Intervals, workers
     load = loader(precision)
     if isinstance(steps, Intervals):
         return steps.struct(load)
+    if isinstance(steps, ClippedSteps):
+        params = parts_with(
+            model, precision, PHOTOMETRIC_ONLY.config, sampler=CLIPPED
+        ).sampler.Params()
+        params.steps = model.march(load, steps.steps, workers.device)
+        params.ends, params.near, params.far = steps.ends, steps.near, steps.far
+        params.transmittance_min = steps.steps.transmittance_min
+        return params
     return model.march(load, steps, workers.device)
 
 

@@ -27,25 +27,21 @@ class FoundExtent(msgspec.Struct, frozen=True):
     box_max: tuple[float, float, float]
 
 
-class RunConfig(msgspec.Struct, frozen=True):
-    """What config.json says, as far as it is read again."""
+class TrainedScene(msgspec.Struct, frozen=True, kw_only=True):
+    """On what photographs something was trained, as far as it is read again."""
 
     scene: str
-    """Path, in the file relative to the run's folder if it lies there; or built-in name."""
+    """Path, in the file relative to its folder if it lies there; or built-in name."""
     downscale: int
     """Pixels of the photographs averaged, in each direction."""
     content_distance: float
     """The one in use, scene units."""
-    train: TrainConfig
-    """What was requested."""
     masks: str | None = None
     """Absolute path of the folder of masks that was given for all photographs; None: none was."""
     pictures: list[str] | None = None
     """File names of the pictures in test/; None in runs of the version before, which wrote all."""
     found: FoundExtent | None = None
     """In place of the scene's own extent, where the cameras did not tell."""
-    keep: Keep = "field"
-    """What is kept of the training once it has finished: its field alone, or checkpoints too."""
     split: Literal["all", "sector"] | int | list[str] | None = None
     """What is withheld for testing, see ``load_scene``; None: what the scene says."""
     offset: tuple[float, float, float] | None = None
@@ -63,6 +59,15 @@ class RunConfig(msgspec.Struct, frozen=True):
             box_max=np.array(self.found.box_max),
             guessed=False,
         )
+
+
+class RunConfig(TrainedScene, frozen=True, kw_only=True):
+    """What config.json says, as far as it is read again."""
+
+    train: TrainConfig
+    """What was requested."""
+    keep: Keep = "field"
+    """What is kept of the training once it has finished: its field alone, or checkpoints too."""
 
 
 def pictures_of(scene: Scene) -> list[str]:

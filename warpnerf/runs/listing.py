@@ -205,7 +205,7 @@ def runs_table(runs: Sequence[RunSummary], folder: Path) -> str:
 
 def _summary(folder: Path) -> RunSummary:
     config = files.read_config(folder)
-    last, metrics = _last_report(folder / "log.jsonl"), Metrics()
+    last, metrics = last_report(folder / "log.jsonl"), Metrics()
     with suppress(OSError, msgspec.MsgspecError):
         metrics = msgspec.json.decode((folder / "metrics.json").read_bytes(), type=Metrics)
     return RunSummary(
@@ -245,7 +245,7 @@ def _scene_of(run: RunSummary) -> str:
     return scene_name(source)
 
 
-def _last_report(log: Path) -> Report:
+def last_report(log: Path) -> Report:
     """The last line of a log that is whole: a crash may have cut one off."""
     with suppress(OSError):
         for line in reversed(log.read_bytes().splitlines()):

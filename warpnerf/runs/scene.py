@@ -5,14 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 from warpnerf.checks import InputError
-from warpnerf.runs.config import RunConfig, pictures_of
+from warpnerf.runs.config import TrainedScene, pictures_of
 from warpnerf.scenes.files import exists
 from warpnerf.scenes.formats.load import BUILTIN, load_scene
 from warpnerf.scenes.scene import Scene
 
 
 def load_run_scene(
-    config: RunConfig, moved: str | None = None, threads: int | None = None
+    config: TrainedScene, moved: str | None = None, threads: int | None = None
 ) -> Scene:
     """Read the scene that a run was trained on; images stay in their files.
 
@@ -48,7 +48,7 @@ def load_run_scene(
     return config.as_trained(scene)
 
 
-def path_of(config: RunConfig, moved: str | None = None) -> str:
+def path_of(config: TrainedScene, moved: str | None = None) -> str:
     """Where the scene is that a run was trained on.
 
     Args:
@@ -66,7 +66,7 @@ def path_of(config: RunConfig, moved: str | None = None) -> str:
     return moved or config.scene
 
 
-def masks_of(config: RunConfig, moved: str | None = None) -> Path | None:
+def masks_of(config: TrainedScene, moved: str | None = None) -> Path | None:
     """The folder of the masks that a run was trained with; None where there were none.
 
     Args:

@@ -138,8 +138,18 @@ class View:
         Returns:
             A view with the same photograph, which is not read.
         """
-        kept = {name: self.__dict__[name] for name in ("name", "image", "depth", "mask")}
-        return View(camera=replace(self.camera, c2w=c2w), **kept)
+        return View(**{**self.__dict__, "camera": replace(self.camera, c2w=c2w)})
+
+    def with_image(self, image: np.ndarray | ImageFile) -> View:
+        """The view whose pixels are kept elsewhere.
+
+        Args:
+            image: The same photograph.
+
+        Returns:
+            A view with the same camera, depth and mask.
+        """
+        return View(**{**self.__dict__, "image": image})
 
     @property
     def channels(self) -> int:

@@ -11,6 +11,7 @@ import numpy as np
 from warpnerf.fields.nodes import cells_within
 from warpnerf.fields.occupancy import FreeCells
 from warpnerf.media.pictures import depth_colours, depth_picture, to_bytes
+from warpnerf.rendering.composite import AnyField
 from warpnerf.rendering.field import Field, Rendering
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.viewer.reprojection import Reprojector
@@ -35,7 +36,7 @@ class Subject:
 
     name: str
     """What the page calls it."""
-    field: Callable[[], Field]
+    field: Callable[[], AnyField]
     """The field as it stands."""
     stamp: Callable[[], int] = lambda: 0
     """A number that changes when the field does."""
@@ -282,17 +283,15 @@ class Painter:
             return None
         return origin + float(seen.depth[0] / seen.opacity[0]) * direction
 
-    def _shown(self, index: int, settings: Settings) -> Field:
+    def _shown(self, index: int, settings: Settings) -> AnyField:
         """What is left of a subject to be shown."""
         field = self.subjects[index].field()
-        if settings.crop is not None:
+        if settings.crop is not None and isinstance(field, Field):
             field = replace(field, free=self._crop(index, field, settings.crop))
-        if settings.clip > field.steps.near:
-            field = replace(field, steps=replace(field.steps, near=settings.clip))
-        if settings.kind == "near field":
-            steps = replace(field.steps, far=settings.within, transmittance_min=0.0)
-            field = replace(field, steps=steps, proposal=None)
-        return field
+        elif settings.crop is not None:
+            field = field.cropped(*settings.crop)
+        field = field.beyond(settings.clip)
+        return field.up_to(settings.within) if settings.kind == "near field" else field
 
     def _crop(self, index: int, field: Field, crop: object) -> FreeCells:
         """Free cells with all outside of the box among them, kept as long as neither changes."""

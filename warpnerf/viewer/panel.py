@@ -73,7 +73,7 @@ class Panel:
             slider.on_update(lambda _: setattr(self, "share", _kept(slider.value, 0.05, 0.9)))
         if stage.cameras:
             self._add_cameras()
-        self._add_crop(box, any(subject.field().steps.in_ndc for subject in subjects))
+        self._add_crop(box, any(subject.field().in_ndc for subject in subjects))
         self._add_path()
 
     def _set(self, **changes: Any) -> None:

@@ -109,7 +109,7 @@ class Session:
         self._world = world
         near, far = depths or (0.0, 2.5 * content_distance)
         settings = Settings(near=near, far=far, within=NEAR_SHARE * content_distance)
-        box = subjects[0].field().lattice.surroundings
+        box = subjects[0].field().surroundings
         look = _before(box) if scene is None else first_look(scene.training_cameras)
         require_extra("viser", "viewer", "the viewer")
         self._warm_up(Viewpoint(c2w=look.c2w, fov=look.fov, width=4, height=3), settings)

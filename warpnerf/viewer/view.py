@@ -7,12 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
+from warpnerf.blocks.folder import open_trained
 from warpnerf.checked import checked_arguments
 from warpnerf.checks import InputError, require_extra
 from warpnerf.media.filming import depth_range
+from warpnerf.rendering.composite import AnyField, CompositeField
 from warpnerf.rendering.field import Field
-from warpnerf.runs.config import RunConfig
-from warpnerf.runs.run import Run
+from warpnerf.runs.config import TrainedScene
 from warpnerf.runs.scene import load_run_scene
 from warpnerf.scenes.scene import Scene
 from warpnerf.viewer.painter import Subject
@@ -21,7 +22,7 @@ from warpnerf.viewer.session import Session
 
 @checked_arguments
 def view(
-    *shown: Field | str | Path,
+    *shown: Field | CompositeField | str | Path,
     scene: Scene | None = None,
     host: str = "127.0.0.1",
     port: int | None = None,
@@ -31,7 +32,8 @@ def view(
     """Serve an interactive viewer of fields in the browser, until interrupted; print its address.
 
     Args:
-        shown: A field or the folder of a run; or two, in the same coordinates, to be compared.
+        shown: A field or the folder of a run or of blocks; or two, in the same coordinates, to be
+            compared.
         scene: Its training cameras are shown; None: those of the first run's scene.
         host: Name or address of this machine to listen at. Any but 127.0.0.1 lets others in.
         port: None: 8080, or the next that is free; 0: any that is free.
@@ -50,7 +52,7 @@ def view(
 
 
 def open_view(
-    shown: Sequence[Field | str | Path],
+    shown: Sequence[AnyField | str | Path],
     *,
     scene: Scene | str | None,
     host: str,
@@ -68,10 +70,10 @@ def open_view(
         raise InputError(f"name one field or run, or two to compare, not {len(shown)}.")
     subjects, distance = [], None
     for number, what in enumerate(shown, 1):
-        if isinstance(what, Field):
+        if isinstance(what, Field | CompositeField):
             subjects.append(_subject(f"field {number}", what))
             continue
-        run = Run(what)
+        run = open_trained(Path(what))
         config = run.read_config()
         field, notes = run.load_field(device, threads)
         for note in notes:
@@ -89,7 +91,7 @@ def open_view(
     if scene is not None:
         distance = distance or scene.content_distance
     depths = None if scene is None else depth_range(first, scene.training_cameras)
-    low, high = first.lattice.surroundings
+    low, high = first.surroundings
     half = 0.5 * float(np.linalg.norm(high - low))
     return Session(
         subjects,
@@ -101,11 +103,11 @@ def open_view(
     )
 
 
-def _subject(name: str, field: Field) -> Subject:
+def _subject(name: str, field: AnyField) -> Subject:
     return Subject(name=name, field=lambda: field)
 
 
-def _scene_of(config: RunConfig, moved: str | None, threads: int | None) -> Scene | None:
+def _scene_of(config: TrainedScene, moved: str | None, threads: int | None) -> Scene | None:
     print(f"reading {moved or config.scene}", flush=True)
     try:
         return load_run_scene(config, moved, threads)

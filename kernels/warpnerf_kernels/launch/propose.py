@@ -48,6 +48,7 @@ class Guide:
     bins: Bins  # its ends are written
     grid: Grid
     density: Density
+    between: wp.array(dtype=vec2)  # [n_rays] distances that bins lie between; none: near and far
 
 
 @wp.struct
@@ -240,9 +241,13 @@ def proposing(space: Space, packed: bool) -> SimpleNamespace:
         """Draw the intervals of rays from what the bins weigh."""
         i = first + wp.tid()
         bins = guide.bins
+        between = vec2(bins.near, bins.far)
+        if guide.between.shape[0] > 0:
+            ends = guide.between[i]
+            between = vec2(wp.max(bins.near, ends[0]), wp.min(bins.far, ends[1]))
         ray, within = clip_ray(
             guide.box,
-            vec2(bins.near, bins.far),
+            between,
             i,
             rays.origins[i],
             rays.directions[i],

@@ -34,6 +34,15 @@ class Observations:
         """How many there are."""
         return len(self.positions)
 
+    def of(self, kept: np.ndarray) -> Observations:
+        """Some of them.
+
+        Args:
+            kept: [n] bool, at least one.
+        """
+        columns = (self.positions, self.directions, self.pixels, self.weights)
+        return _normalised(*(column[kept] for column in columns))
+
 
 def observe(
     cameras: Sequence[Camera], seen: Sequence[np.ndarray], training: Sequence[int]

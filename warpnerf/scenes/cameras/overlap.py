@@ -111,7 +111,22 @@ def _content(camera: Camera, distance: float, n_pixels: int = PIXELS) -> np.ndar
         np.arange(block // 2, camera.width, block) + 0.5,
         np.arange(block // 2, camera.height, block) + 0.5,
     )
-    x, y = (u.ravel() - camera.cx) / camera.fx, (camera.cy - v.ravel()) / camera.fy
+    return content_at(camera, u.ravel(), v.ravel(), np.full(u.size, distance))
+
+
+def content_at(camera: Camera, u: np.ndarray, v: np.ndarray, distances: np.ndarray) -> np.ndarray:
+    """Points on rays of pixels.
+
+    Args:
+        camera: The camera; its distortion is left out of account.
+        u: [n] pixels from the left.
+        v: [n] pixels from the top.
+        distances: [n] along the rays, scene units.
+
+    Returns:
+        [n or fewer, 3] scene units: pixels behind a fisheye's plane have none.
+    """
+    x, y = (u - camera.cx) / camera.fx, (camera.cy - v) / camera.fy
     if camera.fisheye:
         angle = np.hypot(x, y)
         aside, ahead = np.sinc(angle / np.pi), np.cos(angle)  # sin(angle) / angle
@@ -122,4 +137,5 @@ def _content(camera: Camera, distance: float, n_pixels: int = PIXELS) -> np.ndar
         seen = np.ones(len(x), bool)
     directions = np.stack([x, y, z], axis=1)[seen]
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    return camera.position + distance * directions @ camera.c2w[:, :3].T
+    along = distances[seen, None] * directions
+    return np.asarray(camera.position + along @ camera.c2w[:, :3].T)

@@ -20,6 +20,7 @@ from warpnerf.scenes.formats.colmap_models import find_model
 from warpnerf.scenes.formats.contents import VIDEOS, is_unposed, pose_command, what_is_there
 from warpnerf.scenes.formats.found_photographs import Reading
 from warpnerf.scenes.formats.npz import load_npz, single_npz
+from warpnerf.scenes.formats.part import ENDING, part_of, read_part
 from warpnerf.scenes.formats.programs import export_of, exports_in
 from warpnerf.scenes.formats.survey import forms_in
 from warpnerf.scenes.formats.transforms import load_transforms
@@ -55,7 +56,8 @@ def load_scene(
 
     Args:
         path: A folder, a transforms*.json, poses_bounds.npy, .npz or exported file in it, the
-            folder of a COLMAP model, or "builtin:" and the name of a built-in scene.
+            folder of a COLMAP model, a .part.json of `warpnerf blocks`, or "builtin:" and the name
+            of a built-in scene.
         downscale: Edge of the blocks of pixels that become one; 1 keeps the images as they are.
         masks: Folder of masks, named after the photographs: pixels that are black there are neither
             trained on nor measured. They take the place of masks that the scene brings itself.
@@ -100,6 +102,8 @@ def load_scene(
         "keeping": keeping,
         "withhold": split,
     }
+    if path.name.endswith(ENDING):
+        return _load_part(path, how)
     if path.is_dir():
         return _load_folder(path, how)
     if path.name in [split_file(split) for split in SPLITS]:
@@ -119,6 +123,19 @@ def load_scene(
     if path.suffix.lower() in ARCHIVES:
         raise InputError(f"{path}: is an archive; unpack it, and give the folder that it makes.")
     raise InputError(f"{path}: is not a scene; give its folder or a transforms*.json in it.")
+
+
+def _load_part(path: Path, how: dict[str, Any]) -> Scene:
+    part, keeping = read_part(path), how["keeping"]
+    whole = load_scene(
+        part.part_of,
+        downscale=how["downscale"],
+        masks=how["masks"],
+        images="files",
+        threads=keeping.threads,
+        split=part.split if how["withhold"] is None else how["withhold"],
+    )
+    return part_of(whole, part, path, keeping, how["downscale"])
 
 
 def _with_split(scene: Scene, split: Split | None) -> Scene:
@@ -167,8 +184,13 @@ def _first_of_folder(folder: Path, how: dict[str, Any]) -> Scene:
 
 
 def _load_builtin(name: str, downscale: int) -> Scene:
+    rooms = re.fullmatch(r"building-(\d{1,9})", name)
+    if rooms is not None:
+        from warpnerf.scenes.builtin.building import building_scene
+
+        return building_scene(int(rooms[1]), downscale=downscale)
     if name not in BUILTIN_NAMES:
-        known = " and ".join(BUILTIN + known for known in BUILTIN_NAMES)
+        known = ", ".join(BUILTIN + known for known in (*BUILTIN_NAMES, "building-N"))
         raise InputError(f"{BUILTIN}{name}: no such built-in scene; there are {known}.")
     from warpnerf.scenes.builtin.room import (
         room_scene,  # a ray tracer: loaded only where it is used

@@ -15,6 +15,7 @@ from warpnerf.scenes.formats import llff
 from warpnerf.scenes.formats.blender import SPLITS, split_file
 from warpnerf.scenes.formats.colmap_models import find_model, model_kind
 from warpnerf.scenes.formats.npz import is_scene_file, single_npz
+from warpnerf.scenes.formats.part import ENDING, read_part
 from warpnerf.scenes.formats.programs import export_of, exports_in
 from warpnerf.scenes.formats.transforms import FrameEntry, TransformsFile
 
@@ -93,6 +94,8 @@ def _files(path: str | Path) -> tuple[str, list[Path]]:
     if isinstance(path, str) and path.startswith("builtin:"):
         return "built in: an exact ray tracer, with true depth", []
     path = Path(path)
+    if path.name.endswith(ENDING):
+        return f"part of {read_part(path).part_of}", []
     if not exists(path):
         return "none", []
     if path.is_dir():

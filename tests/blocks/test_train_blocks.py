@@ -1,0 +1,111 @@
+"""Blocks as jobs: begun, lost, taken over, stopped, never trained twice; then one scene."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.support import cli_process
+from tests.support.tiny_runs import run, start
+from warpnerf.blocks.folder import BlockFolder
+from warpnerf.rendering.composite import CompositeField
+from warpnerf.scenes.formats.load import load_scene
+
+ROOM = ("builtin:room-sparse", "--downscale", "8")
+OPTIONS = ("--voxels", "512", "--model", "rgb", "--sampler", "march")
+
+
+def cut(folder: Path) -> Path:
+    code, _, err = run("blocks", *ROOM, "--output", folder, "--count", "2")
+    assert code == 0, err
+    return folder
+
+
+def refused(*arguments: str | Path) -> str:
+    code, _, err = run(*arguments)
+    assert code == 2 and err.count("\n") == 1, err
+    return err
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two blocks that were trained by the command, one alone first."""
+    folder = cut(tmp_path_factory.mktemp("blocks") / "room")
+    options = ("--threads", "1", "--", "--steps", "12", *OPTIONS)
+    code, out, err = run("train-blocks", folder, "--only", "1", *options)
+    assert code == 0 and "block-0" not in out, (out, err)
+    assert f"{folder}: block-0 has not been trained" in refused("eval", folder)
+    code, out, err = run("train-blocks", folder, "--threads", "1")  # options are kept
+    assert code == 0 and "block-0 is done" in out and "block-1 begins" not in out, (out, err)
+    return folder
+
+
+def test_blocks_are_one_scene(trained: Path, tmp_path: Path) -> None:
+    json_file = tmp_path / "figures.json"
+    code, _, err = run("eval", trained, "--json", json_file)
+    assert code == 0 and len(json.loads(json_file.read_text())["images"]) == 10, err
+    code, _, err = run(
+        "render", trained, "--photographs", "test_03.png", "--output", tmp_path / "a"
+    )
+    assert code == 0 and (tmp_path / "a/test_03.png").exists(), err
+    field, _ = BlockFolder.read(trained).load_field("cpu", 1)
+    assert isinstance(field, CompositeField)
+    camera = load_scene("builtin:room-sparse", downscale=8).views[3].camera
+    seen = [field.render(camera).rgb, *(member().render(camera).rgb for member in field.members)]
+    assert all(np.abs(seen[0] - alone).max() > 1e-5 for alone in seen[1:])
+
+
+def test_what_is_no_scene_in_blocks_is_refused(trained: Path, tmp_path: Path) -> None:
+    assert "block-0 was begun with" in refused("train-blocks", trained, "--", "--steps", "9")
+    assert "has blocks 0 to 1" in refused("train-blocks", trained, "--only", "2")
+    assert "give --engine ray" in refused("train-blocks", trained, "--address", "auto")
+    assert "--output is not an option" in refused("train-blocks", trained, "--", "--output", "x")
+    assert "blocks.json does not exist" in refused("train-blocks", tmp_path)
+    assert "normals are of one field" in refused(
+        "render", trained, "--show", "normals", "--output", tmp_path / "a.mp4"
+    )
+    other = tmp_path / "other"
+    shutil.copytree(trained, other)
+    shutil.rmtree(other / "block-1")
+    shutil.copytree(trained / "block-0", other / "block-1")
+    assert "holds a run of" in refused("eval", other)
+    assert "--nonsense" in refused("train-blocks", cut(tmp_path / "new"), "--", "--nonsense", "1")
+    assert not (tmp_path / "new/block-0").exists()
+
+
+def until(what: Callable[[], bool], process: subprocess.Popen[str]) -> None:
+    limit = time.monotonic() + cli_process.LIMIT
+    while not what():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < limit
+        time.sleep(0.05)
+
+
+def test_a_lost_block_is_taken_over_and_ctrl_c_saves_it(tmp_path: Path) -> None:
+    blocks = BlockFolder.read(cut(tmp_path / "room"))
+    endless = ("--steps", "1000000", "--checkpoint-every", "0.3", *OPTIONS)
+    one = ("--only", "0", "--threads", "1")
+    process = start("train-blocks", blocks.folder, *one, "--", *endless)
+    run_of_first = blocks.run(0)
+    until(lambda: run_of_first.last_step is not None, process)
+    lock = run_of_first.folder / ".lock"
+    lost_at, killed = run_of_first.last_step or 0, int(lock.read_text())
+    os.kill(killed, signal.SIGKILL)
+    until(lambda: "resuming after step" in (blocks.folder / "block-0.log").read_text(), process)
+    until(lambda: (run_of_first.last_step or 0) > lost_at, process)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=cli_process.LIMIT)
+    assert process.returncode == 130, (out, err)
+    assert "block-0 was lost; it is taken over" in out and "block-0 resumes" in out
+    assert "continue with: warpnerf train-blocks" in out and not lock.exists()
+    said = (blocks.folder / "block-0.log").read_text()
+    assert f"stopped and saved after step {run_of_first.last_step}" in said

@@ -1,0 +1,1 @@
+"""Scenes larger than a machine: cut into blocks, trained as jobs, rendered as one."""
