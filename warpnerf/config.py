@@ -186,6 +186,9 @@ class GridConfig:
 
         Args:
             kind: object, bounded or unbounded.
+
+        Returns:
+            Of raw density.
         """
         given = self.shift_at_growth
         return float(kind in RESTARTS) if isinstance(given, str) else given

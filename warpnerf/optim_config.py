@@ -117,6 +117,9 @@ class OptimConfig:
 
         Args:
             kind: object, bounded or unbounded.
+
+        Returns:
+            As ``restart_at_growth``; not auto.
         """
         given = self.restart_at_growth
         return kind in RESTARTS if isinstance(given, str) else given

@@ -145,8 +145,31 @@ def after_torch(names: Names, out: str) -> None:
     assert colors.shape == (5, 7, 3) and sigmas.shape == (5, 7)
 
 
-AFTER = {"README.md": after_readme, "docs/python.md": after_python, "docs/torch.md": after_torch}
-NEEDS = {"docs/python.md": ("av",), "docs/torch.md": ("torch",)}
+def after_jax(names: Names, out: str) -> None:
+    """The error falls, and gradients are scaled."""
+    import jax.numpy as jnp
+
+    batch = jnp.arange(0, len(names["pixels"]), 50)
+    first = names["first_layers"](names["jax"].random.key(0))
+    assert names["loss"](names["layers"], batch) < 0.7 * names["loss"](first, batch)
+    assert float(jnp.abs(names["gradient"]).max()) > 0.0
+
+    def seen(rgb: Any) -> Any:
+        results = {"rgb": rgb, "density": jnp.ones((1, 2))}
+        tdist, directions = jnp.array([[0.0, 1.0, 2.0]]), jnp.array([[0.0, 0.0, 2.0]])
+        return names["scaled"](results, tdist, directions, 4.0)["rgb"].sum()
+
+    gradient = names["jax"].grad(seen)(jnp.ones((1, 2, 3)))
+    assert np.allclose(gradient[0, :, 0], [1 / 16, 9 / 16])  # (1 / 4)^2, (3 / 4)^2
+
+
+AFTER = {
+    "README.md": after_readme,
+    "docs/python.md": after_python,
+    "docs/torch.md": after_torch,
+    "docs/jax.md": after_jax,
+}
+NEEDS = {"docs/python.md": ("av",), "docs/torch.md": ("torch",), "docs/jax.md": ("jax",)}
 
 
 @pytest.mark.parametrize("document", PYTHON)

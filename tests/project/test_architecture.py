@@ -83,17 +83,21 @@ def test_device_code_imports_itself_by_relative_names(path: Path) -> None:
 
 
 TORCH = ROOT / "warpnerf" / "torch"
+JAX = ROOT / "warpnerf" / "jax"
 LPIPS = ROOT / "warpnerf" / "evaluation" / "lpips.py"
 """A network with weights of others: torch is imported inside its functions, when it is used."""
 
 
 @pytest.mark.parametrize("path", PACKAGE, ids=module_of)
-def test_the_package_knows_no_tests_and_torch_in_two_places_only(path: Path) -> None:
+def test_the_package_knows_no_tests_and_frameworks_in_their_places_only(path: Path) -> None:
     assert not roots(path) & {"tests", "benchmarks"}
     assert "torch" not in roots(path) or TORCH in path.parents or path == LPIPS
+    assert "jax" not in roots(path) or JAX in path.parents
     if TORCH not in path.parents:
         outside = set(imports(path, inside_functions=False))
-        assert not outside & {"torch", "warpnerf.torch", "warpnerf.evaluation.lpips"}
+        assert not outside & {
+            *("torch", "warpnerf.torch", "warpnerf.evaluation.lpips", "warpnerf.jax"),
+        }
 
 
 @pytest.mark.parametrize("path", ORACLE, ids=lambda path: path.name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import inspect
 import subprocess
 import sys
@@ -12,7 +13,7 @@ import pytest
 import warpnerf
 from warpnerf.torch import render_rays, scale_gradient
 
-HEAVY = "{'warp', 'torch', 'imageio', 'PIL', 'safetensors', 'tyro', 'rich', 'numpy'}"
+HEAVY = "{'warp', 'torch', 'jax', 'imageio', 'PIL', 'safetensors', 'tyro', 'rich', 'numpy'}"
 
 
 def in_fresh_python(code: str) -> str:
@@ -30,7 +31,7 @@ def test_import_loads_nothing_heavy() -> None:
 def test_configuring_does_not_load_warp() -> None:
     code = (
         "import sys, warpnerf; warpnerf.TrainConfig(); warpnerf.load_scene; warpnerf.InputError;"
-        "print(sorted({'warp', 'torch'} & set(sys.modules)))"
+        "print(sorted({'warp', 'torch', 'jax'} & set(sys.modules)))"
     )
     assert in_fresh_python(code) == "[]"
 
@@ -65,6 +66,9 @@ def public_functions() -> dict[str, Any]:
     """Functions, and methods where they are first defined, of public names."""
     homes = {name: getattr(warpnerf, name) for name in warpnerf.__all__}
     homes |= {f"torch.{f.__name__}": f for f in (scale_gradient, render_rays)}
+    if importlib.util.find_spec("jax") is not None:
+        of_jax = importlib.import_module("warpnerf.jax")
+        homes |= {f"jax.{f}": getattr(of_jax, f) for f in ("scale_gradient", "render_rays")}
     found = {}
     for name, value in homes.items():
         if inspect.isfunction(value):

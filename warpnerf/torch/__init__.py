@@ -1,6 +1,6 @@
 """Drop-in torch operations: the paper's gradient scaling, and rendering through our own adjoint."""
 
-from warpnerf.torch.arguments import Head, March
+from warpnerf.rendering.arguments import Head, March
 from warpnerf.torch.rendering import RenderedRays, render_rays
 from warpnerf.torch.scaling import scale_gradient
 

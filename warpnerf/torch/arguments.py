@@ -1,37 +1,11 @@
-"""Arguments of a rendering that belong together, and how they were given before."""
+"""How arguments of a rendering that belong together were given before."""
 
 import functools
 import warnings
-from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Callable
+from typing import Any, TypeVar
 
-import torch
-
-from warpnerf.model.interface import Model
-
-
-class March(NamedTuple):
-    """Ray marching with a constant step: samples at t = near + (k + 1/2) step for every k >= 0,
-    below far."""
-
-    step: float
-    """Length of a step, scene units."""
-    near: float = 0.0
-    """Where the first step begins, scene units."""
-    far: float | None = None
-    """No sample at or beyond it, scene units; None: where the box ends."""
-
-
-class Head(NamedTuple):
-    """A colour head: how a node's numbers become RGB."""
-
-    model: str | Model
-    """rgb, sh, deferred, per_sample, or a model from ``warpnerf.model.models``."""
-    layers: Iterable[torch.Tensor] = ()
-    """The model's MLP, as torch.nn.Linear holds it: weight [outputs, inputs] and bias [outputs] of
-    each layer, in turn; so ``network.parameters()``. Inputs are channels or features, then the
-    encoded direction. Its gradient is scaled where it passes samples, so for per_sample."""
-
+from warpnerf.rendering.arguments import Head, March
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 

@@ -2,28 +2,28 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple, get_args
 
 import numpy as np
 import torch
 
-from warpnerf.checks import (
-    InputError,
-    require_at_least,
-    require_finite,
-    require_one_of,
-    require_positive,
-    said,
-)
+from warpnerf.checks import InputError, require_finite, require_one_of
 from warpnerf.config import Scaling
 from warpnerf.model.interface import Model
-from warpnerf.model.models import model_of
-from warpnerf.rendering.steps import MOST_LINEAR, Steps
-from warpnerf.torch.arguments import Head, March, accept_old_spelling
+from warpnerf.rendering.arguments import (
+    Head,
+    March,
+    head_of,
+    require_ascending,
+    require_box,
+    require_reach,
+    steps_of,
+)
+from warpnerf.torch.arguments import accept_old_spelling
 from warpnerf.torch.launches import Call, Render
 from warpnerf.torch.tensors import (
+    PRECISIONS,
     corner_of,
     flat_head,
     rays_of,
@@ -32,9 +32,6 @@ from warpnerf.torch.tensors import (
     require_grid,
     require_numbers,
 )
-
-MAX_STEPS = {torch.float32: MOST_LINEAR, torch.float64: 10**9}
-"""Steps that a ray can count, from its origin on: those whose distances are told apart."""
 
 
 class RenderedRays(NamedTuple):
@@ -96,11 +93,8 @@ def render_rays(
         InputError: A shape, type, device or number does not fit, or a tensor other than raw and
             layers requires grad.
     """
-    if not isinstance(box, Sequence) or len(box) != 2:
-        raise InputError(f"box must be its lower and its upper corner, not {box!r}.")
+    require_box(box)
     box_min, box_max = box
-    length, near, far = step if isinstance(step, March) else March(step)
-    model, layers = head if isinstance(head, Head) else Head(head)
     for field, value in {
         "origins": origins,
         "directions": directions,
@@ -112,24 +106,15 @@ def render_rays(
     }.items():
         require_constant(field, value)
     require_one_of("scaling", scaling, get_args(Scaling))
-    require_positive("step", length)
-    require_at_least("near", near, 0.0)
-    if far is not None and not far > near:
-        raise InputError(f"far must lie beyond near, not at {far}.")
+    steps = steps_of(step)
     require_finite("density_shift", density_shift)
-    if isinstance(model, str):
-        model = model_of(model)
-    if not isinstance(model, Model):
-        raise InputError(f"model must be a name or a model, not {said(model)}.")
+    model, layers = head_of(head)
     require_grid(raw, model)
-    weights = flat_head(list(layers), model, raw)
+    weights = flat_head(layers, model, raw)
     if raw.shape[3] < model.n_floats:
         raw = torch.nn.functional.pad(raw, (0, model.n_floats - raw.shape[3]))
     corners = corner_of("box_min", box_min), corner_of("box_max", box_max)
-    if not (corners[0] < corners[1]).all():
-        raise InputError(
-            f"box_max must lie above box_min on every axis, not {corners[1]} over {corners[0]}."
-        )
+    require_ascending(corners)
     rays = rays_of("origins", origins, raw), rays_of("directions", directions, raw)
     if len(rays[0]) != len(rays[1]):
         raise InputError(
@@ -146,11 +131,7 @@ def render_rays(
         else 0.0
     )
     reach += float(np.linalg.norm(corners[1] - corners[0]))
-    if reach / length > (most := MAX_STEPS[raw.dtype]):
-        raise InputError(
-            f"step {length:g} is too short for rays that reach {reach:g} scene units: more than "
-            f"{most} steps; use a longer step, or an origin nearer to the box."
-        )
+    require_reach(reach, steps.step, PRECISIONS[raw.dtype])
     require_dense("background", background)
     require_dense("content_distance", content_distance)
     require_numbers("background", background)
@@ -166,7 +147,6 @@ def render_rays(
             "content_distance must be above 0: a number or [n_rays], "
             f"not {content.tolist() if content.dim() == 0 else list(content.shape)}."
         )
-    steps = Steps(near=near, far=min(1e30, math.inf if far is None else far), step=length)
     call = Call(
         corners=corners,
         steps=steps,

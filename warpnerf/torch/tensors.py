@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,8 +9,8 @@ import numpy as np
 import torch
 
 from warpnerf.checks import InputError, said
-from warpnerf.config import MAX_VOXELS
-from warpnerf.model.interface import Model, loader
+from warpnerf.model.interface import Model
+from warpnerf.rendering.arguments import require_layers, require_nodes
 
 PRECISIONS = {torch.float32: "float32", torch.float64: "float64"}
 
@@ -21,16 +20,7 @@ def require_grid(raw: torch.Tensor, model: Model) -> None:
     require_tensor("raw", raw)
     if raw.dtype not in PRECISIONS:
         raise InputError(f"raw must be float32 or float64, not {raw.dtype}; call raw.float().")
-    numbers = 1 + model.n_features
-    if raw.dim() != 4 or raw.shape[3] != numbers or min(raw.shape[:3]) < 2:
-        raise InputError(
-            f"raw must be [X, Y, Z, {numbers}] with at least two nodes along each axis, "
-            f"not {list(raw.shape)}."
-        )
-    if raw.shape[:3].numel() >= MAX_VOXELS:
-        raise InputError(
-            f"raw must have fewer than {MAX_VOXELS} nodes, not {raw.shape[:3].numel()}."
-        )
+    require_nodes(raw.shape, model)
 
 
 def require_tensor(field: str, value: Any, like: torch.Tensor | None = None) -> None:
@@ -104,23 +94,11 @@ def rays_of(field: str, value: torch.Tensor, raw: torch.Tensor) -> torch.Tensor:
 
 def flat_head(head: Sequence[torch.Tensor], model: Model, raw: torch.Tensor) -> torch.Tensor:
     """The layers in one tensor, as kernels take them; see ``warpnerf_kernels.networks.mlp``."""
-    layout = model.layout(loader(PRECISIONS[raw.dtype]))
-    if layout is None:
-        if len(head):
-            raise InputError(f"head must be empty: the model {model.name} has no MLP.")
-        return raw.new_zeros(0)
-    sizes = [layout.n_inputs, *[layout.width] * layout.n_hidden, 3]
-    shapes = [
-        shape for n_in, n_out in itertools.pairwise(sizes) for shape in ((n_out, n_in), (n_out,))
-    ]
     for number, tensor in enumerate(head):
         require_tensor(f"head[{number}]", tensor, raw)
-    found = [tuple(tensor.shape) for tensor in head]
-    if found != shapes:
-        raise InputError(
-            f"head of the model {model.name} must be tensors of shapes {shapes}, weight and bias "
-            f"of each layer in turn, not {found}."
-        )
+    require_layers([tuple(tensor.shape) for tensor in head], model, PRECISIONS[raw.dtype])
+    if not len(head):
+        return raw.new_zeros(0)
     pieces = [
         tensor.to(raw.dtype).t() if tensor.dim() == 2 else tensor.to(raw.dtype) for tensor in head
     ]

@@ -1,0 +1,106 @@
+"""The paper's gradient scaling as a JAX operation."""
+
+from __future__ import annotations
+
+from typing import Any, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from warpnerf.checks import InputError, require_one_of, require_positive
+from warpnerf.config import Scaling
+from warpnerf.jax.arrays import array_of, constant, known
+
+
+def scale_gradient(
+    colors: jax.Array,
+    sigmas: jax.Array,
+    distances: jax.Array,
+    content_distance: float | jax.Array = 1.0,
+    scaling: Scaling = "clamped",
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Scale the gradients of samples by their distance; call it just before integrating them.
+
+    Identity forward. Backward, with s = 1 (none), (t / D)^2 (quadratic) or min(1, (t / D)^2)
+    (clamped): dL/dcolor <- s dL/dcolor, dL/dsigma <- s dL/dsigma. What reaches t passes as it is,
+    and s itself is a constant. It is made of ``jax.numpy``, so that every transformation of JAX
+    but forward mode applies to it.
+    Source: Philip & Deschaintre 2023, "Floaters No More", eq. 7.
+
+    Args:
+        colors: [..., C] of samples, any floating type.
+        sigmas: [...] or [..., 1] densities of the same samples.
+        distances: t, of the shape of sigmas, scene units from the camera centre.
+        content_distance: D, scene units; a number, or an array that broadcasts over distances.
+        scaling: none, quadratic or clamped.
+
+    Returns:
+        colors, sigmas and distances, unchanged.
+
+    Raises:
+        InputError: Arrays are not floating point, shapes do not fit, or content_distance is
+            differentiated, or not above zero, where its values are known: under ``jax.jit`` they
+            are not.
+    """
+    require_one_of("scaling", scaling, get_args(Scaling))
+    colors, sigmas, distances = (
+        array_of(field, value)
+        for field, value in (("colors", colors), ("sigmas", sigmas), ("distances", distances))
+    )
+    if sigmas.shape != distances.shape:
+        raise InputError(
+            f"sigmas and distances must have one shape, not {list(sigmas.shape)} and "
+            f"{list(distances.shape)}."
+        )
+    # One distance for all channels of a color.
+    flat = colors.ndim != distances.ndim
+    per_color = (*distances.shape, 1) if flat else distances.shape
+    if per_color[:-1] != colors.shape[:-1] or per_color[-1:] != (1,):
+        raise InputError(
+            f"colors must be [..., C] over sigmas [...] or [..., 1], not {list(colors.shape)} over "
+            f"{list(sigmas.shape)}."
+        )
+    if isinstance(content_distance, (jax.Array, np.ndarray)):
+        if not _broadcasts_over(content_distance.shape, distances.shape):
+            raise InputError(
+                f"content_distance must broadcast over distances {list(distances.shape)}, not be "
+                f"{list(content_distance.shape)}."
+            )
+        values = known("content_distance", content_distance)
+        if values is not None and not (values > 0).all():
+            raise InputError("content_distance must be above 0 everywhere.")
+        content_distance = constant("content_distance", content_distance)
+    else:
+        require_positive("content_distance", content_distance)
+    if scaling == "none":
+        return colors, sigmas, distances
+    ratio = jax.lax.stop_gradient(distances / content_distance)
+    scale = ratio * ratio
+    if scaling == "clamped":
+        scale = jnp.minimum(scale, 1.0)
+    return _scaled(colors, scale[..., None] if flat else scale), _scaled(sigmas, scale), distances
+
+
+@jax.custom_vjp
+def _scaled(x: jax.Array, scale: jax.Array) -> jax.Array:
+    """x, whose gradient is multiplied by scale."""
+    return x
+
+
+def _forward(x: jax.Array, scale: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return x, scale
+
+
+def _backward(scale: jax.Array, gradient: jax.Array) -> tuple[jax.Array, None]:
+    return gradient * scale.astype(gradient.dtype), None
+
+
+_scaled.defvjp(_forward, _backward)
+
+
+def _broadcasts_over(shape: tuple[int, ...], other: Any) -> bool:
+    try:
+        return np.broadcast_shapes(shape, other) == other
+    except ValueError:
+        return False

@@ -1,0 +1,131 @@
+"""Arguments of a differentiable rendering that frameworks share, and their checks."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from warpnerf.checks import InputError, require_at_least, require_positive, said
+from warpnerf.config import MAX_VOXELS
+from warpnerf.model.interface import Model, loader
+from warpnerf.model.models import model_of
+from warpnerf.rendering.steps import MOST_LINEAR, Steps
+
+MAX_STEPS = {"float32": MOST_LINEAR, "float64": 10**9}
+"""Steps that a ray can count, from its origin on: those whose distances are told apart."""
+
+
+class March(NamedTuple):
+    """Ray marching with a constant step: samples at t = near + (k + 1/2) step for every k >= 0,
+    below far."""
+
+    step: float
+    """Length of a step, scene units."""
+    near: float = 0.0
+    """Where the first step begins, scene units."""
+    far: float | None = None
+    """No sample at or beyond it, scene units; None: where the box ends."""
+
+
+class Head(NamedTuple):
+    """A colour head: how a node's numbers become RGB."""
+
+    model: str | Model
+    """rgb, sh, deferred, per_sample, or a model from ``warpnerf.model.models``."""
+    layers: Iterable[Any] = ()
+    """The model's MLP, as torch.nn.Linear holds it: weight [outputs, inputs] and bias [outputs] of
+    each layer, in turn; so ``network.parameters()``. Inputs are channels or features, then the
+    encoded direction. Its gradient is scaled where it passes samples, so for per_sample."""
+
+
+def steps_of(step: float | March) -> Steps:
+    """What render_rays takes as its step.
+
+    Raises:
+        InputError: Lengths are not finite, or do not follow each other.
+    """
+    length, near, far = step if isinstance(step, March) else March(step)
+    require_positive("step", length)
+    require_at_least("near", near, 0.0)
+    if far is not None and not far > near:
+        raise InputError(f"far must lie beyond near, not at {far}.")
+    return Steps(near=near, far=min(1e30, math.inf if far is None else far), step=length)
+
+
+def head_of(head: str | Model | Head) -> tuple[Model, list[Any]]:
+    """The model and its layers, which render_rays takes as its head.
+
+    Raises:
+        InputError: It is neither a model nor the name of one.
+    """
+    model, layers = head if isinstance(head, Head) else Head(head)
+    if isinstance(model, str):
+        model = model_of(model)
+    if not isinstance(model, Model):
+        raise InputError(f"model must be a name or a model, not {said(model)}.")
+    return model, list(layers)
+
+
+def require_box(box: Any) -> None:
+    """Raise InputError unless a box is two things."""
+    if not isinstance(box, Sequence) or len(box) != 2:
+        raise InputError(f"box must be its lower and its upper corner, not {box!r}.")
+
+
+def require_ascending(corners: tuple[np.ndarray, np.ndarray]) -> None:
+    """Raise InputError unless a box has a volume."""
+    if not (corners[0] < corners[1]).all():
+        raise InputError(
+            f"box_max must lie above box_min on every axis, not {corners[1]} over {corners[0]}."
+        )
+
+
+def require_nodes(shape: Sequence[int], model: Model) -> None:
+    """Raise InputError unless an array of that shape is a grid of the model's nodes."""
+    numbers = 1 + model.n_features
+    if len(shape) != 4 or shape[3] != numbers or min(shape[:3]) < 2:
+        raise InputError(
+            f"raw must be [X, Y, Z, {numbers}] with at least two nodes along each axis, "
+            f"not {list(shape)}."
+        )
+    if math.prod(shape[:3]) >= MAX_VOXELS:
+        raise InputError(
+            f"raw must have fewer than {MAX_VOXELS} nodes, not {math.prod(shape[:3])}."
+        )
+
+
+def require_reach(reach: float, step: float, precision: str) -> None:
+    """Raise InputError if steps are too many to be counted.
+
+    Args:
+        reach: Distance from rays' origins to the far end of the box, scene units.
+        step: Length of a step, scene units.
+        precision: float32 or float64.
+    """
+    if reach / step > (most := MAX_STEPS[precision]):
+        raise InputError(
+            f"step {step:g} is too short for rays that reach {reach:g} scene units: more than "
+            f"{most} steps; use a longer step, or an origin nearer to the box."
+        )
+
+
+def require_layers(found: list[tuple[int, ...]], model: Model, precision: str) -> None:
+    """Raise InputError unless arrays of these shapes are the layers of a model's MLP."""
+    layout = model.layout(loader(precision))
+    if layout is None:
+        if found:
+            raise InputError(f"head must be empty: the model {model.name} has no MLP.")
+        return
+    sizes = [layout.n_inputs, *[layout.width] * layout.n_hidden, 3]
+    shapes = [
+        shape for n_in, n_out in itertools.pairwise(sizes) for shape in ((n_out, n_in), (n_out,))
+    ]
+    if found != shapes:
+        raise InputError(
+            f"head of the model {model.name} must be tensors of shapes {shapes}, weight and bias "
+            f"of each layer in turn, not {found}."
+        )
