@@ -17,7 +17,7 @@ FRONT, BEHIND = 0.8, 1.25
 MAX_RAYS = 512
 """Of a view, about; pixels of larger ones are looked at in even gaps."""
 
-GROUP = 0.005
+GROUP = 0.01
 """Rays are rendered together up to one distance where their own differ by less than this share."""
 
 
