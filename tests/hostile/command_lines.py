@@ -16,6 +16,7 @@ BEGINNINGS: dict[str, tuple[str, ...]] = {
     "train": ("scene", "--output", "out/run", *TINY, "--eval-views", "1"),
     "inspect": ("scene",),
     "pose": ("none", "--output", "out/scene"),
+    "compare": ("scene", "--output", "out/compared", "--steps", "2", "--threads", "0"),
     "eval": ("run",),
     "render": ("run", "--size", "8", "6", "--seconds", "0.1", "--output", "out/film"),
     "export": ("run", "out/mesh.ply", "--level", "0.01"),
@@ -25,8 +26,8 @@ BEGINNINGS: dict[str, tuple[str, ...]] = {
     "check": ("--threads", "0"),
     "warmup": ("--threads", "0", "--none"),
 }
-"""What each subcommand is given first, with which it ends soon; view, demo, check and warmup would
-not, so that theirs are wrong from the start."""
+"""What each subcommand is given first, with which it ends soon; view, demo, compare, check and
+warmup would not, so that theirs are wrong from the start."""
 
 UNSENT = ("--view", "--help", "--help-all")
 """Serves a page; prints."""
@@ -35,7 +36,7 @@ UNSENT = ("--view", "--help", "--help-all")
 def case(rng: random.Random, folder: Path, base: Path) -> Case:
     """A command with one to three options of hostile words."""
     fresh(folder, base / "run", base / "scene")
-    name = rng.choices(list(BEGINNINGS), [8, 5, 2, 3, 3, 3, 1, 1, 1, 1, 1])[0]
+    name = rng.choices(list(BEGINNINGS), [8, 5, 2, 2, 3, 3, 3, 1, 1, 1, 1, 1])[0]
     flags = sorted(flags_of(COMMANDS[name]) - set(UNSENT))
     words = [name, *BEGINNINGS[name]]
     for _ in range(rng.choice((1, 1, 1, 2, 3))):

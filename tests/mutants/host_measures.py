@@ -1,4 +1,4 @@
-"""Mutants of the measures that take longer."""
+"""Mutants of the measures that take longer, and of comparisons of trainings by them."""
 
 from mutant import of_host
 
@@ -12,6 +12,17 @@ NEAREST = f"{TESTS}test_the_angle_is_that_to_the_nearest_camera"
 WITHOUT = f"{TESTS}test_a_capture_without_depths_is_measured_as_far_as_it_can_be"
 
 LIGHT, SIGHT, MEASURES = (f"evaluation/{name}.py" for name in ("light", "sight", "measures"))
+
+PAIRED = "reports/test_paired.py::"
+TABLES = f"{PAIRED}test_quantiles_are_those_of_tables"
+SEEDS = f"{PAIRED}test_seeds_are_paired"
+COMPARE = "reports/test_compare.py::"
+CUT = f"{COMPARE}test_cut_anywhere_it_ends_with_the_same_bits"
+FIRST = f"{COMPARE}test_each_is_compared_with_the_first_scaling_of_its_own_kind"
+WORDS = f"{COMPARE}test_a_sentence_tells_better_from_worse_and_from_chance"
+REFUSED = f"{COMPARE}test_a_folder_of_something_else_is_refused"
+REPORT = f"{COMPARE}test_the_report_is_one_file_and_says_what_figures_say"
+OVERLAP = "scenes/test_overlap.py::test_overlap_along_rays_of_two_cameras_side_by_side"
 
 MUTANTS = [
     of_host("light: front up to the surface", LIGHT, "FRONT, BEHIND = 0.8, 1.25", "FRONT, BEHIND = 1.0, 1.25", SUM),
@@ -35,4 +46,21 @@ MUTANTS = [
             BY_HAND),
     of_host("measures: the farthest camera", MEASURES, "cosines.max()", "cosines.min()", NEAREST),
     of_host("measures: sum over rays", MEASURES, "[mass / n for mass, n", "[mass for mass, n", WITHOUT),
+    of_host("paired: one degree of freedom more", "reports/paired.py", "t_quantile(n - 1,", "t_quantile(n,", SEEDS),
+    of_host("paired: deviation of all there are", "reports/paired.py", "std(ddof=1)", "std()", SEEDS),
+    of_host("paired: one side", "reports/paired.py", "0.5 + CONFIDENCE / 2.0", "CONFIDENCE", SEEDS),
+    of_host("paired: terms of the other series", "reports/paired.py", "(k + 1) / (k + 2)", "k / (k + 1)", TABLES),
+    of_host("compare: against the first of all", "reports/comparison.py", "if len(scalings) > 1 else first", "if False else first",
+            FIRST),
+    of_host("compare: better is more", "reports/comparison.py", "int(np.sign(difference.mean)) * figure.better",
+            "int(np.sign(difference.mean))", WORDS),
+    of_host("compare: differences the other way", "reports/comparison.py", "paired_difference(own[name], others[name])",
+            "paired_difference(others[name], own[name])", REPORT),
+    of_host("compare: cut trainings start again", "reports/experiment.py", "if run.checkpoints:", "if False:", CUT),
+    of_host("compare: the seed of the configuration", "reports/experiment.py", "replace(candidate.config, seed=seed)", "candidate.config",
+            CUT),
+    of_host("compare: what is cut counts as trained", "reports/experiment.py", "if trainer.fraction < 1.0:", "if False:", CUT),
+    of_host("compare: any folder", "reports/experiment.py", "if others:", "if False:", REFUSED),
+    of_host("overlap: rays thin out by the distance", "scenes/cameras/overlap.py", "np.maximum(squared, distances[0] ** 2)",
+            "np.sqrt(squared)", OVERLAP),
 ]  # fmt: skip

@@ -84,7 +84,7 @@ MUTANTS = [
     of_host("depth error of what is masked", EVALUATE, " & (True if mask is None else mask)", "", HIDDEN),
     of_host("LPIPS of what is masked", EVALUATE, "lpips(alike, target)", "lpips(rgb, target)", HIDDEN),
     of_host("SSIM of what is masked", EVALUATE, "ssim=ssim(rgb, target, mask)", "ssim=ssim(rgb, target)", HIDDEN),
-    of_host("before black", EVALUATE, "+ (1.0 - alpha) * np.array(background)", "", OVER),
+    of_host("before black", METRICS, "+ (1.0 - alpha) * np.array(background)", "", OVER),
     of_host("fog: close-ups as well", EVALUATE, " and i.psnr < FOG_PSNR", "", FOG),
     of_host("near rays: of ten times as near", EVALUATE, "within = NEAR_SHARE * scene.content_distance",
             "within = NEAR_SHARE * NEAR_SHARE * scene.content_distance", FOG),

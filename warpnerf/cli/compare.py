@@ -13,7 +13,7 @@ from warpnerf.checks import InputError, require_whole, said
 from warpnerf.cli.arguments import SceneName, Settings, Usual
 from warpnerf.cli.configured import begun_with, configured
 from warpnerf.cli.given import NOTHING, Given, flag_of, near_to
-from warpnerf.cli.machine import FAILED
+from warpnerf.cli.machine import FAILED, require_machine
 from warpnerf.config import Scaling, TrainConfig
 from warpnerf.model.storage_kinds import STORAGE_KINDS
 from warpnerf.presets import PRESETS
@@ -92,6 +92,8 @@ def compare_command(options: CompareOptions, given: Annotated[Given, USUAL] = NO
             raise InputError(f"{flag_of(name)}: compare takes several, by {flag}.")
     require_whole("--seeds", options.seeds, 1)
     configs = _configs(options, given)
+    for config in configs.values():
+        require_machine(config)
 
     from warpnerf.reports.compare import PAGE, require_comparable, write_comparison
     from warpnerf.reports.comparison import candidates_of

@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING
 from warpnerf.checks import InputError, cannot_write
 from warpnerf.cli.arguments import Settings
 from warpnerf.cli.configured import configured
+from warpnerf.config import TrainConfig
 from warpnerf.presets import DEFAULT_PRESETS, PRESETS
+from warpnerf.runtime.memory import require_threads
 
 if TYPE_CHECKING:
     from warpnerf.training.warmup import CompiledKernel
@@ -118,3 +120,17 @@ def write_json(path: Path, text: str) -> None:
         write_atomically(path, text.encode())
     except OSError as error:
         raise cannot_write(f"--json {path}", error) from error
+
+
+def require_machine(config: TrainConfig) -> None:
+    """Refuse a device or threads that this machine has not, before photographs are posed or read.
+
+    Raises:
+        InputError: It has not.
+    """
+    if config.threads is not None:
+        require_threads(config.threads)
+    if config.device != "cpu":  # else Warp need not be loaded yet
+        from warpnerf.runtime.parallel import Workers
+
+        Workers(config.device)

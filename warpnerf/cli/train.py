@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from warpnerf.checks import InputError
 from warpnerf.cli.configured import begun_with, configured
 from warpnerf.cli.given import NOTHING, Given
-from warpnerf.cli.machine import FAILED
+from warpnerf.cli.machine import FAILED, require_machine
 from warpnerf.cli.pose import with_poses
 from warpnerf.cli.train_options import USUAL, TrainOptions
 from warpnerf.cli.view import training_page
@@ -19,7 +19,6 @@ from warpnerf.config import TrainConfig
 from warpnerf.presets import PRESETS
 from warpnerf.runs import lock
 from warpnerf.runs.names import new_folder
-from warpnerf.runtime.memory import require_threads
 from warpnerf.runtime.progress import ProgressBar
 from warpnerf.runtime.signals import Stopped, StopRequest
 from warpnerf.scenes.split import Split, read_split
@@ -112,7 +111,7 @@ def _require_free(output: Path, overwrite: bool) -> None:
 
 def _begin_alone(source: str, output: Path, options: TrainOptions, config: TrainConfig) -> int:
     """Train from the first step on, as the only one that writes to the folder."""
-    _require_machine(config)
+    require_machine(config)
     split = None if options.split is None else read_split(options.split)
     photographs, masks = source, options.masks
     downscale = 1 if options.downscale is None else options.downscale
@@ -178,7 +177,7 @@ def _go_on(run: Run, options: TrainOptions, changed: Callable[[TrainConfig], Tra
         if raised(begun.train, config):
             run.load_state()  # refuses: there is none
         options.require_no_training(run.folder)
-        _require_machine(config)
+        require_machine(config)
         masks = options.masks or masks_of(begun, moved)
         source = path_of(begun, moved)
         scene = _read(
@@ -193,7 +192,7 @@ def _go_on(run: Run, options: TrainOptions, changed: Callable[[TrainConfig], Tra
     longer = raised(begun.train, config)
     if longer:
         state.require_longer(config)
-    _require_machine(config)
+    require_machine(config)
     masks = options.masks or masks_of(begun, moved)
     source = path_of(begun, moved)
     scene = _read(source, begun.downscale, masks, run.folder, options, config.threads, begun.split)
@@ -221,20 +220,6 @@ def _go_on(run: Run, options: TrainOptions, changed: Callable[[TrainConfig], Tra
         run.rewind_log(trainer.steps_done)
         del state  # the trainer has copies
         return _train(run, scene, trainer, session, options)
-
-
-def _require_machine(config: TrainConfig) -> None:
-    """Refuse a device or threads that this machine has not, before photographs are posed or read.
-
-    Raises:
-        InputError: It has not.
-    """
-    if config.threads is not None:
-        require_threads(config.threads)
-    if config.device != "cpu":  # else Warp need not be loaded yet
-        from warpnerf.runtime.parallel import Workers
-
-        Workers(config.device)
 
 
 def _read(

@@ -85,7 +85,7 @@ class Experiment:
         return [(candidate, seed) for seed in self.seeds for candidate in self.candidates]
 
     def begin(self) -> None:
-        """Make the folder, or go on in it.
+        """Make the folder, or continue in it.
 
         Raises:
             InputError: It holds another experiment or other files, or cannot be written to.
@@ -208,7 +208,7 @@ class Experiment:
         return self.folder / "moments" / candidate.name
 
     def _trainer(self, run: Run, candidate: Candidate, seed: int) -> Trainer:
-        """A trainer that begins, or that goes on from the run's last checkpoint."""
+        """A trainer that begins, or that resumes from the run's last checkpoint."""
         capture = self.capture
         if run.checkpoints:
             state, _ = run.load_state()
