@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from tests.support import cli_process
 from tests.support.tiny_runs import run, start
@@ -64,12 +65,27 @@ def test_blocks_are_one_scene(trained: Path, tmp_path: Path) -> None:
     assert all(np.abs(seen[0] - alone).max() > 1e-5 for alone in seen[1:])
 
 
+def test_exports_of_blocks_lie_in_their_cores(trained: Path, tmp_path: Path) -> None:
+    files = [tmp_path / "a.ply", tmp_path / "a.splat.ply"]
+    code, _, err = run("export", trained, *files, "--unseen", "--level", "0.05", "--min-size", "0")
+    assert code == 0, err
+    made, blocks = trimesh.load(files[0]), BlockFolder.read(trained)
+    counts = []
+    for block in blocks.config.blocks:
+        low, high = np.array(block.core_min) - 1e-4, np.array(block.core_max) + 1e-4
+        counts.append(((low <= made.vertices) & (made.vertices <= high)).all(axis=1))
+    assert np.any(counts, axis=0).all() and all(inside.sum() > 20 for inside in counts)
+    assert made.faces.max() == len(made.vertices) - 1
+
+
 def test_what_is_no_scene_in_blocks_is_refused(trained: Path, tmp_path: Path) -> None:
     assert "block-0 was begun with" in refused("train-blocks", trained, "--", "--steps", "9")
     assert "has blocks 0 to 1" in refused("train-blocks", trained, "--only", "2")
     assert "give --engine ray" in refused("train-blocks", trained, "--address", "auto")
     assert "--output is not an option" in refused("train-blocks", trained, "--", "--output", "x")
     assert "blocks.json does not exist" in refused("train-blocks", tmp_path)
+    assert "is made of one field" in refused("export", trained, tmp_path / "a.nvdb")
+    assert "--texture is for" in refused("export", trained, tmp_path / "a.glb", "--texture")
     assert "normals are of one field" in refused(
         "render", trained, "--show", "normals", "--output", tmp_path / "a.mp4"
     )

@@ -5,13 +5,16 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from warpnerf.checks import InputError
 from warpnerf.cli.arguments import Corners, RunFolder
 from warpnerf.runtime.progress import ProgressBar
+
+if TYPE_CHECKING:
+    from warpnerf.blocks.folder import BlockFolder as Blocks
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,6 +71,7 @@ def export_command(
         device: cpu, cuda, cuda:1, ...
         threads: CPU threads; by default one per usable core.
     """
+    from warpnerf.blocks.folder import BlockFolder, open_trained
     from warpnerf.exporting.cameras import camera_model
     from warpnerf.exporting.export import (
         CENTRED,
@@ -76,13 +80,14 @@ def export_command(
         checked_ending,
         export_all,
     )
-    from warpnerf.runs.run import Run
     from warpnerf.runs.scene import load_run_scene
     from warpnerf.scenes.formats.georeference import in_words
 
     if not files:
         raise InputError("export: name at least one file to write, such as scene.glb.")
-    run = Run(folder)
+    run = open_trained(folder)
+    if isinstance(run, BlockFolder):
+        return _export_blocks(run, files, options, scene, device, threads)
     config = run.read_config()
     crop = options.crop
     endings = [checked_ending(file) for file in files]
@@ -140,4 +145,47 @@ def export_command(
             "note: the lenses have distortion, as in the photographs; 3DGS reads PINHOLE only: "
             "--pinhole writes such a folder, with the photographs undistorted"
         )
+    return 0
+
+
+def _export_blocks(
+    blocks: Blocks,
+    files: tuple[Path, ...],
+    options: Options,
+    scene: str | None,
+    device: str,
+    threads: int | None,
+) -> int:
+    """Write a scene in blocks, of which not all can be written that can of a run."""
+    from warpnerf.exporting.blocks import OfCores, export_blocks
+
+    for name, given in (
+        ("--scene", scene is not None),
+        ("--crop", options.crop is not None),
+        ("--faces", options.faces is not None),
+        ("--texture", options.texture),
+        ("--pinhole", options.pinhole),
+    ):
+        if given:
+            raise InputError(
+                f"{name} is for the export of one run, and {blocks.folder} has {len(blocks)}; "
+                f"leave it out, or export one of them, such as {blocks.run(0).folder}."
+            )
+    how = OfCores(
+        unseen=options.unseen, level=options.level, min_size=options.min_size, fill=options.fill
+    )
+    with ProgressBar("first block") as bar:
+
+        def on_block(done: int) -> None:
+            bar.report(done / len(blocks), f"{done} of {len(blocks)} blocks")
+
+        try:
+            export_blocks(blocks, files, how, device, threads, on_block)
+        except OSError as error:
+            raise InputError(
+                f"{error.filename or files[0]} cannot be written: {error.strerror or error}; name "
+                "another place, or make room."
+            ) from error
+    for file in files:
+        print(f"wrote {file}")
     return 0
