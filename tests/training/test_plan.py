@@ -36,9 +36,10 @@ from warpnerf.scenes.scene import Scene
 from warpnerf.training import plan as planning
 from warpnerf.training import trainer as training
 from warpnerf.training.optim import adam_step
+from warpnerf.training.peers import ALONE, Peers
 from warpnerf.training.plan import TrainingPlan, resolve
 from warpnerf.training.plan_json import plan_from_json, plan_to_json
-from warpnerf.training.trainer import Trainer, no_reduction
+from warpnerf.training.trainer import Trainer
 
 
 def contracted() -> Scene:
@@ -223,6 +224,16 @@ def test_a_training_needs_room_for_its_last_grid_also_when_resumed(
             Trainer(ball(), tiny_config(), resume)
 
 
+class Adding(Peers):
+    """Another one, whose gradients a function adds."""
+
+    def __init__(self, change: Callable[[Any], None]) -> None:
+        self.change = change
+
+    def add(self, gradients: Any, parameters: Any) -> None:
+        self.change(gradients)
+
+
 def test_gradients_are_reduced_before_they_are_regularised(
     monkeypatch: pytest.MonkeyPatch, on_cpu: None
 ) -> None:
@@ -236,7 +247,7 @@ def test_gradients_are_reduced_before_they_are_regularised(
     def counted(gradients: Any) -> None:
         counts.append(float(np.abs(gradients.values.numpy()).sum()))
 
-    for name, reduce in (("kept", no_reduction), ("doubled", double)):
+    for name, peers in (("kept", ALONE), ("doubled", Adding(double))):
         found = seen[name] = []
 
         def watched(parameters: Any, states: Any, gradients: Any, *rest: Any, to: Any) -> None:
@@ -245,7 +256,7 @@ def test_gradients_are_reduced_before_they_are_regularised(
 
         monkeypatch.setattr(training, "adam_step", lambda *a, found=found: watched(*a, to=found))
         optim = wn.OptimConfig(tv_density=0.0, tv_rgb=0.0, accumulate_at=())
-        Trainer(ball(), tiny_config(optim=optim), reduce=reduce).update()
+        Trainer(ball(), tiny_config(optim=optim), peers=peers).update()
     monkeypatch.setattr(training, "adam_step", adam_step)
     for kept, doubled in zip(seen["kept"], seen["doubled"], strict=True):
         np.testing.assert_array_equal(doubled, 2.0 * kept)
@@ -255,7 +266,7 @@ def test_gradients_are_reduced_before_they_are_regularised(
     def cleared(gradients: Any) -> None:
         gradients.values.zero_()
 
-    trainer = Trainer(ball(), tiny_config(), reduce=cleared)
+    trainer = Trainer(ball(), tiny_config(), peers=Adding(cleared))
     before = trainer.storage.tensors()["values"].copy()
     trainer.storage.values.assign(  # type: ignore[attr-defined]
         np.random.default_rng(0).normal(size=trainer.storage.values.numpy().shape)  # type: ignore[attr-defined]
@@ -266,7 +277,10 @@ def test_gradients_are_reduced_before_they_are_regularised(
     np.testing.assert_array_equal(trainer.storage.tensors()["values"], given)
 
     counts: list[float] = []
-    plain, counting = Trainer(ball(), tiny_config()), Trainer(ball(), tiny_config(), reduce=counted)
+    plain, counting = (
+        Trainer(ball(), tiny_config()),
+        Trainer(ball(), tiny_config(), peers=Adding(counted)),
+    )
     for trainer in (plain, counting):
         trainer.run()
     assert len(counts) == STEPS and min(counts) > 0.0

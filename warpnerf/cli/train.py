@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from warpnerf.checks import InputError
+from warpnerf.cli import processes
 from warpnerf.cli.configured import begun_with, configured
 from warpnerf.cli.given import NOTHING, Given
 from warpnerf.cli.machine import FAILED, require_machine
@@ -22,6 +23,7 @@ from warpnerf.runs.names import new_folder
 from warpnerf.runtime.progress import ProgressBar
 from warpnerf.runtime.signals import Stopped, StopRequest
 from warpnerf.scenes.split import Split, read_split
+from warpnerf.training.peers import ALONE, PeerLostError, Peers
 
 if TYPE_CHECKING:
     from warpnerf.runs.run import Run
@@ -40,9 +42,18 @@ def train_command(options: TrainOptions, given: Annotated[Given, USUAL] = NOTHIN
     --help-all shows them all. Defaults are those of the --preset beside it.
     """
     options.require_usable()
+    if processes.are_several():
+        options.require_no_page()
+        return processes.together(lambda peers: _train_command(options, given, peers))
+    return _train_command(options, given, ALONE)
+
+
+def _train_command(options: TrainOptions, given: Given, peers: Peers) -> int:
+    """The command, in one process of those that train."""
 
     def changed(config: TrainConfig) -> TrainConfig:
-        return configured(config, given, options.model_options, options.loss)
+        config = configured(config, given, options.model_options, options.loss)
+        return config if peers.count == 1 else processes.share_of_machine(config, given)
 
     if options.resume is not None:
         for name in ("output", "preset", "config", "downscale", "split", "overwrite"):
@@ -51,7 +62,7 @@ def train_command(options: TrainOptions, given: Annotated[Given, USUAL] = NOTHIN
                     f"--{name} does not go with --resume: the run in {options.resume} continues as "
                     "it was begun; leave it out."
                 )
-        return _resume(options.resume, options, changed)
+        return _resume(options.resume, options, changed, peers)
     begin, options = _starting_point(options)
     config = begun_with(changed(begin), given)
     if options.scene is None:
@@ -60,11 +71,13 @@ def train_command(options: TrainOptions, given: Annotated[Given, USUAL] = NOTHIN
         from warpnerf.rendering.losses import parts_with
 
         parts_with(config.model, "float32", config.loss)
+    if peers.rank > 0:  # which only reads
+        return _begin_alone(options.scene, Path(), options, config, peers)
     if options.output is not None:
-        return _begin(options.scene, options.output, options, config)
+        return _begin(options.scene, options.output, options, config, peers)
     with new_folder(options.scene) as output:
         print(f"training into {output}", flush=True)
-        return _begin(options.scene, output, options, config)
+        return _begin(options.scene, output, options, config, peers)
 
 
 def _starting_point(options: TrainOptions) -> tuple[TrainConfig, TrainOptions]:
@@ -89,12 +102,14 @@ def _starting_point(options: TrainOptions) -> tuple[TrainConfig, TrainOptions]:
     return run.train, options
 
 
-def _begin(source: str, output: Path, options: TrainOptions, config: TrainConfig) -> int:
+def _begin(
+    source: str, output: Path, options: TrainOptions, config: TrainConfig, peers: Peers
+) -> int:
     """Train from the first step on."""
     _require_free(output, options.overwrite)
     with lock.only_writer(output):
         _require_free(output, options.overwrite)  # once more, now that nobody else begins there
-        return _begin_alone(source, output, options, config)
+        return _begin_alone(source, output, options, config, peers)
 
 
 def _require_free(output: Path, overwrite: bool) -> None:
@@ -109,13 +124,16 @@ def _require_free(output: Path, overwrite: bool) -> None:
         Run.require_free(output, overwrite)
 
 
-def _begin_alone(source: str, output: Path, options: TrainOptions, config: TrainConfig) -> int:
+def _begin_alone(
+    source: str, output: Path, options: TrainOptions, config: TrainConfig, peers: Peers
+) -> int:
     """Train from the first step on, as the only one that writes to the folder."""
     require_machine(config)
+    output = peers.from_first(lambda: output)
     split = None if options.split is None else read_split(options.split)
     photographs, masks = source, options.masks
     downscale = 1 if options.downscale is None else options.downscale
-    source = with_poses(photographs, output, masks, config.threads)
+    source = peers.from_first(lambda: with_poses(photographs, output, masks, config.threads))
     if source != photographs:
         masks = None  # the posed scene brings them
     scene = _read(source, downscale, masks, output, options, config.threads, split)
@@ -127,15 +145,21 @@ def _begin_alone(source: str, output: Path, options: TrainOptions, config: Train
     from warpnerf.training.coarse import prepare_trainer
     from warpnerf.training.plan import resolve
 
+    peers.require_same(lambda: processes.identity(scene, config))
     plan = resolve(scene, config)
     if plan.looks_first:
         print("estimating the extent of the scene", flush=True)
         with ProgressBar("first step") as bar:
             trainer = prepare_trainer(
-                scene, plan, on_progress=lambda found: bar.report(found.fraction, str(found))
+                scene,
+                plan,
+                on_progress=lambda found: bar.report(found.fraction, str(found)),
+                peers=peers,
             )
     else:
-        trainer = prepare_trainer(scene, plan)
+        trainer = prepare_trainer(scene, plan, peers=peers)
+    if peers.rank > 0:
+        return processes.follow(Run(output), trainer)
     trained = trainer.scene  # in which box and distance may be other ones
     _describe(trained, trainer)
     distance, near, looked = trainer.plan.content_distance, config.march.near, plan.looks_first
@@ -155,23 +179,36 @@ def _begin_alone(source: str, output: Path, options: TrainOptions, config: Train
 
 
 def _resume(
-    folder: Path, options: TrainOptions, changed: Callable[[TrainConfig], TrainConfig]
+    folder: Path,
+    options: TrainOptions,
+    changed: Callable[[TrainConfig], TrainConfig],
+    peers: Peers,
 ) -> int:
     """Train from the last checkpoint on."""
     from warpnerf.runs.run import Run
 
     Run(folder).read_config()
+    if peers.rank > 0:  # which only reads
+        return _go_on(Run(folder), options, changed, peers)
     with Run(folder).only_writer():
-        return _go_on(Run(folder), options, changed)
+        return _go_on(Run(folder), options, changed, peers)
 
 
-def _go_on(run: Run, options: TrainOptions, changed: Callable[[TrainConfig], TrainConfig]) -> int:
+def _go_on(
+    run: Run,
+    options: TrainOptions,
+    changed: Callable[[TrainConfig], TrainConfig],
+    peers: Peers,
+) -> int:
     from warpnerf.runs.scene import masks_of, path_of
     from warpnerf.training.state import MAY_GROW, raised, require_same_config
     from warpnerf.training.trainer import Trainer
 
     begun, moved = run.read_config(), options.scene
-    if run.is_unlooked_at and options.eval_views != "none":  # stopped while it was
+    # Stopped while it was looked at.
+    if peers.from_first(lambda: run.is_unlooked_at) and options.eval_views != "none":
+        if peers.rank > 0:
+            return 0
         config = changed(begun.train)
         require_same_config(begun.train, config)
         if raised(begun.train, config):
@@ -196,7 +233,10 @@ def _go_on(run: Run, options: TrainOptions, changed: Callable[[TrainConfig], Tra
     masks = options.masks or masks_of(begun, moved)
     source = path_of(begun, moved)
     scene = _read(source, begun.downscale, masks, run.folder, options, config.threads, begun.split)
-    trainer = Trainer(scene, config, state)
+    peers.require_same(lambda: processes.identity(scene, config))
+    trainer = Trainer(scene, config, state, peers=peers)
+    if peers.rank > 0:
+        return processes.follow(run, trainer)
     scene = begun.as_trained(scene)
     _describe(scene, trainer)
     for note in notes:
@@ -292,7 +332,7 @@ def _train(
         if held_out is not None:
             held_out.after_update()
 
-    with StopRequest() as stop:
+    with StopRequest(processes.patience(trainer.peers)) as stop:
         try:
             with ProgressBar("first step") as bar:
 
@@ -320,21 +360,24 @@ def _train(
                 kept = f"Step {run.last_step} is saved: warpnerf eval {run.folder} looks at it."
             print(f"warpnerf: error: {error} {kept}", file=sys.stderr)
             return FAILED
+        except PeerLostError as error:
+            return processes.saved_alone(run, trainer, error)
         except Stopped as stopped:  # asked a second time
             print(f"stopped; {run.way_on()}", flush=True)
             return stopped.exit_code
+        exit_code = processes.exit_code_of(stop, trainer)
         if trainer.fraction >= 1.0:
             run.save_field(trainer.field(), keep == "checkpoint")
             run.draw_curves(scene.name)
     if session is not None:
         session.notify("The training has ended", f"warpnerf view {run.folder} shows what it left.")
-    if log is not None and (stop.exit_code is not None or options.eval_views == "none"):
+    if log is not None and (exit_code is not None or options.eval_views == "none"):
         log.close({})
-    if stop.exit_code is not None:
+    if exit_code is not None:
         step = trainer.steps_done
         saved = f"stopped and saved after step {step}; continue with: {run.resume_command}"
         print(saved if run.last_step == step else f"stopped; {run.way_on()}", flush=True)
-        return stop.exit_code
+        return exit_code
     if options.eval_views == "none":
         print(f"wrote {run.folder}: field.safetensors, log.jsonl and config.json")
         return 0

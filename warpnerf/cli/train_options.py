@@ -93,6 +93,15 @@ class TrainOptions:
             what = f"--log {self.log}"
             require_extra({"tensorboard": "tensorboardX"}.get(self.log, self.log), self.log, what)
 
+    def require_no_page(self) -> None:
+        """Raise InputError where a page is to be served: the other processes of a training would
+        wait for whoever looks at it."""
+        if self.page is not None:
+            raise InputError(
+                "--view does not go with several processes; leave it out, and look at the run by "
+                "warpnerf view."
+            )
+
     def require_no_training(self, run: Path) -> None:
         """Raise InputError where an option is for a training, and only views are left to look at.
 

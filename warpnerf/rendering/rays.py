@@ -231,8 +231,12 @@ class PixelSampler:
         self._source.first_blocks = wp.empty(0, dtype=wp.int32, device=self._workers.device)
         self._source.covered = wp.empty(0, dtype=wp.uint8, device=self._workers.device)
 
-    def draw(self, step: int, n_steps: int = 1) -> RayBatch:
-        """The batches of some steps as one.
+    def count(self, n_steps: int = 1) -> int:
+        """Rays of the batches of some steps."""
+        return n_steps * self._n_drawn
+
+    def draw(self, step: int, n_steps: int = 1, share: tuple[int, int] = (0, 1)) -> RayBatch:
+        """The batches of some steps as one, or a share of it.
 
         What is drawn is a function of the steps, the seed, and of what ``cull_background`` was
         given. As long as that has left nothing out, a batch of several steps is made of those of
@@ -241,15 +245,19 @@ class PixelSampler:
         Args:
             step: The first.
             n_steps: How many.
+            share: (k, n): of n parts that make the batch, part k.
 
         Returns:
-            n_steps times as many rays as a step draws, in the same arrays from one call to the next
-            as long as there are as many.
+            ``count`` rays or their share, in the same arrays from one call to the next as long as
+            there are as many.
         """
-        if self._batch.count != n_steps * self._n_drawn:
-            self._batch = _room(n_steps * self._n_drawn, self._workers)
+        part, parts = share
+        n_rays = max(parts, self.count(n_steps))
+        begin, end = (n_rays * k // parts for k in (part, part + 1))
+        if self._batch.count != end - begin:
+            self._batch = _room(end - begin, self._workers)
         batch = self._batch
-        self._draw.rays_before = (step * self._n_rays) % 2**32
+        self._draw.rays_before = (step * self._n_rays + begin) % 2**32
         self._workers.launch(
             kernels.sample_pixels,
             batch.count,

@@ -6,6 +6,7 @@ import _thread
 import signal
 import sys
 import threading
+import time
 
 SIGNALS = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
@@ -37,6 +38,12 @@ def raise_when_asked() -> None:
 class StopRequest:
     """Within it, the first signal is only noted, so that an update can be finished and saved."""
 
+    def __init__(self, patience: float = 0.0) -> None:
+        """Signals within so many seconds of the first one are the same request, for processes that
+        a terminal and whoever started them both ask."""
+        self._patience = patience
+        self._asked_at = 0.0
+
     def __enter__(self) -> StopRequest:
         """Take the signals over."""
         self.exit_code: int | None = None
@@ -55,8 +62,12 @@ class StopRequest:
         return self.exit_code is not None
 
     def _note(self, number: int, frame: object) -> None:
-        self.exit_code = Stopped(number).exit_code
-        raise_when_asked()  # who asks twice does not want to wait
+        if self.exit_code is None:
+            self.exit_code, self._asked_at = Stopped(number).exit_code, time.monotonic()
+            if self._patience == 0.0:
+                raise_when_asked()  # who asks twice does not want to wait
+        elif time.monotonic() - self._asked_at >= self._patience:
+            raise Stopped(number)
 
 
 def _raise(number: int, frame: object) -> None:

@@ -31,6 +31,7 @@ from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.extent.points import ObservedExtent, observed_extent
 from warpnerf.scenes.scene import Scene, View
 from warpnerf.training.growth import require_room
+from warpnerf.training.peers import ALONE, Peers
 from warpnerf.training.plan import TrainingPlan, coarse_steps, resolve
 from warpnerf.training.state import Progress, TrainingState
 from warpnerf.training.trainer import Trainer
@@ -68,6 +69,7 @@ def prepare_trainer(
     config: TrainConfig | TrainingPlan,
     resume: TrainingState | None = None,
     on_progress: Callable[[Progress], None] | None = None,
+    peers: Peers = ALONE,
 ) -> Trainer:
     """Prepare a trainer, its scene's extent estimated first where its plan says so.
 
@@ -76,27 +78,29 @@ def prepare_trainer(
         config: How; a plan where that is resolved already.
         resume: Where to resume; what was found then is used again.
         on_progress: Called while the extent is looked for, with the share of that.
+        peers: The processes that train.
 
     Raises:
         InputError: As for ``Trainer``, and for ``extent_by_training``.
     """
     if resume is not None:
-        return Trainer(scene, config, resume)
+        return Trainer(scene, config, resume, peers=peers)
     plan = config if isinstance(config, TrainingPlan) else resolve(scene, config)
     if not plan.looks_first:
-        return Trainer(scene, plan)
+        return Trainer(scene, plan, peers=peers)
     config = plan.config
     require_room(plan, Workers(config.device, config.threads).device)
-    observed, seconds = extent_by_training(scene, plan, on_progress)
+    observed, seconds = extent_by_training(scene, plan, on_progress, peers)
     if observed is None:
         scene = replace(scene, notes=(*scene.notes, NOTHING_SEEN))
-    return Trainer(scene, config, observed=observed, seconds=seconds)
+    return Trainer(scene, config, observed=observed, seconds=seconds, peers=peers)
 
 
 def extent_by_training(
     scene: Scene,
     plan: TrainingPlan,
     on_progress: Callable[[Progress], None] | None = None,
+    peers: Peers = ALONE,
 ) -> tuple[ObservedExtent | None, float]:
     """Estimate a scene's extent, what its cameras see, by short trainings.
 
@@ -104,6 +108,7 @@ def extent_by_training(
         scene: Its box and content distance are where the first one begins.
         plan: Of the training that it is for.
         on_progress: Called with each report of these, its fraction that of all of them.
+        peers: The processes that train.
 
     Returns:
         What they see, None where too few see anything opaque; seconds of training, to which
@@ -145,7 +150,7 @@ def extent_by_training(
             if on_progress is not None:
                 on_progress(replace(progress, fraction=(done + progress.fraction) / rounds))
 
-        trainer = Trainer(scene, small, observed=observed)
+        trainer = Trainer(scene, small, observed=observed, peers=peers)
         assert isinstance(trainer.storage, DenseGrid)
         leave_out_near(trainer.storage, scene.training_cameras, config.march.near)
         seconds += trainer.run(report).seconds

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from warpnerf.fields.gradients import Gradients
 from warpnerf.fields.lattice import Lattice
 from warpnerf.fields.occupancy import FreeCells
 from warpnerf.model.sampler_kinds import Resampled
@@ -79,6 +80,12 @@ class Resampling:
         """Where the samples of a batch lie."""
         return self._proposer.intervals
 
+    @property
+    def gradients(self) -> Gradients:
+        """Of the proposal, accumulated since the last update."""
+        assert self._proposer.gradients is not None
+        return self._proposer.gradients
+
     def propose(self, free: FreeCells, batch: RayBatch, fraction: float) -> None:
         """Draw the intervals of a batch.
 
@@ -110,7 +117,5 @@ class Resampling:
             factor: On the learning rate.
             optim: The rest.
         """
-        gradients = self._proposer.gradients
-        assert gradients is not None
         parameters = self._proposal.parameters(optim)
-        adam_step(parameters, states, gradients, update, factor, optim, self._workers)
+        adam_step(parameters, states, self.gradients, update, factor, optim, self._workers)

@@ -8,10 +8,8 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-import warp as wp
 
 from warpnerf.config import TrainConfig
-from warpnerf.fields.gradients import Gradients
 from warpnerf.fields.lattice import Lattice
 from warpnerf.fields.occupancy import FreeCells
 from warpnerf.fields.parameters import Parameter, first_weights, head_parameters
@@ -37,6 +35,7 @@ from warpnerf.training.growth import (
     require_room,
 )
 from warpnerf.training.optim import adam_step, first_states
+from warpnerf.training.peers import ALONE, Peers, Signals
 from warpnerf.training.plan import TrainingPlan, resolve
 from warpnerf.training.resampling import first_proposal, grown_proposal, resampling_of
 from warpnerf.training.state import Progress, TrainingState, require_finite, scene_digest
@@ -50,15 +49,6 @@ FIRST_LOOK = 200
 so densities must have had time to show."""
 
 
-Reduce = Callable[[Gradients], None]
-"""Changes an update's gradients before they are regularised; flags are then those of all tiles that
-hold any."""
-
-
-def no_reduction(gradients: Gradients) -> None:
-    """Leave gradients as they are: one process draws all rays."""
-
-
 class Trainer:
     """A training run between two updates: the grid, its optimiser, and what comes next."""
 
@@ -70,7 +60,7 @@ class Trainer:
         *,
         observed: ObservedExtent | None = None,
         seconds: float = 0.0,
-        reduce: Reduce = no_reduction,
+        peers: Peers = ALONE,
     ) -> None:
         """Set up the first update, or the next one of a training to be resumed.
 
@@ -82,9 +72,7 @@ class Trainer:
             observed: Gives content distances in place of the scene's, and its box where the scene's
                 is a guess, for a new training; a plan has been resolved with it.
             seconds: Spent on it so far.
-            reduce: Called with the gradients of each update, once all its rays are through and
-                before total variation: where several processes train, each on rays of its own, it
-                adds theirs.
+            peers: The processes that train; each has a trainer, and draws its share of the rays.
 
         Raises:
             InputError: The device is missing, the grid would not fit the memory, or scene or
@@ -131,7 +119,7 @@ class Trainer:
         self._restarted = 0
         assert isinstance(config.model, Model)
         self.model = config.model
-        self.reduce = reduce
+        self.peers = peers
         self.free = FreeCells.none(self.workers)
         self._report_due = False
         self._started: float | None = None
@@ -167,8 +155,20 @@ class Trainer:
         Raises:
             FloatingPointError: The loss, or a value in the grid, is no longer a finite number.
         """
+        self._load_kernels()
+        self.peers.wait()
         saved_step, saved_at = self.steps_done, time.monotonic()
-        while self.fraction < 1.0 and not stop():
+        while True:
+            late = time.monotonic() - saved_at >= self.config.checkpoint_every
+            due = late and self.steps_done > saved_step
+            agreed = self.peers.agree(Signals(seconds=self._seconds, stop=stop(), save=due))
+            self._seconds = agreed.seconds
+            if agreed.save and on_checkpoint is not None:
+                on_checkpoint(self.state())
+                self.peers.wait()
+                saved_step, saved_at = self.steps_done, time.monotonic()
+            if self.fraction >= 1.0 or agreed.stop:
+                break
             self.update()
             if between is not None and self._started is not None:
                 began = time.perf_counter()
@@ -178,10 +178,6 @@ class Trainer:
                 progress = self.report()
                 if on_progress is not None:
                     on_progress(progress)
-            late = time.monotonic() - saved_at >= self.config.checkpoint_every
-            if on_checkpoint is not None and late:
-                on_checkpoint(self.state())
-                saved_step, saved_at = self.steps_done, time.monotonic()
         unsaved = self.steps_done > saved_step
         if on_checkpoint is not None and unsaved and (checkpoint_when_done or self.fraction < 1.0):
             on_checkpoint(self.state())
@@ -208,8 +204,7 @@ class Trainer:
         When due, the grid grows and free space is looked for before.
         """
         if self._started is None:  # compiling is not training
-            for kernel in self._kernels():
-                self.workers.load(kernel)
+            self._load_kernels()
         fraction = self.fraction
         self._grow(fraction)
         if self._updates % self.config.occupancy_every == 0:
@@ -217,7 +212,7 @@ class Trainer:
         before = self.steps_done
         n_steps = min(self.schedule.steps_an_update(fraction), self.config.steps - before)
         self._differentiate(self._draw(n_steps), n_steps)
-        self.reduce(self._pass.gradients)
+        self._add_gradients()
         self._regularise(fraction, n_steps)
         self._step(fraction, n_steps)
         self._report_due = self.steps_done // REPORT_EVERY > before // REPORT_EVERY
@@ -226,17 +221,24 @@ class Trainer:
         self._seconds = time.perf_counter() - self._started
 
     def _draw(self, n_steps: int) -> RayBatch:
-        """The rays of the next steps, put together."""
-        return self._sampler.draw(self.steps_done, n_steps)
+        """The rays of the next steps, put together; this process's share of them."""
+        return self._sampler.draw(self.steps_done, n_steps, (self.peers.rank, self.peers.count))
 
     def _differentiate(self, batch: RayBatch, n_steps: int) -> None:
         """Add the gradient of a batch's losses to that of the update."""
         if self._resampling is not None:
             self._resampling.propose(self.free, batch, self.fraction)
-        self._pass.run(self.free, batch, n_steps, self._seen)
+        share = self._seen * (batch.count / self._sampler.count(n_steps))
+        self._pass.run(self.free, batch, n_steps, share)
         if self._resampling is not None:
-            share = n_steps * self._seen
-            self._resampling.learn(batch, share, self._updates, self.fraction)
+            self._resampling.learn(batch, n_steps * share, self._updates, self.fraction)
+
+    def _add_gradients(self) -> None:
+        """Sum the gradients of all processes."""
+        self.peers.add(self._pass.gradients, self._of_field())
+        if self._resampling is not None and self.proposal is not None:
+            parameters = self.proposal.parameters(self.config.optim)
+            self.peers.add(self._resampling.gradients, parameters)
 
     def _regularise(self, fraction: float, n_steps: int) -> None:
         """Add the gradient of the storage's regulariser, where it has one."""
@@ -362,8 +364,9 @@ class Trainer:
             Objective(config=self.plan.losses, content_distance=self.plan.content_distance),
         )
 
-    def _kernels(self) -> list[wp.Kernel]:
-        return training_kernels(
+    def _load_kernels(self) -> None:
+        """Compile what is not yet in the cache."""
+        for kernel in training_kernels(
             self.model,
             self.lattice.contraction,
             self.config.scaling,
@@ -372,7 +375,8 @@ class Trainer:
             self.plan.losses,
             self.config.field,
             self.plan.sampler,
-        )
+        ):
+            self.workers.load(kernel)
 
     def _grow(self, fraction: float) -> None:
         """Carry field and optimiser over to more voxels, once the schedule says so."""

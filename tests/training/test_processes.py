@@ -1,0 +1,168 @@
+"""Several processes that train one scene, by torch.distributed on this machine."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import sys
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.support.cli_process import make_scene
+from tests.support.several import Ended, several
+from tests.support.tiny_trainings import STEPS, ball, tiny_config
+from tests.support.tiny_trainings import early_growth as early_growth
+from warpnerf.cli.main import main
+from warpnerf.training.peers import Peers
+from warpnerf.training.trainer import Trainer
+
+processes = pytest.importorskip("warpnerf.torch.processes")
+if sys.platform != "linux":
+    pytest.skip("processes of these tests are forks", allow_module_level=True)
+
+
+@pytest.fixture(autouse=True)
+def _forks(on_cpu: None) -> None:
+    """A GPU may not be used in forks."""
+
+
+def recorded(peers: Peers) -> list[dict[str, np.ndarray]]:
+    """From now on, the gradients of each update, summed over processes."""
+    found: list[dict[str, np.ndarray]] = []
+    add = peers.add
+
+    def adding(gradients: Any, parameters: Any) -> None:
+        add(gradients, parameters)
+        arrays = {name: array.numpy().copy() for name, array in gradients.arrays.items()}
+        arrays["weights"] = arrays["weights"].sum(axis=0)
+        found.append(arrays)
+
+    peers.add = adding  # type: ignore[method-assign]
+    return found
+
+
+def trained(peers: Peers, file: Path) -> int:
+    """Train, and write the first update's gradients and the field to a file."""
+    found = recorded(peers)
+    trainer = Trainer(ball(), tiny_config(), peers=peers)
+    progress = trainer.run()
+    fields = {f"field.{name}": array for name, array in trainer.storage.tensors().items()}
+    fields |= {"field.weights": trainer.weights.numpy()}
+    np.savez(file, **found[0], **fields, loss=progress.loss, n_updates=len(found))
+    return 0
+
+
+def test_processes_with_a_share_of_the_rays_are_one_with_all(tmp_path: Path) -> None:
+    """To rounding, which Adam blows up after the first update; and to the bit each other, and when
+    done again."""
+    alone = tmp_path / "alone.npz"
+    trained(Peers(), alone)
+    for turn in range(2):
+        done = several(
+            lambda rank, turn=turn: trained(  # type: ignore[misc]
+                processes.Processes(), tmp_path / f"{turn}{rank}.npz"
+            ),
+            tmp_path,
+        )
+        assert [ended.code for ended in done] == [0, 0], done
+    one, *others = (np.load(tmp_path / f"{turn}{rank}.npz") for turn in "01" for rank in "01")
+    for other in others:
+        assert all(np.array_equal(one[name], other[name]) for name in one.files if name != "loss")
+    with np.load(alone) as expected:
+        for name in ("values", "weights"):
+            largest = np.abs(expected[name]).max()
+            assert largest > 0.0
+            np.testing.assert_allclose(one[name], expected[name], rtol=0.0, atol=2e-6 * largest)
+        assert np.array_equal(one["touched"] != 0, expected["touched"] != 0)
+        assert int(one["n_updates"]) == int(expected["n_updates"]) == STEPS
+        assert one["field.values"].shape == expected["field.values"].shape  # it has grown alike
+        assert np.abs(one["field.values"] - expected["field.values"]).mean() < 0.05
+
+
+# --- The command --------------------------------------------------------------------------------
+
+TINY = ("--steps", "6", "--voxels", "512", "--threads", "1", "--eval-views", "none")
+
+
+def command(scene: Path, run: Path, *options: str) -> int:
+    return main(["train", str(scene), "--output", str(run), *TINY, *options])
+
+
+def sentences(ended: list[Ended]) -> list[str]:
+    """What processes said of errors, line by line."""
+    lines = [line for one in ended for line in one.err.splitlines()]
+    return [line for line in lines if line.startswith("warpnerf: ")]
+
+
+@pytest.mark.parametrize(
+    ("lost", "by"), [(1, signal.SIGKILL), (1, signal.SIGSTOP), (0, signal.SIGKILL)]
+)
+def test_a_lost_process_ends_the_others_with_a_checkpoint(
+    lost: int, by: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From which another number of processes resumes."""
+    monkeypatch.setattr(processes, "PATIENCE", timedelta(seconds=5))
+    scene, run, update = make_scene(tmp_path), tmp_path / "run", Trainer.update
+
+    def lost_after_three(trainer: Trainer) -> None:
+        if trainer._updates == 3 and trainer.peers.rank == lost:
+            os.kill(os.getpid(), by)
+        update(trainer)
+
+    def one(rank: int) -> int:
+        Trainer.update = lost_after_three  # type: ignore[method-assign]
+        return command(scene, run)
+
+    done = several(one, tmp_path, killed_after=1 - lost)
+    assert done[1 - lost].code == 1 and done[lost].code == -signal.SIGKILL, done
+    (sentence,) = sentences(done)
+    (checkpoint,) = run.glob("checkpoint-*")
+    step = int(re.findall(r"\d+", checkpoint.name)[0])
+    assert f"has ended, or hangs; continue after step {step} with: warpnerf train" in sentence
+    assert main(["train", "--resume", str(run), "--eval-views", "none"]) == 0
+    assert (run / "field.safetensors").exists()
+
+
+def test_processes_that_train_otherwise_are_refused(tmp_path: Path) -> None:
+    scene, run = make_scene(tmp_path), tmp_path / "run"
+    for options, name in ((("--seed", "1"), "configuration"), (("--downscale", "2"), "scene")):
+
+        def one(rank: int, options: tuple[str, ...] = options) -> int:
+            return command(scene, run, *(options if rank == 1 else ()))
+
+        done = several(one, tmp_path)
+        assert [ended.code for ended in done] == [2, 2], done
+        (sentence,) = sentences(done)
+        assert f"process 1 trains with another {name} than process 0" in sentence
+        assert not run.exists()
+
+
+def test_one_writes_and_prints_and_one_that_is_stopped_stops_all(tmp_path: Path) -> None:
+    scene, run, update = make_scene(tmp_path), tmp_path / "run", Trainer.update
+
+    def stopped_after_three(trainer: Trainer) -> None:
+        update(trainer)
+        if trainer._updates == 3 and trainer.peers.rank == 1:
+            for _ in range(2):  # as a terminal and torchrun both do
+                os.kill(os.getpid(), signal.SIGTERM)
+
+    def one(rank: int) -> int:
+        Trainer.update = stopped_after_three  # type: ignore[method-assign]
+        return command(scene, run)
+
+    done = several(one, tmp_path)
+    assert [ended.code for ended in done] == [143, 143], done
+    assert "stopped and saved after step" in done[0].out and not done[1].out
+
+    def resumed(rank: int) -> int:
+        return main(["train", "--resume", str(run), "--eval-views", "none"])
+
+    done = several(resumed, tmp_path)
+    assert [ended.code for ended in done] == [0, 0], done
+    assert "resuming after step" in done[0].out and not done[1].out
+    assert (run / "field.safetensors").exists() and not (run / ".lock").exists()

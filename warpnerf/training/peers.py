@@ -1,0 +1,96 @@
+"""Several processes that train one scene: what each does of an update, and what they agree on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+from warpnerf.fields.gradients import Gradients
+from warpnerf.fields.parameters import Parameter
+
+T = TypeVar("T")
+
+
+class PeerLostError(RuntimeError):
+    """Another process of a training has ended, or does not answer."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Signals:
+    """What processes agree on between two updates."""
+
+    seconds: float
+    """Of training; those of the first process count."""
+    stop: bool
+    """Whether one of them is asked to stop."""
+    save: bool
+    """Whether a checkpoint is due at the first process."""
+
+
+class Peers:
+    """The processes of a training, seen from one of them. This class is for a process alone.
+
+    All of them hold the same field, differentiate their shares of a batch, add their gradients, and
+    update alike. So they do the same things in the same order, and none needs what others have.
+    """
+
+    rank: int = 0
+    """Which one this is; 0 is the first, which alone writes and prints."""
+    count: int = 1
+    """How many there are."""
+
+    def from_first(self, make: Callable[[], T]) -> T:
+        """What a function returns in the first process, which alone calls it.
+
+        Args:
+            make: What it returns can be pickled.
+
+        Raises:
+            PeerLostError: One has ended.
+        """
+        return make()
+
+    def require_same(self, what: Callable[[], dict[str, str]]) -> None:
+        """Raise InputError, in every process, unless all have the same.
+
+        Args:
+            what: Called where there are several: values by the words for them, such as "scene".
+
+        Raises:
+            PeerLostError: One has ended.
+        """
+
+    def wait(self) -> None:
+        """Until all are here, however long they take: after set-up, or while one of them saves.
+
+        Raises:
+            PeerLostError: One has ended.
+        """
+
+    def agree(self, signals: Signals) -> Signals:
+        """What all do next.
+
+        Args:
+            signals: What this process would do.
+
+        Raises:
+            PeerLostError: One has ended, or does not come.
+        """
+        return signals
+
+    def add(self, gradients: Gradients, parameters: Sequence[Parameter]) -> None:
+        """Replace gradients by their sums over all processes, and flags by those of all tiles that
+        hold any.
+
+        Args:
+            gradients: Of an update, once all of its rays are through.
+            parameters: Whose gradients these are.
+
+        Raises:
+            PeerLostError: One has ended, or does not come.
+        """
+
+
+ALONE = Peers()
+"""One process draws all rays."""
