@@ -29,14 +29,7 @@ from warpnerf.model.sampler_kinds import (
 )
 from warpnerf.model.spaces import SPACES, SpaceKind
 from warpnerf.model.storage_kinds import DENSE, StorageKind, storage_of
-from warpnerf.optim_config import (
-    OPTIM_RATES,
-    OPTIM_VARIATION,
-    RESTARTS,
-    OptimConfig,
-    SceneKind,
-    model_rates,
-)
+from warpnerf.optim_config import OPTIM_RATES, OPTIM_VARIATION, OptimConfig, SceneKind, model_rates
 
 Scaling = Literal["none", "quadratic", "clamped"]
 Jacobian = Literal["none", "density", "paper"]
@@ -98,9 +91,8 @@ class GridConfig:
     grow_at: Literal["auto"] | tuple[float, ...] = "auto"
     """Shares of the training at which the number of nodes doubles. auto: as suits the kind of
     scene (``GROW_AT``)."""
-    shift_at_growth: float | Literal["auto"] = "auto"
-    """Taken from all raw densities at each growth, before their activation. auto: 1, as DVGO does,
-    around an object (``optim_config.RESTARTS``), else 0."""
+    shift_at_growth: float = 0.0
+    """Taken from all raw densities at each growth, before their activation; DVGO takes 1."""
     alpha_init: float = 1e-3
     """Opacity of one voxel's length before training."""
     contraction: str = "auto"
@@ -144,14 +136,10 @@ class GridConfig:
             raise InputError(
                 f"grid.grow_at must be auto or shares between 0 and 1, not {said(self.grow_at)}."
             )
-        shift = self.shift_at_growth
-        if isinstance(shift, str):
-            require_one_of("grid.shift_at_growth", shift, ("auto",))
-            shift = 0.0
-        require_at_least("grid.shift_at_growth", shift, 0.0)
-        if shift > 0.0 and not self.grow_at:
+        require_at_least("grid.shift_at_growth", self.shift_at_growth, 0.0)
+        if self.shift_at_growth > 0.0 and not self.grow_at:
             raise InputError(
-                f"grid.shift_at_growth is {shift:g}, but grid.grow_at is empty; "
+                f"grid.shift_at_growth is {self.shift_at_growth:g}, but grid.grow_at is empty; "
                 "give shares at which the grid grows, or leave shift_at_growth out."
             )
         if self.contraction != "auto":
@@ -180,18 +168,6 @@ class GridConfig:
             Shares of the training.
         """
         return GROW_AT[kind] if isinstance(self.grow_at, str) else self.grow_at
-
-    def shifts_at_growth(self, kind: SceneKind) -> float:
-        """What is taken from raw densities at each growth: ``shift_at_growth``, decided.
-
-        Args:
-            kind: object, bounded or unbounded.
-
-        Returns:
-            Of raw density.
-        """
-        given = self.shift_at_growth
-        return float(kind in RESTARTS) if isinstance(given, str) else given
 
     def nodes_after(self, grown: int, kind: SceneKind) -> int:
         """About how many voxel grid nodes there are after so many steps of growth.
@@ -426,7 +402,7 @@ class TrainConfig:
                 f"jacobian must be none with grid.contraction {space.name}, not {self.jacobian}: "
                 "it is for contractions that leave a box around the cameras as it is."
             )
-        if self.optim.restart_at_growth is True and not self.grid.grow_at:
+        if self.optim.restart_at_growth and not self.grid.grow_at:
             raise InputError(
                 "optim.restart_at_growth is true, but grid.grow_at is empty; give shares at which "
                 "the grid grows, or leave restart_at_growth out."

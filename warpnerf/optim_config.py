@@ -27,10 +27,6 @@ ACCUMULATE_AT: dict[SceneKind, tuple[float, ...]] = {
 """What ``OptimConfig.accumulate_at`` is by default. Where rays meet fewer samples, as they should
 where photographs have alpha, updates take more steps, and earlier."""
 
-RESTARTS: frozenset[SceneKind] = frozenset({"object"})
-"""Kinds of scenes around which, by default, the optimiser restarts and densities are lowered where
-the grid grows: what was dense beside a surface while the grid was coarse is forgotten."""
-
 OPTIM_RATES = ("learning_rate_density", "learning_rate_rgb")
 """Fields of ``OptimConfig`` that are rates of numbers that a field stores."""
 
@@ -56,10 +52,9 @@ class OptimConfig:
     """The same of raw colours. Models with other features have rates of their own for them."""
     decay: float = 0.07
     """What is left of the learning rates at the end of training."""
-    restart_at_growth: bool | Literal["auto"] = "auto"
+    restart_at_growth: bool = False
     """Whether the optimiser restarts where the grid grows, as DVGO's does: without moments, and
-    with the learning rates of the start, whose decay continues from there at the same pace. auto:
-    around an object (``RESTARTS``)."""
+    with the learning rates of the start, whose decay continues from there at the same pace."""
     beta1: float = 0.9
     """Decay of the first moment."""
     beta2: float = 0.99
@@ -111,18 +106,6 @@ class OptimConfig:
                 raise InputError(
                     f"optim.{name} must lie in [0, 1), not {said(getattr(self, name))}."
                 )
-
-    def restarts_at_growth(self, kind: SceneKind) -> bool:
-        """Whether the optimiser restarts where the grid grows: ``restart_at_growth``, decided.
-
-        Args:
-            kind: object, bounded or unbounded.
-
-        Returns:
-            As ``restart_at_growth``; not auto.
-        """
-        given = self.restart_at_growth
-        return kind in RESTARTS if isinstance(given, str) else given
 
     def accumulates_at(self, kind: SceneKind) -> tuple[float, ...]:
         """When gradient accumulation doubles: ``accumulate_at``, decided for a kind of scene.

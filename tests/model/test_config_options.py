@@ -239,7 +239,7 @@ def test_both_spellings_of_models_and_losses_are_one() -> None:
 def test_what_a_preset_has_and_would_do_nothing_is_left_out() -> None:
     dvgo, llff, unbounded = (PRESETS[name] for name in ("dvgo", "dvgo-llff", "dvgo-unbounded"))
     fixed = configured(dvgo, words(grid__grow_at="none"))
-    assert (fixed.grid.shift_at_growth, fixed.optim.restart_at_growth) == ("auto", "auto")
+    assert (fixed.grid.shift_at_growth, fixed.optim.restart_at_growth) == (0.0, False)
     contracted = configured(llff, words(grid__contraction="linf"))
     assert contracted.grid.planes == wn.GridConfig().planes != llff.grid.planes
     bounded = configured(unbounded, words(grid__contraction="none"))

@@ -68,16 +68,8 @@ def tiny_config(**changes: Any) -> TrainConfig:
             threads=1,
             model=SMALL,
             loss=SQUARED,
-            grid=GridConfig(
-                voxels=6000, grow_at=(0.301, 0.601), alpha_init=0.1, shift_at_growth=0.0
-            ),
-            optim=OptimConfig(
-                tv_every=3,
-                tv_density=1e-4,
-                tv_rgb=1e-4,
-                accumulate_at=(),
-                restart_at_growth=False,
-            ),
+            grid=GridConfig(voxels=6000, grow_at=(0.301, 0.601), alpha_init=0.1),
+            optim=OptimConfig(tv_every=3, tv_density=1e-4, tv_rgb=1e-4, accumulate_at=()),
         ),
         **changes,
     )

@@ -45,14 +45,6 @@ def test_auto_is_what_suits_the_kind_of_scene(kind: str) -> None:
         assert schedule.growths(fraction) == sum(at <= fraction for at in grow)
         assert schedule.steps_an_update(fraction) == 2 ** sum(at <= fraction for at in share)
     assert schedule.most_steps_an_update == 2 ** len(share)
-    of_object = kind == "object"
-    assert (schedule.restart_at_growth, schedule.shift_at_growth) == (of_object, float(of_object))
-    told = TrainConfig(
-        grid=GridConfig(shift_at_growth=0.5),
-        optim=OptimConfig(restart_at_growth=not of_object),
-    )
-    schedule = Schedule.of(told, kind)  # type: ignore[arg-type]
-    assert (schedule.restart_at_growth, schedule.shift_at_growth) == (not of_object, 0.5)
 
 
 def test_rates_decay_and_grow_with_the_root_of_the_root_of_the_steps() -> None:

@@ -20,10 +20,7 @@ class Schedule:
     decay: float
     """What is left of the learning rates at the end."""
     restart_at_growth: bool = False
-    """Whether the optimiser restarts where the grid grows, and the decay continues from the
-    learning rates of the start."""
-    shift_at_growth: float = 0.0
-    """Taken from all raw densities where the grid grows."""
+    """Whether the decay continues from the learning rates of the start where the grid grows."""
 
     def __post_init__(self) -> None:
         """Refuse shares that are none."""
@@ -42,8 +39,7 @@ class Schedule:
             grow_at=config.grid.grows_at(kind),
             accumulate_at=config.optim.accumulates_at(kind),
             decay=config.optim.decay,
-            restart_at_growth=config.optim.restarts_at_growth(kind),
-            shift_at_growth=config.grid.shifts_at_growth(kind),
+            restart_at_growth=config.optim.restart_at_growth,
         )
 
     def growths(self, fraction: float) -> int:

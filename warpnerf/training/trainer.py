@@ -386,9 +386,9 @@ class Trainer:
         config, box, nodes = self.config, self._tight_box(), self.plan.stages[grown].nodes
         # What holds the old arrays gives their memory back before more is requested.
         del self._pass, self._resampling, self.regulariser
-        before, shift = self.storage, (grown - self._grown) * self.schedule.shift_at_growth
+        before, shift = self.storage, (grown - self._grown) * config.grid.shift_at_growth
         storage = grown_storage(before, box, nodes, shift, self.workers)
-        restarts = self.schedule.restart_at_growth
+        restarts = config.optim.restart_at_growth
         if not restarts:
             of_field = self._of_field()
             self.optimiser |= grown_states(self.optimiser, of_field, before, storage, self.workers)
