@@ -78,8 +78,7 @@ def test_torch_computes_what_the_oracle_does(model, scene, scaled, grid):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("unbounded", [False, True])
-@pytest.mark.parametrize("field", ["vm", "hash"])
+@pytest.mark.parametrize(("field", "unbounded"), [("vm", False), ("hash", True)])
 def test_torch_reads_fields_as_warpnerf_does(field, unbounded):
     """Also where space is contracted; what differs does not pass."""
     scene = replace(ball(), unbounded=unbounded)

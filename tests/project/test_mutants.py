@@ -57,12 +57,12 @@ def test_each_mutant_names_tests_that_there_are(mutants: tuple) -> None:
         assert asked and asked <= known, sorted(asked - known)
 
 
-@pytest.mark.slow  # some eighty runs of pytest
+@pytest.mark.slow  # some thirty runs of pytest
 @pytest.mark.timeout(3600)
 def test_mutants_of_the_host_are_noticed() -> None:
-    """Every third; all of them by ``python tests/mutants warpnerf/``, in half an hour."""
+    """Every ninth; all of them by ``python tests/mutants warpnerf/``, in more than half an hour."""
     kernel_cache.start()
     cache = wp.config.kernel_cache_dir
-    command = [sys.executable, MUTANTS_FOLDER, "--cache", cache, "--every", "3", "warpnerf/"]
+    command = [sys.executable, MUTANTS_FOLDER, "--cache", cache, "--every", "9", "warpnerf/"]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]

@@ -41,11 +41,8 @@ from warpnerf.training.trainer import Trainer
     ("model", "threads", "unbounded"),
     [
         ("deferred", 1, False),
-        ("deferred", 3, False),
-        ("deferred", 1, True),
         ("deferred", 3, True),
         ("rgb", 3, False),
-        ("sh", 3, False),
         ("per_sample", 3, False),
     ],
 )
