@@ -203,7 +203,7 @@ def check(mutants: list[Mutant], folder: Path, jobs: int) -> Iterator[tuple[Muta
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("names", nargs="*", help="of mutants or their files, in part; none: all")
-    parser.add_argument("--every", type=int, default=1, help="only every so many-th of them")
+    parser.add_argument("--every", type=int, default=1, help="only every Nth of them")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--cache", type=Path, help="compiled kernels, kept; none: a temporary one")
     options = parser.parse_args()
