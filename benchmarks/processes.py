@@ -31,7 +31,7 @@ from warpnerf.training.peers import Peers, Signals
 from warpnerf.training.trainer import Trainer
 
 
-class Tiles(Processes):
+class Touched(Processes):
     """Counts what is exchanged."""
 
     exchanged_bytes = 0
@@ -41,15 +41,15 @@ class Tiles(Processes):
         super()._reduce(tensor, operation)
 
 
-class Dense(Tiles):
+class Dense(Touched):
     """Adds the gradients of all nodes, touched or not."""
 
-    def _add_tiles(self, values: torch.Tensor, touched: torch.Tensor) -> None:
-        self._reduce(touched, torch.distributed.ReduceOp.MAX)
-        self._reduce(values, torch.distributed.ReduceOp.SUM)
+    def _add_flags(self, flags: list[torch.Tensor]) -> None:
+        for touched in flags:
+            touched.fill_(1)
 
 
-EXCHANGES = {"tiles": Tiles, "dense": Dense}
+EXCHANGES = {"tiles": Touched, "dense": Dense}
 
 
 class Side:

@@ -241,6 +241,9 @@ def check_shell(command: str, read_command: Callable[[str], None]) -> None:
     in pyproject.toml.
     """
     words = shlex.split(command)
+    if words[0] == "torchrun":
+        words = words[words.index("-m") + 1 :]
+        command = shlex.join(words)
     if words[0] == "warpnerf":
         read_command(command)
     elif words[0] == "python":

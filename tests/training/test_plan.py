@@ -230,8 +230,8 @@ class Adding(Peers):
     def __init__(self, change: Callable[[Any], None]) -> None:
         self.change = change
 
-    def add(self, gradients: Any, parameters: Any) -> None:
-        self.change(gradients)
+    def add(self, accumulated: Any) -> None:
+        self.change(accumulated[0][0])
 
 
 def test_gradients_are_reduced_before_they_are_regularised(

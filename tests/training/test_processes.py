@@ -36,8 +36,9 @@ def recorded(peers: Peers) -> list[dict[str, np.ndarray]]:
     found: list[dict[str, np.ndarray]] = []
     add = peers.add
 
-    def adding(gradients: Any, parameters: Any) -> None:
-        add(gradients, parameters)
+    def adding(accumulated: Any) -> None:
+        add(accumulated)
+        gradients, _ = accumulated[0]
         arrays = {name: array.numpy().copy() for name, array in gradients.arrays.items()}
         arrays["weights"] = arrays["weights"].sum(axis=0)
         found.append(arrays)

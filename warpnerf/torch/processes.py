@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 import torch.distributed as dist
@@ -39,6 +39,7 @@ class Processes(Peers):
         Raises:
             InputError: They cannot be met.
         """
+        self._room: torch.Tensor | None = None
         try:
             self._store, self.rank, self.count = next(dist.rendezvous("env://", timeout=MEETING))
             dist.init_process_group(
@@ -98,46 +99,87 @@ class Processes(Peers):
         seconds, stop, save = all_of.tolist()
         return Signals(seconds=seconds, stop=bool(stop), save=bool(save))
 
-    def add(self, gradients: Gradients, parameters: Sequence[Parameter]) -> None:
-        """Sums of touched tiles and of weights; the order of summands depends on ranks alone."""
-        for parameter in parameters:
+    def add(self, accumulated: Sequence[tuple[Gradients, Parameter]]) -> None:
+        """Sums of touched tiles and of weights; the order of summands depends on ranks alone.
+
+        First all flags, then all sums: each message waits for the slowest process.
+        """
+        device = accumulated[0][0].arrays["weights"].device
+        if device.is_cuda:
+            wp.synchronize_device(device)
+        tiled: list[tuple[torch.Tensor, torch.Tensor]] = []
+        rows: list[torch.Tensor] = []
+        for gradients, parameter in accumulated:
             arrays = [gradients.arrays[name] for name in parameter.gradient]
-            cuda = arrays[0].device.is_cuda
-            if cuda:
-                wp.synchronize_device(arrays[0].device)
             tensors = [wp.to_torch(array, requires_grad=False) for array in arrays]
             if len(tensors) == 2:
-                self._add_tiles(*tensors)
+                tiled.append((tensors[0], tensors[1]))
             else:
-                self._add_rows(tensors[0])
-            if cuda:
-                torch.cuda.synchronize()
+                rows.append(tensors[0])
+        self._add_flags([touched for _, touched in tiled])
+        self._add_values([_tiles(*of) for of in tiled], rows)
+        if device.is_cuda:
+            torch.cuda.synchronize()
 
-    def _add_tiles(self, values: torch.Tensor, touched: torch.Tensor) -> None:
-        """Values [n_entries, width] of tiles that any process has flagged, and the next ones."""
-        self._reduce(touched, dist.ReduceOp.MAX)
-        holds = touched.bool()
-        holds[1:] |= touched[:-1].bool()
-        flat = values.reshape(-1)
-        tile = TILE * values.shape[1]
-        n_whole = len(flat) // tile
-        tiles, rest = flat[: n_whole * tile].view(n_whole, tile), flat[n_whole * tile :]
-        chosen = holds[:n_whole].nonzero()[:, 0]
-        sums = torch.cat([tiles[chosen].reshape(-1), rest])
-        self._reduce(sums, dist.ReduceOp.SUM)
-        tiles[chosen] = sums[: len(chosen) * tile].view(-1, tile)
-        rest.copy_(sums[len(chosen) * tile :])
+    def _add_flags(self, flags: list[torch.Tensor]) -> None:
+        """Flags that any process has set."""
+        everything = torch.cat(flags)
+        self._reduce(everything, dist.ReduceOp.MAX)
+        for own, of_all in zip(flags, everything.split([len(f) for f in flags]), strict=True):
+            own.copy_(of_all)
 
-    def _add_rows(self, rows: torch.Tensor) -> None:
-        """Rows of the threads, of which processes may have different numbers."""
-        sums = rows.sum(dim=0)
-        self._reduce(sums, dist.ReduceOp.SUM)
-        rows.zero_()
-        rows[0] = sums
+    def _add_values(self, tiled: list[Tiles], rows: list[torch.Tensor]) -> None:
+        """Values of tiles that may hold any, and weights: rows of the threads, of which processes
+        may have different numbers."""
+        pieces = [(len(t.chosen), t.tiles.shape[1]) for t in tiled]
+        sizes = [n * width for n, width in pieces] + [len(t.rest) for t in tiled]
+        sizes += [row.shape[1] for row in rows]
+        if self._room is None or len(self._room) < sum(sizes):
+            like = rows[0] if rows else tiled[0].rest
+            self._room = like.new_empty(sum(sizes) * 5 // 4)
+        message = self._room[: sum(sizes)]
+        parts = message.split(sizes)
+        n = len(tiled)
+        for t, piece, part, rest in zip(tiled, pieces, parts, parts[n:], strict=False):
+            torch.index_select(t.tiles, 0, t.chosen, out=part.view(piece))
+            rest.copy_(t.rest)
+        for row, part in zip(rows, parts[2 * n :], strict=True):
+            torch.sum(row, dim=0, out=part)
+        self._reduce(message, dist.ReduceOp.SUM)
+        for t, piece, part, rest in zip(tiled, pieces, parts, parts[n:], strict=False):
+            t.tiles.index_copy_(0, t.chosen, part.view(piece))
+            t.rest.copy_(rest)
+        for row, part in zip(rows, parts[2 * n :], strict=True):
+            row.zero_()
+            row[0] = part
 
     def _reduce(self, tensor: torch.Tensor, operation: Any) -> None:
         with _lost():
             dist.all_reduce(tensor, operation, self._devices if tensor.is_cuda else self._training)
+
+
+class Tiles(NamedTuple):
+    """The gradient of an array of entries, by tiles."""
+
+    tiles: torch.Tensor
+    """[n_tiles, numbers of a tile], those that are whole."""
+    chosen: torch.Tensor
+    """Which of them may hold any."""
+    rest: torch.Tensor
+    """What is no whole tile."""
+
+
+def _tiles(values: torch.Tensor, touched: torch.Tensor) -> Tiles:
+    """Of values [n_entries, width]; a flag stands for the next tile, too."""
+    flat, size = values.reshape(-1), TILE * values.shape[1]
+    n_whole = len(flat) // size
+    holds = touched.clone()
+    holds[1:] |= touched[:-1]
+    return Tiles(
+        tiles=flat[: n_whole * size].view(n_whole, size),
+        chosen=holds[:n_whole].nonzero()[:, 0],
+        rest=flat[n_whole * size :],
+    )
 
 
 @contextmanager

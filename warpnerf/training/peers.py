@@ -79,13 +79,13 @@ class Peers:
         """
         return signals
 
-    def add(self, gradients: Gradients, parameters: Sequence[Parameter]) -> None:
+    def add(self, accumulated: Sequence[tuple[Gradients, Parameter]]) -> None:
         """Replace gradients by their sums over all processes, and flags by those of all tiles that
         hold any.
 
         Args:
-            gradients: Of an update, once all of its rays are through.
-            parameters: Whose gradients these are.
+            accumulated: Parameters, and where their gradients of an update are, once all of its
+                rays are through.
 
         Raises:
             PeerLostError: One has ended, or does not come.

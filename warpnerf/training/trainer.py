@@ -235,10 +235,12 @@ class Trainer:
 
     def _add_gradients(self) -> None:
         """Sum the gradients of all processes."""
-        self.peers.add(self._pass.gradients, self._of_field())
+        accumulated = [(self._pass.gradients, parameter) for parameter in self._of_field()]
         if self._resampling is not None and self.proposal is not None:
+            gradients = self._resampling.gradients
             parameters = self.proposal.parameters(self.config.optim)
-            self.peers.add(self._resampling.gradients, parameters)
+            accumulated += [(gradients, parameter) for parameter in parameters]
+        self.peers.add(accumulated)
 
     def _regularise(self, fraction: float, n_steps: int) -> None:
         """Add the gradient of the storage's regulariser, where it has one."""
