@@ -41,6 +41,7 @@ def eval_command(
     """
     from warpnerf.blocks.folder import open_trained
     from warpnerf.evaluation.evaluate import evaluate, require_measurable
+    from warpnerf.runs.run import Run
     from warpnerf.runs.scene import path_of
     from warpnerf.scenes.formats.load import load_scene
 
@@ -71,7 +72,8 @@ def eval_command(
             field, views, split, lpips=distance, on_progress=bar.report, measures=measures
         )
     print(result)
-    if result.measures is not None and scene is None and masks is None and split == "test":
+    its_own = scene is None and masks is None and split == "test"
+    if result.measures is not None and its_own and isinstance(run, Run):
         run.add_measures(result.measures)
     if json is not None:
         write_json(json, result.to_json())

@@ -6,11 +6,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
-from warpnerf.rendering.field import Field
+from warpnerf.rendering.composite import AnyField
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.scene import FirstHit
 
@@ -24,7 +23,7 @@ def clearance(camera: Camera, first_hit: FirstHit) -> float:
     return float(first_hit(np.broadcast_to(camera.position, directions.shape), directions).min())
 
 
-def near_density(field: Field, cameras: Sequence[Camera], first_hit: FirstHit) -> float:
+def near_density(field: AnyField, cameras: Sequence[Camera], first_hit: FirstHit) -> float:
     """Mean optical depth from a camera to its clearance, in all directions; its true value is 0.
 
     Args:
@@ -36,8 +35,8 @@ def near_density(field: Field, cameras: Sequence[Camera], first_hit: FirstHit) -
     depths = []
     for camera in cameras:
         origins = np.broadcast_to(camera.position, directions.shape)
-        steps = replace(field.steps, far=clearance(camera, first_hit), transmittance_min=0.0)
-        seen = replace(field, steps=steps, proposal=None).render_rays(origins, directions)
+        close_by = field.up_to(clearance(camera, first_hit))
+        seen = close_by.render_rays(origins, directions)
         depths.append(float(-np.log(np.maximum(1.0 - seen.opacity, 1e-6)).mean()))
     return float(np.mean(depths))
 

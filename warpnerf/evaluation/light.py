@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from warpnerf.rendering.field import Field
+from warpnerf.rendering.composite import AnyField
 from warpnerf.rendering.rays import camera_rays
 from warpnerf.scenes.scene import Scene, View, require_split
 
@@ -16,9 +16,6 @@ FRONT, BEHIND = 0.8, 1.25
 
 MAX_RAYS = 512
 """Of a view, about; pixels of larger ones are looked at in even gaps."""
-
-GROUP = 0.01
-"""Rays are rendered together up to one distance where their own differ by less than this share."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +34,7 @@ class Light:
     """How many were looked along."""
 
 
-def measure_light(field: Field, scene: Scene, split: str) -> Light | None:
+def measure_light(field: AnyField, scene: Scene, split: str) -> Light | None:
     """Measure where the light of a split's rays is absorbed.
 
     With T(t) the light that passes up to distance t and d a ray's true depth
@@ -45,7 +42,7 @@ def measure_light(field: Field, scene: Scene, split: str) -> Light | None:
         front = 1 - T(0.8 d),  hit = T(0.8 d) - T(1.25 d),
         behind = T(1.25 d) - T(inf),  transmitted = T(inf)
 
-    over pixels whose true depth is known. A step of the ray counts where its middle lies.
+    over pixels whose true depth is known. A step that a limit cuts counts with its share.
 
     Args:
         field: A trained field.
@@ -56,7 +53,7 @@ def measure_light(field: Field, scene: Scene, split: str) -> Light | None:
         Means over rays; None where no depth is known, and in normalised device coordinates, whose
         rays are not cut at distances.
     """
-    if field.steps.in_ndc:
+    if field.in_ndc:
         return None
     views = [scene.views[index] for index in require_split(scene, split)]
     rays = [found for found in (_rays(field, view) for view in views) if found is not None]
@@ -74,7 +71,7 @@ def measure_light(field: Field, scene: Scene, split: str) -> Light | None:
 
 
 def absorbed(
-    field: Field, origins: np.ndarray, directions: np.ndarray, depths: np.ndarray
+    field: AnyField, origins: np.ndarray, directions: np.ndarray, depths: np.ndarray
 ) -> np.ndarray:
     """Shares of light that are absorbed in front, at the surface, behind, and nowhere.
 
@@ -87,37 +84,24 @@ def absorbed(
     Returns:
         [n, 4] float64; each row sums to 1.
     """
-    steps = replace(field.steps, transmittance_min=0.0)
-    whole = replace(field, steps=steps, proposal=None)  # all matter that is there
-    passing = [
-        _transmittance(whole, origins, directions, share * depths.astype(np.float64))
-        for share in (FRONT, BEHIND)
-    ]
-    end = 1.0 - whole.render_rays(origins, directions).opacity.astype(np.float64)
-    front, behind = passing
+    whole = field.up_to(math.inf)  # all matter that is there
+    near, far = (share * depths.astype(np.float64) for share in (FRONT, BEHIND))
+    front, behind, end = (
+        _transmittance(whole, origins, directions, limits)
+        for limits in (near, far, np.full(len(depths), np.inf))
+    )
     return np.stack([1.0 - front, front - behind, behind - end, end], axis=1)
 
 
 def _transmittance(
-    field: Field, origins: np.ndarray, directions: np.ndarray, distances: np.ndarray
+    field: AnyField, origins: np.ndarray, directions: np.ndarray, limits: np.ndarray
 ) -> np.ndarray:
-    """Light that passes each ray up to a distance of its own, [n] float64.
-
-    Kernels end all rays of a launch at one distance, so rays with almost the same share a launch.
-    """
-    passing = np.ones(len(distances))
-    limits = np.minimum(distances, field.steps.far)
-    groups = np.floor(np.log(limits) / GROUP)
-    order = np.argsort(groups, kind="stable")
-    for rays in np.split(order, np.flatnonzero(np.diff(groups[order])) + 1):
-        far = math.exp(float(np.log(limits[rays]).mean()))
-        if far > field.steps.near:
-            cut = replace(field, steps=replace(field.steps, far=far))
-            passing[rays] = 1.0 - cut.render_rays(origins[rays], directions[rays]).opacity
-    return passing
+    """Light that passes each ray up to a distance of its own, [n] float64."""
+    ends = np.stack([np.zeros(len(limits)), limits], axis=1)
+    return 1.0 - field.render_between(origins, directions, ends).opacity.astype(np.float64)
 
 
-def _rays(field: Field, view: View) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+def _rays(field: AnyField, view: View) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Origins, directions and true depths of some of a view's pixels whose depth is known."""
     if view.depth is None:
         return None

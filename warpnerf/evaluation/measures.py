@@ -22,7 +22,8 @@ from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.scene import Scene, View
 
 if TYPE_CHECKING:
-    from warpnerf.rendering.field import Field, Rendering
+    from warpnerf.rendering.composite import AnyField
+    from warpnerf.rendering.field import Rendering
 
 SEEN_BY = (1, 2)
 """Training views, at least, that see the surfaces of the pixels that are measured."""
@@ -155,7 +156,7 @@ def _shares(light: Light) -> list[float]:
 class Measuring:
     """Gathers measures while the views of a split are rendered."""
 
-    def __init__(self, field: Field, scene: Scene, split: str) -> None:
+    def __init__(self, field: AnyField, scene: Scene, split: str) -> None:
         """Begin.
 
         Args:
@@ -251,7 +252,7 @@ class Measuring:
         )
 
 
-def training_psnr(field: Field, scene: Scene) -> float:
+def training_psnr(field: AnyField, scene: Scene) -> float:
     """Mean PSNR of up to TRAINING_VIEWS training views, spread, dB."""
     indices = scene.splits["train"]
     found = []

@@ -139,8 +139,25 @@ class CompositeField:
         require_rays(origins, directions)
         return self._render(origins, directions)
 
-    def _render(self, origins: np.ndarray, directions: np.ndarray) -> Rendering:
-        """Composite the parts of rays.
+    def render_between(
+        self, origins: np.ndarray, directions: np.ndarray, ends: np.ndarray
+    ) -> Rendering:
+        """Render parts of rays, over black, see ``Field.render_between``.
+
+        Args:
+            origins: [n_rays, 3], scene units.
+            directions: [n_rays, 3] of unit length.
+            ends: [n_rays, 2] where each part begins and ends, scene units.
+
+        Returns:
+            rgb [n_rays, 3], depth [n_rays] and opacity [n_rays].
+        """
+        return replace(self, background=(0.0, 0.0, 0.0))._render(origins, directions, ends)
+
+    def _render(
+        self, origins: np.ndarray, directions: np.ndarray, ends: np.ndarray | None = None
+    ) -> Rendering:
+        """Composite the parts of rays, or of what of them lies between two distances.
 
         rgb = sum_j T_j rgb_j + T_end background,  T_{j+1} = T_j T of part j,
 
@@ -152,9 +169,11 @@ class CompositeField:
         at_once = max(1, CROSSINGS // max(1, len(self.cells)))
         for begin in range(0, n, at_once):
             some = slice(begin, begin + at_once)
-            for rays, number, ends in self._parts(origins[some], directions[some], light[some]):
+            within = None if ends is None else ends[some]
+            parts = self._parts(origins[some], directions[some], light[some], within)
+            for rays, number, cut in parts:
                 rays = rays + begin
-                part = self.members[number]().render_between(origins[rays], directions[rays], ends)
+                part = self.members[number]().render_between(origins[rays], directions[rays], cut)
                 rgb[rays] += light[rays, None] * part.rgb
                 depth[rays] += light[rays] * part.depth
                 light[rays] *= 1.0 - part.opacity
@@ -162,7 +181,11 @@ class CompositeField:
         return Rendering(rgb=rgb.clip(0.0, 1.0), depth=depth, opacity=1.0 - light)
 
     def _parts(
-        self, origins: np.ndarray, directions: np.ndarray, light: np.ndarray
+        self,
+        origins: np.ndarray,
+        directions: np.ndarray,
+        light: np.ndarray,
+        within: np.ndarray | None,
     ) -> Iterator[tuple[np.ndarray, int, np.ndarray]]:
         """Parts of rays in cells, those nearer to where a ray begins first.
 
@@ -170,12 +193,15 @@ class CompositeField:
             origins: [n, 3]
             directions: [n, 3]
             light: [n] that passes all parts that were given so far; rays without end there.
+            within: [n, 2] distances between which they lie; None: the whole rays.
 
         Yields:
             Indices [m] of rays, the number of a cell, and their ends there, [m, 2] scene units.
         """
         enter, leave = crossings(self.cells, origins, directions)
         enter = np.maximum(enter, self.near)
+        if within is not None:
+            enter, leave = np.maximum(enter, within[:, 0]), np.minimum(leave, within[:, 1])
         enter[enter >= leave] = np.inf
         order = np.argsort(enter, axis=0, kind="stable")
         for number in range(len(self.cells)):

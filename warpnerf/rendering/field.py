@@ -204,7 +204,8 @@ class Field:
         Returns:
             A field with the same storage.
         """
-        steps = replace(self.steps, far=distance, transmittance_min=0.0)
+        far = min(distance, self.steps.far)
+        steps = replace(self.steps, far=far, transmittance_min=0.0)
         return replace(self, steps=steps, proposal=None)
 
     def _array(self, values: np.ndarray, dtype: type) -> wp.array:
