@@ -277,7 +277,7 @@ def trained(monkeypatch: pytest.MonkeyPatch, *line: str | Path) -> tuple[Any, ..
     whether it replaces a run, and its page."""
     begun: list[tuple[Any, ...]] = []
 
-    def begin(source: str, output: Path, options: Any, config: wn.TrainConfig) -> int:
+    def begin(source: str, output: Path, options: Any, config: wn.TrainConfig, _: Any) -> int:
         downscale = 1 if options.downscale is None else options.downscale
         scene = source, output, downscale, options.masks, options.images
         begun.append((*scene, config, options.overwrite, options.page))
