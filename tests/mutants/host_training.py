@@ -100,7 +100,7 @@ MUTANTS = [
             "Objective(config=self.plan.losses, content_distance=self.plan.content_distance)",
             "Objective(content_distance=self.plan.content_distance)", LOSSES),
     of_host("all rays count as drawn", TRAINER,
-            "self._pass.run(self.free, batch, n_steps, self._seen)",
+            "self._pass.run(self.free, batch, n_steps, share)",
             "self._pass.run(self.free, batch, n_steps)", EMPTY),
     of_host("nothing is free", TRAINER, "self._pass.run(self.free, batch",
             "self._pass.run(FreeCells.none(self.workers), batch", EMPTY),
