@@ -55,6 +55,7 @@ FORGED = "runs/test_checkpoint.py::test_a_forged_training_is_refused"
 SAYS = "training/test_plan.py::test_it_says_what_is_trained"
 WAITS = "training/test_plan.py::test_a_plan_that_waits_for_a_short_training_is_refused"
 GOES_BY = "training/test_plan.py::test_a_resumed_training_goes_by_the_plan_that_it_began_with"
+PROCESSES = "training/test_processes.py::test_processes_with_a_share_of_the_rays_are_one_with_all"
 REDUCED = "training/test_plan.py::test_gradients_are_reduced_before_they_are_regularised"
 WITHOUT_PLAN = (
     "runs/test_old_checkpoints.py::test_a_training_without_a_plan_goes_on_as_it_would_have"
@@ -100,16 +101,16 @@ MUTANTS = [
             "Objective(config=self.plan.losses, content_distance=self.plan.content_distance)",
             "Objective(content_distance=self.plan.content_distance)", LOSSES),
     of_host("all rays count as drawn", TRAINER,
-            "self._pass.run(self.free, batch, n_steps, self._seen)",
+            "self._pass.run(self.free, batch, n_steps, share)",
             "self._pass.run(self.free, batch, n_steps)", EMPTY),
     of_host("nothing is free", TRAINER, "self._pass.run(self.free, batch",
             "self._pass.run(FreeCells.none(self.workers), batch", EMPTY),
     of_host("steps count as one", TRAINER, "self._pass.run(self.free, batch, n_steps, ",
             "self._pass.run(self.free, batch, 1, ", SHARED),
-    of_host("one step's rays", TRAINER, "self._sampler.draw(self.steps_done, n_steps)",
-            "self._sampler.draw(self.steps_done)", SHARED),
-    of_host("the same batch again", TRAINER, "self._sampler.draw(self.steps_done, n_steps)",
-            "self._sampler.draw(0, n_steps)", SHARED),
+    of_host("one step's rays", TRAINER, "self._sampler.draw(self.steps_done, n_steps, (",
+            "self._sampler.draw(self.steps_done, 1, (", SHARED),
+    of_host("the same batch again", TRAINER, "self._sampler.draw(self.steps_done, n_steps, (",
+            "self._sampler.draw(0, n_steps, (", SHARED),
     of_host("another seed", TRAINER, "config.seed,\n            self.workers,\n        )\n        self.schedule",
             "0,\n            self.workers,\n        )\n        self.schedule",
             SEED),
@@ -140,8 +141,8 @@ MUTANTS = [
     of_host("the box stays", GROWN, "return box_min + occupied[0] * edges, box_min + occupied[1] * edges",
             "return box_min, box_max", GROWS),
     of_host("time does not count", TRAINER, "done = max(done, self._seconds / self.config.time_limit)", "pass", SECONDS),
-    of_host("checkpoints at the end only", TRAINER, "if on_checkpoint is not None and late:",
-            "if on_checkpoint is None and late:", SAVED),
+    of_host("checkpoints at the end only", TRAINER, "if agreed.save and on_checkpoint is not None:",
+            "if agreed.save and on_checkpoint is None:", SAVED),
     of_host("resumes in the state's arrays", TRAINER, "        state = state.copied_to(self.workers.device)\n", "",
             RESUMED),
     of_host("opacity of objects", PLANNED, "plan.kind == \"object\" and plan.losses.opacity != 0.0",
@@ -208,7 +209,12 @@ MUTANTS = [
             WAITS),
     of_host("what is auto is decided again", TRAINER, "plan = resume.plan_of(scene, asked)",
             "plan = resolve(scene, asked, looked=True)", GOES_BY),
-    of_host("gradients are not reduced", TRAINER, "        self.reduce(self._pass.gradients)\n", "", REDUCED),
+    of_host("gradients are not reduced", TRAINER, "        self._add_gradients()\n", "", REDUCED),
+    of_host("all processes draw the same rays", RAYS, "self._n_rays + begin)", "self._n_rays)", PROCESSES),
+    of_host("a flag stands for its tile alone", "torch/processes.py",
+            "    holds[1:] |= touched[:-1]\n", "", PROCESSES),
+    of_host("each process's mean is over its own rays", TRAINER,
+            "self._seen * (batch.count / self._sampler.count(n_steps))", "self._seen", PROCESSES),
     of_host("an older reach is the distance", PLANNED, "one, distances, self.reach)", "one, distances, one)", WITHOUT_PLAN),
     of_host("older distances are forgotten", PLANNED, "list(self.content_distances or [one] * n_views)",
             "[one] * n_views", OLDER_DISTANCES),

@@ -141,6 +141,11 @@ def test_processes_that_train_otherwise_are_refused(tmp_path: Path) -> None:
         (sentence,) = sentences(done)
         assert f"process 1 trains with another {name} than process 0" in sentence
         assert not run.exists()
+    (run / "of_others").mkdir(parents=True)  # only the first process looks there
+    done = several(lambda rank: command(scene, run), tmp_path)
+    assert done[0].code == 2 and done[1].code == 1, done
+    (sentence,) = sentences(done)
+    assert "holds other files; name a new folder" in sentence
 
 
 def test_one_writes_and_prints_and_one_that_is_stopped_stops_all(tmp_path: Path) -> None:

@@ -62,7 +62,7 @@ def together(train: Callable[[Peers], int]) -> int:
             raise
         return BAD_INPUT
     except PeerLostError as error:  # before the first update
-        return _told(peers, str(error))
+        return _told(str(error)) if peers.is_first_to_fail() else FAILED
 
 
 def share_of_machine(config: TrainConfig, given: Given) -> TrainConfig:
@@ -134,9 +134,9 @@ def _ended(run: Run, trainer: Trainer, error: PeerLostError) -> int:
             run.save_checkpoint(trainer.state())
     except FloatingPointError:
         pass  # nothing to resume from; the checkpoint before stays
-    return _told(trainer.peers, f"{str(error).rstrip('.')}; {run.way_on()}.")
+    return _told(f"{str(error).rstrip('.')}; {run.way_on()}.")
 
 
-def _told(peers: Peers, sentence: str) -> int:
+def _told(sentence: str) -> int:
     print(f"warpnerf: error: {sentence}", file=sys.stderr, flush=True)
     return FAILED

@@ -63,7 +63,10 @@ class Processes(Peers):
 
     def is_first_to_fail(self) -> bool:
         """Whether no process has called this before: of one error, one tells."""
-        return int(self._store.add("failed", 1)) == 1
+        try:
+            return int(self._store.add("failed", 1)) == 1
+        except RuntimeError:  # the first process keeps it, and has ended
+            return False
 
     def from_first(self, make: Callable[[], T]) -> T:
         """By a broadcast; the others wait for as long as it takes."""
