@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
-from warpnerf.fields.gradients import Gradients
-from warpnerf.fields.parameters import Parameter
+if TYPE_CHECKING:
+    from warpnerf.fields.gradients import Gradients
+    from warpnerf.fields.parameters import Parameter
 
 T = TypeVar("T")
 
