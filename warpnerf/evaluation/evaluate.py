@@ -12,7 +12,6 @@ import numpy as np
 
 from warpnerf.checked import checked_arguments
 from warpnerf.checks import InputError
-from warpnerf.evaluation.measures import Measures, Measuring
 from warpnerf.evaluation.metrics import (
     SSIM_WINDOW,
     alike_where_masked,
@@ -32,6 +31,7 @@ from warpnerf.runtime.terminal import table_text
 from warpnerf.scenes.scene import Scene, View, require_split
 
 if TYPE_CHECKING:
+    from warpnerf.evaluation.measures import Measures
     from warpnerf.rendering.composite import CompositeField
     from warpnerf.rendering.field import Field, Rendering
 
@@ -172,7 +172,11 @@ def evaluate(
     images = []
     within = NEAR_SHARE * scene.content_distance
     views = [scene.views[index] for index in require_split(scene, split)]
-    measuring = Measuring(field, scene, split) if measures else None
+    measuring = None
+    if measures:  # loads Warp
+        from warpnerf.evaluation.measures import Measuring
+
+        measuring = Measuring(field, scene, split)
     for number, view in enumerate(views, 1):
         rendering = field.render(view.camera)
         target = truth(view, field.background)
