@@ -23,6 +23,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import blocks
 import factors
 import hashed
 import heads
@@ -55,6 +56,7 @@ MUTANTS = (
     *schedule.MUTANTS,
     *hashed.MUTANTS,
     *heads.MUTANTS,
+    *blocks.MUTANTS,
     *factors.MUTANTS,
     *losses.MUTANTS,
     *ndc.MUTANTS,

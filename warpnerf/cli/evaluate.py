@@ -26,7 +26,7 @@ def eval_command(
     """Measure a trained run on a split of its scene, or of other photographs of the same place.
 
     Args:
-        folder: Output folder of a training run.
+        folder: Output folder of a training run, or of blocks.
         scene: Other photographs in the same coordinates, reduced as those of the training were.
         masks: Folder of masks for these photographs; without --scene by default as for training.
         split: Which views.

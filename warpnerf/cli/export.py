@@ -63,7 +63,7 @@ def export_command(
     transforms.json and COLMAP text, and points.
 
     Args:
-        folder: Output folder of a training run.
+        folder: Output folder of a training run, or of blocks.
         files: Where to write; a file is replaced, a folder has to be new. Several take little
             longer than one, and either all are written or none is.
         options: What, and how.

@@ -121,7 +121,7 @@ def render_command(
     """Render a trained run, along a path or from photographs: colour, depth, opacity, normals.
 
     Args:
-        folder: Output folder of a training run.
+        folder: Output folder of a training run, or of blocks.
         options: What, and how.
         scene: Where the run's photographs are now, if they have moved.
         device: cpu, cuda, cuda:1, ...

@@ -33,7 +33,7 @@ def view_command(
     """Look at a trained run, or at two beside each other, in a page of the browser.
 
     Args:
-        folder: Output folder of a training run.
+        folder: Output folder of a training run, or of blocks.
         other: Of another run in the same coordinates, shown beside it.
         scene: Where the run's photographs are now, if they have moved.
         host: Name or address of this machine to listen at; 0.0.0.0 lets other machines in, whoever
