@@ -114,7 +114,8 @@ def until(what: Callable[[], bool], process: subprocess.Popen[str]) -> None:
         time.sleep(0.05)
 
 
-def test_a_lost_block_is_taken_over_and_ctrl_c_saves_it(tmp_path: Path) -> None:
+def test_a_lost_block_is_taken_over_and_a_signal_to_all_saves_it(tmp_path: Path) -> None:
+    """As a scheduler stops a job: the training gets the signal twice, once from its parent."""
     blocks = BlockFolder.read(cut(tmp_path / "room"))
     endless = ("--steps", "1000000", "--checkpoint-every", "0.3", *OPTIONS)
     one = ("--only", "0", "--threads", "1")
@@ -126,9 +127,10 @@ def test_a_lost_block_is_taken_over_and_ctrl_c_saves_it(tmp_path: Path) -> None:
     os.kill(killed, signal.SIGKILL)
     until(lambda: "resuming after step" in (blocks.folder / "block-0.log").read_text(), process)
     until(lambda: (run_of_first.last_step or 0) > lost_at, process)
-    process.send_signal(signal.SIGINT)
+    os.kill(int(lock.read_text()), signal.SIGTERM)
+    process.send_signal(signal.SIGTERM)
     out, err = process.communicate(timeout=cli_process.LIMIT)
-    assert process.returncode == 130, (out, err)
+    assert process.returncode == 143, (out, err)
     assert "block-0 was lost; it is taken over" in out and "block-0 resumes" in out
     assert "continue with: warpnerf train-blocks" in out and not lock.exists()
     said = (blocks.folder / "block-0.log").read_text()

@@ -15,6 +15,7 @@ from warpnerf.cli.given import Given
 from warpnerf.cli.machine import FAILED
 from warpnerf.config import TrainConfig
 from warpnerf.config_json import config_to_json
+from warpnerf.runtime.child import is_child
 from warpnerf.runtime.memory import usable_cores
 from warpnerf.runtime.signals import Stopped, StopRequest
 
@@ -28,7 +29,8 @@ BAD_INPUT = 2
 STOPPED = 143
 """What a process exits with that stops because another one was told to: as after SIGTERM."""
 PATIENCE = 5.0
-"""Seconds in which a terminal and torchrun both pass on one Ctrl-C."""
+"""Seconds in which a terminal or scheduler, and whoever started this process, both pass on one
+request."""
 
 
 def are_several() -> bool:
@@ -85,7 +87,7 @@ def identity(scene: Scene, config: TrainConfig) -> dict[str, str]:
 
 def patience(peers: Peers) -> float:
     """For how many seconds further signals are no second request to stop."""
-    return 0.0 if peers.count == 1 else PATIENCE
+    return PATIENCE if peers.count > 1 or is_child() else 0.0
 
 
 def exit_code_of(stop: StopRequest, trainer: Trainer) -> int | None:

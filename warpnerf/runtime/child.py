@@ -13,6 +13,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+IS_CHILD = "WARPNERF_CHILD"
+"""Environment variable that is set in such processes."""
+
 DEATH_SIGNAL = 1
 """``PR_SET_PDEATHSIG`` of Linux: what a process is sent when its parent has ended."""
 
@@ -38,7 +41,14 @@ def start(arguments: Sequence[str], log: Path) -> subprocess.Popen[bytes]:
             stdout=file,
             stderr=subprocess.STDOUT,
             start_new_session=True,
+            env={**os.environ, IS_CHILD: "1"},
         )
+
+
+def is_child() -> bool:
+    """Whether this process was started so: who stops all processes, and the parent which passes
+    that on, both send it a signal."""
+    return IS_CHILD in os.environ
 
 
 def _become(parent: int, arguments: Sequence[str]) -> None:
