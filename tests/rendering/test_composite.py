@@ -11,7 +11,7 @@ from tests.support.tiny_fields import tiny_field
 from tests.support.tiny_scenes import camera_at, look_at
 from warpnerf.rendering import render
 from warpnerf.rendering.composite import CompositeField, crossings
-from warpnerf.rendering.field import Field
+from warpnerf.rendering.field import Field, Rendering
 
 INF = np.inf
 CELLS = np.array(
@@ -51,8 +51,15 @@ def test_copies_of_a_field_are_the_field(packed: bool, monkeypatch: pytest.Monke
             render, "variant_of", lambda *a, **k: whole_variant(*a, **{**k, "packed": False})
         )
     field = whole_field(contraction="linf")
+    together = composite_of([field] * 4)
     camera = camera_at(look_at((2.0, 1.1, 0.7), (0.1, 0.0, 0.2)), width=24, height=18, fx=20.0)
-    expected, found = field.render(camera), composite_of([field] * 4).render(camera)
+    away = camera_at(look_at((20.0, 11.0, 7.0), (0.1, 0.0, 0.2)), width=24, height=18, fx=100.0)
+    require_same(together.render(camera), field.render(camera))
+    require_same(together.render(away), field.render(away))  # its far lies in what it sees
+    require_same(together.up_to(23.4).render(away), field.up_to(23.4).render(away))
+
+
+def require_same(found: Rendering, expected: Rendering) -> None:
     assert 0.2 < expected.opacity.mean() < 0.95
     np.testing.assert_allclose(found.rgb, expected.rgb, atol=2e-6)
     np.testing.assert_allclose(found.opacity, expected.opacity, atol=2e-6)

@@ -45,6 +45,8 @@ class CompositeField:
     """The device that all are on."""
     near: float = 0.0
     """Nothing is seen that is nearer, scene units."""
+    far: float = np.inf
+    """Nothing is seen at or beyond it, scene units; nor what a field's own steps do not reach."""
 
     @property
     def in_ndc(self) -> bool:
@@ -96,8 +98,9 @@ class CompositeField:
         Returns:
             The same fields, nearer than that.
         """
-        members = [partial(_up_to, member, distance) for member in self.members]
-        return replace(self, members=members, transmittance_min=0.0)
+        members = [partial(_marched, member) for member in self.members]
+        far = min(self.far, distance)
+        return replace(self, members=members, far=far, transmittance_min=0.0)
 
     @checked_arguments
     def render(self, camera: Camera) -> Rendering:
@@ -199,7 +202,7 @@ class CompositeField:
             Indices [m] of rays, the number of a cell, and their ends there, [m, 2] scene units.
         """
         enter, leave = crossings(self.cells, origins, directions)
-        enter = np.maximum(enter, self.near)
+        enter, leave = np.maximum(enter, self.near), np.minimum(leave, self.far)
         if within is not None:
             enter, leave = np.maximum(enter, within[:, 0]), np.minimum(leave, within[:, 1])
         enter[enter >= leave] = np.inf
@@ -251,5 +254,6 @@ def crossings(
     return enter, leave
 
 
-def _up_to(member: Member, distance: float) -> Field:
-    return member().up_to(distance)
+def _marched(member: Member) -> Field:
+    """All matter that a field holds, as ``Field.up_to`` has it."""
+    return member().up_to(np.inf)

@@ -222,9 +222,6 @@ class Field:
         """Look along rays from some places, [n, 3]; all the way, or between ends, [n_rays] vec2."""
         reach = reach_of_places(self.lattice.box_min, self.lattice.box_max, places)
         steps = self.steps.reaching(reach)
-        if ends is not None:  # from farther away a part is seen as far behind its box
-            further = (steps.n_linear - self.steps.n_linear) * steps.step
-            steps = replace(steps, far=steps.far + further)
         if self.proposal is None:
             walked = steps if ends is None else ClippedSteps(steps=steps, ends=ends)
             return self._walk(walked, origins, directions)
