@@ -32,7 +32,7 @@ from warpnerf.runs.run import Run
 from warpnerf.runtime.memory import available_memory
 from warpnerf.scenes.files import exists, read_json
 from warpnerf.scenes.formats.load import BUILTIN
-from warpnerf.scenes.formats.part import ENDING, Part, Triple
+from warpnerf.scenes.formats.part import ENDING, Part, Triple, read_part
 from warpnerf.scenes.scene import Scene
 from warpnerf.scenes.split import Split
 from warpnerf.writing import StagedWrites
@@ -122,6 +122,32 @@ class BlockFolder:
         cores = np.array([[block.core_min, block.core_max] for block in self.config.blocks])
         return np.where(cores == root, np.array([[-np.inf] * 3, [np.inf] * 3]), cores)
 
+    def require_own_runs(self, numbers: Sequence[int]) -> None:
+        """Refuse blocks whose folder has results of another scene, such as of another cut.
+
+        Args:
+            numbers: Of the blocks; those that have no results yet are left alone.
+
+        Raises:
+            InputError: A run is of another scene, or cannot be read.
+        """
+        for number in numbers:
+            if self.run(number).results:
+                self._own_config(number)
+
+    def _own_config(self, number: int) -> RunConfig:
+        """The configuration of a block's run; InputError where the run is of another scene."""
+        run, path = self.run(number), self.part(number)
+        config, part = run.read_config(), read_part(path)
+        trained = (config.box_min, config.box_max, config.downscale, len(config.pictures or ()))
+        cut = (part.box_min, part.box_max, self.config.downscale, len({*part.photographs}))
+        if trained != cut:
+            raise InputError(
+                f"{run.folder} holds a run of another scene than {path.name}: its box, downscale "
+                "or photographs are others; move it away, and train the block again."
+            )
+        return config
+
     def run_config(self, number: int) -> RunConfig:
         """The configuration of a block's run.
 
@@ -135,12 +161,7 @@ class BlockFolder:
                 f"{self.folder}: {name} {done}, and a scene is shown whole; run warpnerf "
                 f"train-blocks {self.folder} until all blocks are there."
             )
-        config = run.read_config()
-        if Path(config.scene).name != self.part(number).name:
-            raise InputError(
-                f"{run.folder} holds a run of {config.scene}, not of {self.part(number).name}; "
-                "move it away, and train the block again."
-            )
+        config = self._own_config(number)
         if config.train.grid.contraction == "ndc":
             raise InputError(
                 f"{run.folder} was trained in normalised device coordinates, in which blocks have "

@@ -124,11 +124,11 @@ def work_of(blocks: BlockFolder, number: int, options: Sequence[str], threads: i
         threads: CPU threads.
     """
     run, config = blocks.run(number), blocks.config
-    folder = run.folder.absolute()
+    folder, part = run.folder.absolute(), str(blocks.part(number).absolute())
     if run.checkpoints:
-        words = ["train", "--resume", str(folder), "--eval-views", "none"]
+        words = ["train", part, "--resume", str(folder), "--eval-views", "none"]
     else:
-        words = ["train", str(blocks.part(number).absolute()), "--output", str(folder)]
+        words = ["train", part, "--output", str(folder)]
         words += ["--downscale", str(config.downscale), "--grid.box", "scene"]
         words += [] if config.masks is None else ["--masks", config.masks]
         given = {word.partition("=")[0] for word in options}
@@ -216,7 +216,7 @@ class BlockTraining:
                 self._running[number] = self._engine.start(work)
             except OSError as error:
                 raise cannot_write(str(work.log), error) from error
-            resumed = work.arguments[1] == "--resume"
+            resumed = "--resume" in work.arguments
             say(f"{self._blocks.name(number)} {'resumes' if resumed else 'begins'}")
 
     def _look(self, say: Callable[[str], None]) -> None:

@@ -124,10 +124,11 @@ def train_blocks_command(
             require_whole(name, value, 1)
     if threads is not None and engine == "local":
         require_threads(threads)
+    numbers = range(len(blocks)) if only is None else [only]
+    blocks.require_own_runs(numbers)
     options = options_of(blocks, _words(train_options))
     where = _engine(engine, address, workers, threads)
     try:
-        numbers = range(len(blocks)) if only is None else [only]
         training = BlockTraining(blocks, numbers, options, where)
         with _Board() as board:
             code = training.run(board.say, board.show)

@@ -80,7 +80,7 @@ def export_blocks(
     for number, config in enumerate(configs):
         run, entry = blocks.run(number), blocks.config.blocks[number]
         field, _ = run.load_field(device, threads)
-        part = load_run_scene(config, threads=threads)
+        part = load_run_scene(config, str(blocks.part(number)), threads)
         views = [part.views[index] for index in part.splits["train"]]
         seen = cached_visibility(field, views, run.visibility_file, None)
         ups.append(up_direction(part.training_cameras))

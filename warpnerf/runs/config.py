@@ -68,6 +68,10 @@ class RunConfig(TrainedScene, frozen=True, kw_only=True):
     """What was requested."""
     keep: Keep = "field"
     """What is kept of the training once it has finished: its field alone, or checkpoints too."""
+    box_min: tuple[float, float, float] | None = None
+    """Lower corner of the scene's box as trained on, scene units."""
+    box_max: tuple[float, float, float] | None = None
+    """Upper corner."""
 
 
 def pictures_of(scene: Scene) -> list[str]:
