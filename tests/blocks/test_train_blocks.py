@@ -9,6 +9,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,12 @@ import trimesh
 from tests.support import cli_process
 from tests.support.solid_fields import ball_field
 from tests.support.tiny_runs import run, start
-from warpnerf.blocks.folder import BlockFolder
+from warpnerf.blocks import train
+from warpnerf.blocks.cut import cut as cut_scene
+from warpnerf.blocks.engines import Work
+from warpnerf.blocks.folder import BlockFolder, stored_source, write_blocks
+from warpnerf.blocks.train import BlockTraining
+from warpnerf.checks import InputError
 from warpnerf.rendering.composite import CompositeField
 from warpnerf.runs.checkpoint import save_field
 from warpnerf.scenes.formats.load import load_scene
@@ -107,7 +113,64 @@ def test_what_is_no_scene_in_blocks_is_refused(trained: Path, tmp_path: Path) ->
     for command in ("eval", "train-blocks"):
         assert "block-1 holds a run of another scene" in refused(command, other)
     assert "--nonsense" in refused("train-blocks", cut(tmp_path / "new"), "--", "--nonsense", "1")
-    assert not (tmp_path / "new/block-0").exists()
+    assert not (tmp_path / "new/block-0").exists() and not (tmp_path / "new/train.json").exists()
+
+
+class Scripted:
+    """An engine whose trainings end at once with the given codes, by block; 0 with a field."""
+
+    slots, threads = 1, 1
+
+    def __init__(self, folder: Path, codes: dict[str, int], on_start: Callable[[str], None]):
+        self.folder, self.codes, self.on_start = folder, codes, on_start
+
+    def start(self, work: Work) -> int:
+        name = work.log.stem
+        self.on_start(name)
+        work.log.write_text(f"warpnerf: error: {name} has no photograph.\n")
+        code = self.codes.get(name, 0)
+        if name not in self.codes:
+            (self.folder / name).mkdir(exist_ok=True)
+            for file in ("config.json", "field.safetensors"):
+                (self.folder / name / file).touch()
+        return code
+
+    def ended(self, started: int) -> int:
+        return started
+
+    def stop(self, started: object) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+
+def test_a_block_that_cannot_be_trained_stops_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And one that another process still saves is waited for; the first of all may be refused."""
+    monkeypatch.setattr(train, "AGAIN", 0.0)
+    scene = load_scene(ROOM[0], downscale=8)
+    source = stored_source(ROOM[0], 8, None, None)
+    blocks = write_blocks(tmp_path / "room", scene, source, cut_scene(scene, 5))
+    begun: list[str] = []
+
+    def on_start(name: str) -> None:
+        begun.append(name)
+        if name == "block-3":
+            saving.close()
+
+    codes = {"block-2": 2, "block-3": 0}  # is refused; ends without a field
+    engine = Scripted(blocks.folder, codes, on_start)
+    with pytest.raises(InputError, match="block-2: block-2 has no photograph"):
+        BlockTraining(blocks, [2, 4], [], engine).run(lambda line: None, lambda states: None)
+    begun.clear()
+    with ExitStack() as saving:
+        saving.enter_context(blocks.run(0).only_writer())
+        training = BlockTraining(blocks, range(5), [], engine)
+        assert training.run(lambda line: None, lambda states: None) == 1
+    assert begun == [f"block-{n}" for n in (1, 2, 3, 0, 4)]
+    assert [state.state for state in training.states()] == ["done"] * 2 + ["failed"] * 2 + ["done"]
 
 
 def until(what: Callable[[], bool], process: subprocess.Popen[str]) -> None:

@@ -107,6 +107,11 @@ class BlockFolder:
         """The run of a block."""
         return Run(self.folder / self.name(number))
 
+    @property
+    def begun(self) -> list[int]:
+        """Blocks whose training has begun, whether or not it has saved anything yet."""
+        return [n for n in range(len(self)) if exists(self.run(n).folder / "config.json")]
+
     def is_finished(self, number: int) -> bool:
         """Whether the field of a block is there."""
         return exists(self.run(number).folder / "field.safetensors")

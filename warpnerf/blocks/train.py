@@ -16,6 +16,7 @@ import msgspec
 from warpnerf.blocks.engines import Engine, Work
 from warpnerf.blocks.folder import OPTIONS, BlockFolder
 from warpnerf.checks import InputError, cannot_write
+from warpnerf.runs import lock
 from warpnerf.runs.listing import last_report
 from warpnerf.runtime.signals import StopRequest
 from warpnerf.scenes.files import exists, read_json
@@ -100,7 +101,7 @@ def options_of(blocks: BlockFolder, given: Sequence[str]) -> list[str]:
     before = read_json(path, StoredOptions).options if exists(path) else None
     if before is not None and (not given or list(given) == before):
         return before
-    begun = [n for n in range(len(blocks)) if exists(blocks.run(n).folder / "config.json")]
+    begun = blocks.begun
     if begun and before is not None:
         said = shlex.join(before) or "no options"
         raise InputError(
@@ -160,6 +161,7 @@ class BlockTraining:
         self._tries: Counter[int] = Counter()
         self._reached: dict[int, int] = {}
         self._not_before: dict[int, float] = {}
+        self._waited_for: set[int] = set()
         self.failed: dict[int, str] = {}
         """Why blocks could not be trained, by number."""
 
@@ -178,7 +180,7 @@ class BlockTraining:
             0; 1 where blocks failed; 129, 130, 143 after SIGHUP, Ctrl-C, SIGTERM.
 
         Raises:
-            InputError: The first attempt at a block was refused.
+            InputError: The first attempt at a block was refused, and none was ever begun.
         """
         shown = 0.0
         with StopRequest() as stop:
@@ -207,7 +209,12 @@ class BlockTraining:
         """Start as many jobs as there is room for."""
         now = time.monotonic()
         ready = [n for n in self._waiting if self._not_before.get(n, 0.0) <= now]
-        for number in ready[: self._engine.slots - len(self._running)]:
+        for number in ready:
+            if len(self._running) >= self._engine.slots:
+                return
+            if lock.is_held(self._blocks.run(number).folder):
+                self._wait(number, say)
+                continue
             work = work_of(self._blocks, number, self._options, self._engine.threads)
             self._waiting.remove(number)
             self._tries[number] += 1
@@ -218,6 +225,13 @@ class BlockTraining:
                 raise cannot_write(str(work.log), error) from error
             resumed = "--resume" in work.arguments
             say(f"{self._blocks.name(number)} {'resumes' if resumed else 'begins'}")
+
+    def _wait(self, number: int, say: Callable[[str], None]) -> None:
+        """Leave a block for a while to the process that still trains or saves it."""
+        self._not_before[number] = time.monotonic() + AGAIN
+        if number not in self._waited_for:
+            say(f"{self._blocks.name(number)} is held by another process, which is waited for")
+            self._waited_for.add(number)
 
     def _look(self, say: Callable[[str], None]) -> None:
         """See which jobs have ended, and how."""
@@ -233,9 +247,10 @@ class BlockTraining:
             if self._step(number) > self._reached[number]:
                 self._tries[number] = 1
             last = _last_line(self.log(number))
-            if code == 2 and self._tries[number] == 1 and not self._blocks.run(number).checkpoints:
+            refused = code == 2 and self._tries[number] == 1 and not self._step(number)
+            if refused and not self._blocks.begun:  # so would be the others
                 raise InputError(f"{name}: {last.removeprefix('warpnerf: error: ')}")
-            if code == 1 or self._tries[number] >= TRIES:
+            if code in (0, 1) or refused or self._tries[number] >= TRIES:
                 self.failed[number] = last
                 say(f"{name} failed: {last}")
                 continue

@@ -126,7 +126,7 @@ def train_blocks_command(
         require_threads(threads)
     numbers = range(len(blocks)) if only is None else [only]
     blocks.require_own_runs(numbers)
-    options = options_of(blocks, _words(train_options))
+    options = options_of(blocks, _words_for_train(train_options))
     where = _engine(engine, address, workers, threads)
     try:
         training = BlockTraining(blocks, numbers, options, where)
@@ -143,11 +143,17 @@ def train_blocks_command(
     return code
 
 
-def _words(options: str) -> list[str]:
+def _words_for_train(options: str) -> list[str]:
+    """Words of options that train can read; InputError where it cannot."""
+    from warpnerf.cli.main import call_of
+
     try:
-        return shlex.split(options)
+        words = shlex.split(options)
     except ValueError as error:
         raise InputError(f"--train-options {options!r}: {error}; quote it as a shell.") from None
+    if words:
+        call_of(["train", "SCENE", *words])
+    return words
 
 
 def _engine(name: str, address: str | None, workers: int | None, threads: int | None) -> Engine:

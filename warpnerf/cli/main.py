@@ -140,8 +140,18 @@ def _require_known(name: str, words: Sequence[str]) -> None:
             )
 
 
-def _parsed(words: list[str]) -> int:
-    """Read the line, and call its subcommand. Only that one is looked at: the others are named."""
+def call_of(words: list[str]) -> Call:
+    """Read a line. Only its subcommand is looked at: the others are named.
+
+    Args:
+        words: After ``warpnerf``.
+
+    Returns:
+        The subcommand with its options, which is not called yet.
+
+    Raises:
+        InputError: The line cannot be read.
+    """
     name = words[0] if words and not words[0].startswith("-") else None
     if name is not None and name not in COMMANDS:
         raise InputError(
@@ -181,7 +191,7 @@ def _parsed(words: list[str]) -> int:
             name,
             shows_help=bool({"--help", "-h"} & {*words}),
         )
-    return call()
+    return call
 
 
 def _later(command: Callable[..., int]) -> Callable[..., Call]:
@@ -246,7 +256,7 @@ def main(arguments: list[str] | None = None) -> int:
         sys.stdout = UntilClosed(sys.stdout)
     try:
         arguments = [_meant(arguments[at - 1], word) for at, word in enumerate(arguments)]
-        return _parsed(arguments)
+        return call_of(arguments)()
     except InputError as error:
         print(f"warpnerf: error: {_one_line(str(error))}", file=sys.stderr)
         return BAD_INPUT

@@ -62,6 +62,23 @@ def only_writer(folder: Path) -> Iterator[None]:
                 place.rmdir()
 
 
+def is_held(folder: Path) -> bool:
+    """Whether a process writes to a folder."""
+    if fcntl is None:
+        return False
+    try:
+        file = os.open(folder / NAME, os.O_RDWR)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(file)
+    return False
+
+
 def require_own_files(folder: Path) -> None:
     """Raise InputError where a file of a run is a symbolic link, a pipe or a device.
 
