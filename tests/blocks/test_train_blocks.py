@@ -92,6 +92,10 @@ def test_exports_are_the_cores_joined(trained: Path, tmp_path: Path) -> None:
     for block in blocks.config.blocks:
         low, high = np.array(block.core_min), np.array(block.core_max)
         assert ((low <= made.vertices) & (made.vertices <= high)).all(axis=1).sum() > 200
+    save_field(blocks.run(1).folder / "field.safetensors", ball_field((0.1, -0.2, 9.0), radius))
+    code, out, err = run("export", blocks.folder, *files, "--unseen", "--threads", "1")
+    assert code == 0 and out.count("block-1 has no") == 2 and "block-0 has no" not in out, err
+    assert "level must be" in refused("export", blocks.folder, *files, "--level=-1")
 
 
 def test_what_is_no_scene_in_blocks_is_refused(trained: Path, tmp_path: Path) -> None:

@@ -180,12 +180,14 @@ def _export_blocks(
             bar.report(done / len(blocks), f"{done} of {len(blocks)} blocks")
 
         try:
-            export_blocks(blocks, files, how, device, threads, on_block)
+            empty = export_blocks(blocks, files, how, device, threads, on_block)
         except OSError as error:
             raise InputError(
                 f"{error.filename or files[0]} cannot be written: {error.strerror or error}; name "
                 "another place, or make room."
             ) from error
+    for sentence in empty:
+        print(f"note: {sentence}")
     for file in files:
         print(f"wrote {file}")
     return 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,13 +13,11 @@ from warpnerf.checks import InputError
 from warpnerf.exporting import mesh, splats, spz, surface
 from warpnerf.exporting.export import MESHES, SPLATS, SURFACES, checked_ending
 from warpnerf.exporting.splats import Splats
-from warpnerf.exporting.surface import Surface
+from warpnerf.exporting.surface import NothingThereError, Surface
 from warpnerf.exporting.visibility_file import cached_visibility
 from warpnerf.runs.scene import load_run_scene
 from warpnerf.scenes.cameras.focus import up_direction
 from warpnerf.writing import StagedWrites
-
-log = logging.getLogger(__name__)
 
 JOINED = tuple(ending for ending in (*MESHES, ".points.ply", *SPLATS) if ending != ".html")
 """Endings of files that can be written of blocks."""
@@ -47,7 +44,7 @@ def export_blocks(
     device: str,
     threads: int | None,
     on_block: Callable[[int], None],
-) -> None:
+) -> list[str]:
     """Export a scene in blocks: what each block has in its core, one after the other, joined.
 
     What the training cameras of a block see of its field is written; around the box of the scene
@@ -61,8 +58,12 @@ def export_blocks(
         threads: CPU threads; None: one per usable core.
         on_block: Called with the number of blocks that are done.
 
+    Returns:
+        What blocks have nothing of, a sentence each.
+
     Raises:
-        InputError: A block is missing, a format cannot be joined, or there is nothing to write.
+        InputError: A block is missing, a value is wrong, a format cannot be joined, or no block has
+            what it holds.
         OSError: A file cannot be written; what was there before is left as it was.
     """
     endings = [checked_ending(path) for path in paths]
@@ -75,11 +76,12 @@ def export_blocks(
     configs = [blocks.run_config(number) for number in range(len(blocks))]
     surfaces: list[Surface] = []
     clouds: list[Splats] = []
-    empty: list[InputError] = []
+    empty: list[str] = []
     ups = []
     for number, config in enumerate(configs):
         run, entry = blocks.run(number), blocks.config.blocks[number]
         field, _ = run.load_field(device, threads)
+        surface.check_options(field, how.level, None, how.min_size, how.fill)
         part = load_run_scene(config, str(blocks.part(number)), threads)
         views = [part.views[index] for index in part.splits["train"]]
         seen = cached_visibility(field, views, run.visibility_file, None)
@@ -97,19 +99,20 @@ def export_blocks(
                     fill=how.fill,
                 )
                 surfaces.append(made)
+        except NothingThereError as error:  # sky, or the inside of a hill
+            empty.append(f"{blocks.name(number)} has no surface: {error}")
+        try:
             if {*endings} & {*SPLATS}:
                 clouds.append(splats.splats_of(field, seen, unseen=how.unseen, crop=crop))
-        except InputError as error:  # sky, or the inside of a hill
-            log.info(f"{blocks.name(number)} has nothing to write: {error}")
-            empty.append(error)
+        except NothingThereError as error:
+            empty.append(f"{blocks.name(number)} has no splats: {error}")
         on_block(number + 1)
-    if not surfaces and not clouds:
-        raise empty[0]
     up, offset = _unit(np.mean(ups, axis=0)), blocks.config.offset
     away = None if offset is None else np.array(offset)
     with StagedWrites() as staged:
         for path, ending in zip(paths, endings, strict=True):
             staged.add(path, *_pieces(ending, surfaces, clouds, up, away))
+    return empty
 
 
 def _pieces(

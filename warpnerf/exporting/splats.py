@@ -18,12 +18,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from warpnerf.checked import checked_arguments
-from warpnerf.checks import InputError
 from warpnerf.exporting.colour import colours
 from warpnerf.exporting.ply import ply
 from warpnerf.exporting.quaternions import quaternions
 from warpnerf.exporting.surface import (
     Crop,
+    NothingThereError,
     checked_crop,
     density,
     inside,
@@ -107,7 +107,7 @@ def splats_of(
     if crop is not None:
         usable &= inside(points, checked_crop(field, crop))
     if not usable.any():
-        raise InputError(
+        raise NothingThereError(
             "no splat is left: nothing in the crop is both dense enough to be seen and seen by a "
             "training camera; enlarge the crop, or keep what is unseen."
         )

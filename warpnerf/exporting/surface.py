@@ -33,6 +33,10 @@ Crop = tuple[Sequence[float], Sequence[float]]
 """Lower and upper corner, scene units."""
 
 
+class NothingThereError(InputError):
+    """A field holds nothing of what is asked for."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Surface:
     """A triangle mesh with normals and colours at its vertices."""
@@ -101,7 +105,7 @@ def extract_surface(
     points = points_of(lattice, nodes)
     kept = inside(points, box)
     if not kept.any():
-        raise InputError(
+        raise NothingThereError(
             f"level {level:g}: the surface of this density does not reach into the crop; enlarge "
             "the crop, or choose another level."
         )
@@ -113,7 +117,7 @@ def extract_surface(
     faces = faces[kept[faces].all(axis=1)]
     faces = faces[_large_components(points, faces, min_size)]
     if not len(faces):
-        raise InputError(
+        raise NothingThereError(
             f"level {level:g}: no part of the surface of this density is both seen by a training "
             f"camera and {min_size:g} scene units across; choose a lower level, a smaller minimum "
             "size, or keep what is unseen."
@@ -159,9 +163,9 @@ def default_level(field: Field) -> float:
 
 
 def require_crossed(field: Field, level: float | None, crop: Crop | None) -> None:
-    """Raise InputError where no node has at least the level, or all have, as far as a crop reaches.
+    """Raise NothingThereError where no node has at least the level, or all have.
 
-    Of fields in which a box holds no block of nodes, all nodes are looked at.
+    Only the crop is looked at. Of fields in which a box holds no block of nodes, all nodes are looked at.
     """
     lattice = field.lattice
     level = default_level(field) if level is None else level
@@ -175,7 +179,7 @@ def require_crossed(field: Field, level: float | None, crop: Crop | None) -> Non
         raw = raw[tuple(slice(max(a, 0), b + 1) for a, b in zip(first, last, strict=True))]
     if not raw.min() < _raw_of(field, level) <= raw.max():
         low_sigma, high_sigma = density(field, np.array([raw.min(), raw.max()]))
-        raise InputError(
+        raise NothingThereError(
             f"level {level:g}: the field has no surface of this density{where}, where it is "
             f"{low_sigma:.3g} to {high_sigma:.3g} per scene unit; choose a level in between."
         )
