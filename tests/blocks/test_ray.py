@@ -12,6 +12,7 @@ import pytest
 from tests.blocks.test_train_blocks import OPTIONS, cut, until
 from tests.support import cli_process
 from tests.support.tiny_runs import run, start
+from warpnerf.blocks.engines import largest_machine
 from warpnerf.blocks.folder import BlockFolder
 
 
@@ -27,6 +28,13 @@ def test_an_address_where_no_ray_is() -> None:
             RayEngine(address, None, None)
 
 
+def test_the_largest_machine_counts() -> None:
+    """A job's cores are on one machine, which is still there."""
+    sizes = [(True, {"CPU": 4.0}), (False, {"CPU": 64.0}), (True, {"memory": 1.0})]
+    nodes = [{"Alive": alive, "Resources": resources} for alive, resources in sizes]
+    assert largest_machine(nodes) == 4 and largest_machine(nodes[1:]) == 1
+
+
 @pytest.mark.slow
 def test_a_killed_worker_s_block_is_taken_over(tmp_path: Path) -> None:
     pytest.importorskip("ray")
@@ -34,6 +42,8 @@ def test_a_killed_worker_s_block_is_taken_over(tmp_path: Path) -> None:
     ray = ("--engine", "ray", "--workers", "2", "--threads", "1")
     steps = ("--steps", "300", "--checkpoint-every", "0.3", *OPTIONS)
     first, second = blocks.run(0), blocks.run(1)
+    code, _, err = run("train-blocks", blocks.folder, *ray[:2], "--threads", "9999")
+    assert code == 2 and "no machine of the cluster has so many cores" in err
     process = start("train-blocks", blocks.folder, *ray, "--", *steps)
     until(lambda: first.last_step is not None and second.last_step is not None, process)
     process.send_signal(signal.SIGINT)

@@ -124,7 +124,14 @@ class RayEngine:
         self._ray = ray
         self._stop: Path | None = None
         cores = int(ray.cluster_resources().get("CPU", 1))
-        self.threads = min(2, cores) if threads is None else threads
+        largest = largest_machine(ray.nodes())
+        if threads is not None and threads > largest:
+            ray.shutdown()
+            raise InputError(
+                f"--threads {threads}: no machine of the cluster has so many cores, and none would "
+                f"ever train; give {largest} at the most."
+            )
+        self.threads = min(2, largest) if threads is None else threads
         self.slots = max(1, cores // self.threads) if workers is None else workers
         # The engine looks after lost jobs itself: another attempt has to wait for the last one.
         self._run = ray.remote(num_cpus=self.threads, max_retries=0)(run_on_worker)
@@ -156,6 +163,16 @@ class RayEngine:
     def close(self) -> None:
         """Leave the cluster; one that was started here ends."""
         self._ray.shutdown()
+
+
+def largest_machine(nodes: Iterable[dict[str, Any]]) -> int:
+    """Cores of the largest machine that is up, at least 1.
+
+    Args:
+        nodes: Of ``ray.nodes``.
+    """
+    cores = [int(node["Resources"].get("CPU", 0)) for node in nodes if node["Alive"]]
+    return max([1, *cores])
 
 
 def run_on_worker(arguments: list[str], log: str, stop: str) -> int:

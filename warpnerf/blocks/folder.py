@@ -20,6 +20,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import warp as wp
 
 from warpnerf.blocks.cut import Block
 from warpnerf.checks import InputError, cannot_write
@@ -216,7 +217,8 @@ class _Fields:
             self._kept.move_to_end(number)
             return self._kept[number][0]
         if self._room is None:
-            free = available_memory()
+            device = wp.get_device(self.how[0])
+            free = device.free_memory if device.is_cuda else available_memory()
             self._room = np.inf if free is None else MEMORY_SHARE * free
         run = self.runs[number]
         size = 2 * (run.folder / "field.safetensors").stat().st_size  # its numbers have 16 bits

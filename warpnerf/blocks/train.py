@@ -60,7 +60,7 @@ class BlockState:
     name: str
     photographs: int
     state: str
-    """waiting, training, done, stopped or failed."""
+    """waiting, queued (given to the engine, but silent yet), training, done, stopped or failed."""
     step: int
     fraction: float
     """Of its training, [0, 1]."""
@@ -160,6 +160,7 @@ class BlockTraining:
         self._running: dict[int, Any] = {}
         self._tries: Counter[int] = Counter()
         self._reached: dict[int, int] = {}
+        self._said: dict[int, int] = {}
         self._not_before: dict[int, float] = {}
         self._waited_for: set[int] = set()
         self.failed: dict[int, str] = {}
@@ -219,6 +220,7 @@ class BlockTraining:
             self._waiting.remove(number)
             self._tries[number] += 1
             self._reached[number] = self._step(number)
+            self._said[number] = _size(work.log)
             try:
                 self._running[number] = self._engine.start(work)
             except OSError as error:
@@ -273,7 +275,8 @@ class BlockTraining:
         elif number in self.failed:
             state = "failed"
         elif number in self._running:
-            state = "training"
+            silent = _size(self.log(number)) == self._said[number]
+            state = "queued" if silent else "training"
         else:
             state = "stopped" if self._step(number) else "waiting"
         return BlockState(
@@ -284,6 +287,14 @@ class BlockTraining:
             fraction=report.fraction,
             seconds=report.seconds,
         )
+
+
+def _size(log: Path) -> int:
+    """Bytes of a file; 0 where there is none."""
+    try:
+        return log.stat().st_size
+    except OSError:
+        return 0
 
 
 def _last_line(log: Path) -> str:

@@ -165,7 +165,7 @@ def default_level(field: Field) -> float:
 def require_crossed(field: Field, level: float | None, crop: Crop | None) -> None:
     """Raise NothingThereError where no node has at least the level, or all have.
 
-    Only the crop is looked at. Of fields in which a box holds no block of nodes, all nodes are looked at.
+    Only the crop is looked at; all nodes of fields in which a box holds no block of them.
     """
     lattice = field.lattice
     level = default_level(field) if level is None else level
