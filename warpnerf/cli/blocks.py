@@ -12,7 +12,7 @@ import tyro
 
 from warpnerf.checks import InputError, require_whole
 from warpnerf.cli.arguments import SceneName
-from warpnerf.presets import PRESETS
+from warpnerf.presets import DEFAULT_PRESETS, PRESETS
 from warpnerf.runtime.memory import require_threads, usable_cores
 from warpnerf.runtime.progress import has_bar
 from warpnerf.runtime.terminal import print_table
@@ -62,23 +62,24 @@ def blocks_command(
     )
     source = stored_source(scene, downscale, masks, chosen)
     made = write_blocks(output, whole, source, cut(whole, count))
-    config = PRESETS["fast"]
-    config = replace(config, grid=replace(config.grid, box="scene", contraction="linf"))
+    configs = [
+        replace(preset, grid=replace(preset.grid, box="scene", contraction="linf"))
+        for preset in map(PRESETS.__getitem__, DEFAULT_PRESETS)
+    ]
     rows = []
     for number, entry in enumerate(made.config.blocks):
         path = made.part(number)
         part = part_of(whole, read_part(path), path, Keeping(place="files"), downscale)
-        cost = cost_of(part, config, threads or usable_cores())
+        costs = [cost_of(part, config, threads or usable_cores()) for config in configs]
         edges = " x ".join(
             f"{b - a:.3g}" for a, b in zip(entry.core_min, entry.core_max, strict=True)
         )
-        gib = f"{cost.plan.memory / 2**30:.2g} GiB"
-        taken = duration(cost.seconds)
-        rows.append([made.name(number), edges, str(entry.photographs), gib, taken])
-    print_table(["block", "core", "photographs", "memory", "time"], rows)
+        taken = [f"{c.plan.memory / 2**30:.2g} GiB, {duration(c.seconds)}" for c in costs]
+        rows.append([made.name(number), edges, str(entry.photographs), *taken])
+    print_table(["block", "core", "photographs", *DEFAULT_PRESETS], rows)
     print(
-        f"memory and time are those of preset fast on {threads or usable_cores()} CPU threads, "
-        "very roughly"
+        f"memory and time are those of training by a preset on {threads or usable_cores()} CPU "
+        "threads, very roughly"
     )
     print(f"wrote {output}: {FILE}, {PLAN} and the scene of each block")
     print(f"train them by: warpnerf train-blocks {shlex.quote(str(output))}")
