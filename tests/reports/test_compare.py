@@ -120,15 +120,22 @@ def row(values: dict[str, list[float]], against: dict[str, list[float]] | None =
 
 
 def test_a_sentence_tells_better_from_worse_and_from_chance() -> None:
-    plain = {"psnr": [20.0] * 3, "front_train": [0.5] * 3, "near_mass": [0.1] * 3}
-    other = {
+    plain = {
+        "psnr": [20.0] * 3,
+        "front_train": [0.5] * 3,
+        "hit_train": [0.4] * 3,
+        "near_mass": [0.1] * 3,
+    }
+    other = {  # emptier: less in front, and at the surfaces as well
         "psnr": [21.0, 21.1, 20.9],
-        "front_train": [0.6, 0.61, 0.59],
+        "front_train": [0.4, 0.41, 0.39],
+        "hit_train": [0.3, 0.31, 0.29],
         "near_mass": [0.0, 0.3, 0.1],
     }
     said, caution = sentences([row(plain), row(other, plain)])
     assert said.startswith("b against a: better in PSNR (+1.00, ")
-    assert "worse in light in front, training rays (+0.1000" in said
+    assert "worse in light at surfaces, training rays (-0.1000" in said
+    assert "changed in light in front, training rays (-0.1000" in said
     assert "no significant difference in optical depth near cameras" in said
     assert "by Student's t" in caution
     single = replace(row({"psnr": [21.0]}, {"psnr": [20.0]}), seconds=[1.0])

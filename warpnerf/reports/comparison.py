@@ -29,6 +29,26 @@ class Figure:
     """Behind the point."""
 
 
+def _light(split: str, rays: str) -> dict[str, Figure]:
+    """Where light is absorbed. Only what ends at surfaces tells better from worse: an emptier field
+    has less in front of them, and misses them more."""
+    headings = {
+        "front": ("light in front", 0),
+        "hit": ("light at surfaces", 1),
+        "behind": ("light behind", 0),
+        "transmitted": ("light that passes", 0),
+    }
+    return {
+        f"{name}_{split}": Figure(
+            heading=f"{heading}, {rays}",
+            path=("measures", "light", split, name),
+            better=better,
+            digits=4,
+        )
+        for name, (heading, better) in headings.items()
+    }
+
+
 FIGURES = {
     "psnr": Figure(heading="PSNR [dB]", path=("mean", "psnr"), better=1, digits=2),
     "ssim": Figure(heading="SSIM", path=("mean", "ssim"), better=1, digits=4),
@@ -59,30 +79,8 @@ FIGURES = {
         better=-1,
         digits=4,
     ),
-    "front_test": Figure(
-        heading="light in front, test rays",
-        path=("measures", "light", "test", "front"),
-        better=-1,
-        digits=4,
-    ),
-    "behind_test": Figure(
-        heading="light behind, test rays",
-        path=("measures", "light", "test", "behind"),
-        better=-1,
-        digits=4,
-    ),
-    "front_train": Figure(
-        heading="light in front, training rays",
-        path=("measures", "light", "train", "front"),
-        better=-1,
-        digits=4,
-    ),
-    "behind_train": Figure(
-        heading="light behind, training rays",
-        path=("measures", "light", "train", "behind"),
-        better=-1,
-        digits=4,
-    ),
+    **_light("test", "test rays"),
+    **_light("train", "training rays"),
     "near_mass": Figure(
         heading="optical depth near cameras", path=("floaters", "near_mass"), better=-1, digits=4
     ),

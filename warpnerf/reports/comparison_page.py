@@ -72,11 +72,13 @@ $moments
 camera: near a camera hardly any other sees what it samples most.</figcaption>
 </figure>
 <h2 id="figures">What the figures are</h2>
-<p>Light in front is absorbed before 0.8 of the true depth, light behind after 1.25 of it. Optical
-depth near cameras is measured up to a tenth of the content distance. Where two training views see:
-over the pixels of test views whose true surface at least two training views see; coverage is the
-share of them where the field is at least half opaque. Views pulled back are training cameras moved
-back by a fifth of the content distance.</p>
+<p>Light in front is absorbed before 0.8 of the true depth, light at surfaces from there to 1.25 of
+it, light behind after that, and light that passes nowhere: the four sum to 1. More at surfaces is
+better; each of the others alone is neither, as a field that is emptier everywhere has less light in
+front and more that passes. Optical depth near cameras is measured up to a tenth of the content
+distance. Where two training views see: over the pixels of test views whose true surface at least
+two training views see; coverage is the share of them where the field is at least half opaque. Views
+pulled back are training cameras moved back by a fifth of the content distance.</p>
 <script>
 const views = $views;
 const place = document.getElementById("views");
