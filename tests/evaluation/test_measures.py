@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -135,6 +136,21 @@ def test_a_wall_hides_what_is_behind_it(traced: bool) -> None:
     hidden = [replace(view, mask=mask) for view, mask in zip(scene.views, masks, strict=False)]
     scene = replace(scene, views=[*hidden, *scene.views[2:]])
     assert training_views_that_see(scene, before[None]).tolist() == [2]
+
+
+@pytest.mark.parametrize("k1", [-0.2, 0.2])
+def test_a_camera_sees_all_of_its_own_surfaces_through_its_lens(k1: float) -> None:
+    """And nothing beside them that the lens would fold into its picture."""
+    field, scene = tiny_field(), walled(True)
+    camera = replace(scene.views[0].camera, k1=k1)
+    view = replace(scene.views[0], camera=camera)
+    rays = directions_of(field, view)
+    depth = first_hit(np.broadcast_to(camera.position, rays.shape), rays).reshape(30, 40)
+    view = replace(view, depth=depth.astype(np.float32))
+    alone = replace(scene, views=[view], splits={"train": (0,)})
+    assert training_views_that_see(alone, surfaces(view, rays)).all()
+    along = np.array([[-math.sin(a), 0.0, -math.cos(a)] for a in np.radians(np.arange(55, 90))])
+    assert not training_views_that_see(alone, camera.position + along @ camera.c2w[:, :3].T).any()
 
 
 def test_figures_are_of_the_pixels_that_enough_views_see() -> None:
