@@ -60,7 +60,7 @@ MUTANTS = [
     of_host("compare: the seed of the configuration", "reports/experiment.py", "replace(candidate.config, seed=seed)", "candidate.config",
             CUT),
     of_host("compare: what is cut counts as trained", "reports/experiment.py", "if trainer.fraction < 1.0:", "if False:", CUT),
-    of_host("compare: any folder", "reports/experiment.py", "if others:", "if False:", REFUSED),
+    of_host("compare: any folder", "reports/experiment.py", "if names and RECORD not in names:", "if False:", REFUSED),
     of_host("overlap: rays thin out by the distance", "scenes/cameras/overlap.py", "np.maximum(squared, distances[0] ** 2)",
             "np.sqrt(squared)", OVERLAP),
 ]  # fmt: skip

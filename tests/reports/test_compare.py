@@ -159,8 +159,11 @@ def test_figures_that_a_capture_lacks_are_none() -> None:
 
 
 def test_a_folder_of_something_else_is_refused(finished: Experiment, room: Scene) -> None:
-    with pytest.raises(InputError, match=r"another comparison: its seeds is 2, not 3; name a new"):
-        experiment(finished.folder, room, n_seeds=3).begin()
+    with pytest.raises(InputError, match=r"another comparison: its seeds is 2, not 1; name a new"):
+        experiment(finished.folder, room, n_seeds=1).begin()
+    swapped = {**room.splits, "test": room.splits["test"][::-1]}
+    with pytest.raises(InputError, match=r"on other photographs, masks, cameras or split; bring"):
+        experiment(finished.folder, replace(room, splits=swapped)).begin()
     other = experiment(finished.folder, room)
     longer = replace(other.candidates[1], config=replace(CONFIG, steps=17))
     other.candidates = (other.candidates[0], longer)
@@ -169,7 +172,29 @@ def test_a_folder_of_something_else_is_refused(finished: Experiment, room: Scene
     with pytest.raises(InputError, match=r"holds other files \(plain-seed-0\)"):
         experiment(finished.folder / "runs", room).begin()
     with pytest.raises(InputError, match="cannot be written"):
-        experiment(finished.folder / "figures.json" / "x", room).begin()
+        experiment(finished.folder / "experiment.json" / "x", room).begin()
+
+
+def test_more_seeds_and_configurations_are_accepted_and_leftovers_swept(
+    room: Scene, tmp_path: Path
+) -> None:
+    folder = tmp_path / "out"
+    folder.mkdir()
+    (folder / ".experiment.json.71.tmp").write_text("{")
+    made = experiment(folder, room, n_seeds=1)
+    made.begin()
+    leftovers = [folder / ".report.html.71.tmp", folder / "moments" / "plain" / ".0.npz.71.tmp"]
+    leftovers[1].parent.mkdir(parents=True)
+    for path in leftovers:
+        path.write_bytes(b"")
+    more = experiment(folder, room)
+    more.candidates += (Candidate(name="third", config=CONFIG),)
+    more.begin()
+    assert not list(folder.rglob("*.tmp"))
+    record = json.loads((folder / "experiment.json").read_text())
+    assert record["seeds"] == 2 and list(record["configurations"]) == ["plain", "scaled", "third"]
+    with pytest.raises(InputError, match="configurations has plain, scaled, third, not plain, sca"):
+        experiment(folder, room).begin()
 
 
 def test_too_few_test_views_are_refused(room: Scene) -> None:

@@ -20,6 +20,7 @@ from warpnerf.checks import InputError, cannot_write
 from warpnerf.config import TrainConfig
 from warpnerf.config_json import config_to_json
 from warpnerf.rendering.field import Field, Rendering
+from warpnerf.runs.files import is_leftover, sweep
 from warpnerf.runs.run import Run
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.files import read_json
@@ -27,7 +28,7 @@ from warpnerf.scenes.scene import Scene
 from warpnerf.scenes.split import Split
 from warpnerf.training.coarse import prepare_trainer
 from warpnerf.training.plan import resolve
-from warpnerf.training.state import Progress
+from warpnerf.training.state import Progress, scene_digest
 from warpnerf.training.trainer import Trainer
 from warpnerf.writing import write_atomically
 
@@ -85,32 +86,30 @@ class Experiment:
         return [(candidate, seed) for seed in self.seeds for candidate in self.candidates]
 
     def begin(self) -> None:
-        """Make the folder, or continue in it.
+        """Make the folder, or continue in it, with more seeds or configurations as well.
 
         Raises:
             InputError: It holds another experiment or other files, or cannot be written to.
         """
         path = self.folder / RECORD
+        require_free(self.folder)
         wanted = json.loads(json.dumps(self._record()))
-        if path.exists():
-            found = read_json(path, dict[str, Any])
-            if any(found.get(name) != wanted[name] for name in wanted):
-                raise InputError(
-                    f"--output {self.folder} holds another comparison: its "
-                    f"{_difference(found, wanted)}; name a new folder."
+        found = read_json(path, dict[str, Any]) if path.exists() else {}
+        begun = _begun(wanted, found)
+        if found and any(found.get(name) != begun[name] for name in begun):
+            wrong = f"holds another comparison: its {_difference(found, begun)}; name a new folder."
+            if found | {"views": begun["views"]} == begun:
+                wrong = (
+                    "holds a comparison on other photographs, masks, cameras or split; bring them "
+                    "back, or name a new folder."
                 )
-            return
+            raise InputError(f"--output {self.folder} {wrong}")
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            others = sorted(path.name for path in self.folder.iterdir())
-        except OSError as error:
-            raise cannot_write(f"--output {self.folder}", error) from error
-        if others:
-            raise InputError(
-                f"--output {self.folder} holds other files ({others[0]}); name a new folder."
-            )
-        try:
-            write_atomically(path, (json.dumps(wanted, indent=2) + "\n").encode())
+            for place in (self.folder, *self.folder.glob("moments/*"), *self.folder.glob("views")):
+                sweep(place)
+            if found != wanted:
+                write_atomically(path, (json.dumps(wanted, indent=2) + "\n").encode())
         except OSError as error:
             raise cannot_write(f"--output {self.folder}", error) from error
 
@@ -120,6 +119,7 @@ class Experiment:
             "downscale": self.capture.downscale,
             "masks": self.capture.masks,
             "split": self.capture.split,
+            "views": scene_digest(self.capture.scene, ("train", "test")),
             "seeds": len(self.seeds),
             "configurations": {
                 candidate.name: config_to_json(candidate.config) for candidate in self.candidates
@@ -261,6 +261,32 @@ def camera_of_moments(scene: Scene) -> Camera:
     cameras = scene.training_cameras
     camera = cameras[len(cameras) // 2]
     return camera.downscaled(camera.block_for(MOMENT_PIXELS))
+
+
+def require_free(folder: Path) -> None:
+    """Raise InputError where a folder holds other files than those of an experiment.
+
+    Raises:
+        InputError: It does, or cannot be read.
+    """
+    try:
+        names = sorted(p.name for p in folder.iterdir() if not is_leftover(p))
+    except (FileNotFoundError, NotADirectoryError):
+        names = []  # is made later, or refused
+    except OSError as error:
+        raise cannot_write(f"--output {folder}", error) from error
+    if names and RECORD not in names:
+        raise InputError(f"--output {folder} holds other files ({names[0]}); name a new folder.")
+
+
+def _begun(wanted: dict[str, Any], found: dict[str, Any]) -> dict[str, Any]:
+    """A record without the seeds and configurations that it has besides another's."""
+    begun, configurations = dict(wanted), found.get("configurations")
+    if isinstance(found.get("seeds"), int):
+        begun["seeds"] = min(found["seeds"], wanted["seeds"])
+    if isinstance(configurations, dict) and set(configurations) <= set(wanted["configurations"]):
+        begun["configurations"] = {name: wanted["configurations"][name] for name in configurations}
+    return begun
 
 
 def _difference(found: Any, wanted: Any, where: str = "") -> str:
