@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import get_args
@@ -16,7 +17,14 @@ from warpnerf.cli.compare import CompareOptions, compare_command
 from warpnerf.config import GridConfig, LossConfig, Scaling, TrainConfig
 from warpnerf.model.models import Rgb
 from warpnerf.reports.compare import require_comparable, write_comparison
-from warpnerf.reports.comparison import FIGURES, Row, candidates_of, sentences, value_at
+from warpnerf.reports.comparison import (
+    FIGURES,
+    Row,
+    candidates_of,
+    compare_figures,
+    sentences,
+    value_at,
+)
 from warpnerf.reports.experiment import MOMENTS, Candidate, Capture, Experiment
 from warpnerf.reports.paired import paired_difference
 from warpnerf.scenes.formats.load import load_scene
@@ -112,6 +120,43 @@ def test_the_report_is_one_file_and_says_what_figures_say(finished: Experiment) 
     assert all(sentence.split(" (")[0][:40] in page for sentence in record["sentences"])
 
 
+def test_a_training_that_fails_is_left_out_and_said(
+    finished: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And one that a kill left between its field and the end of its checkpoints is tidied up."""
+    whole = finished.capture.scene
+    made = experiment(tmp_path / "out", whole)
+    shutil.copytree(finished.folder, made.folder)
+    (plain, scaled), runs = made.candidates, made.folder / "runs"
+    shutil.rmtree(runs / "scaled-seed-0")
+    for name in ("metrics.json", "curves.png"):
+        (runs / "plain-seed-1" / name).unlink(missing_ok=True)
+    (runs / "plain-seed-1" / "checkpoint-00000008.safetensors").write_bytes(b"")
+
+    def fails(self: training.Trainer) -> None:
+        raise FloatingPointError("the loss is no longer finite.")
+
+    monkeypatch.setattr(training.Trainer, "update", fails)
+    made.begin()
+    assert made.train(scaled, 0) and made.train(scaled, 0) and made.train(plain, 1)
+    assert not made.run(plain, 1).checkpoints
+    rows = write_comparison(made)
+    assert [len(row.seconds) for row in rows] == [2, 1]
+    assert {difference.seeds for difference in rows[1].differences.values()} == {1}
+    mine, theirs = (made.metrics(candidate, 1) for candidate in (scaled, plain))
+    assert mine is not None and theirs is not None
+    apart = mine["mean"]["psnr"] - theirs["mean"]["psnr"]
+    assert rows[1].differences["psnr"].mean == pytest.approx(apart)
+    page = (made.folder / "report.html").read_text()
+    assert "scaled with seed 0 failed, and counts in no figure: the loss is no longer" in page
+    path = runs / "plain-seed-1" / "metrics.json"
+    theirs["floaters"]["within"] *= 2.0
+    path.write_text(json.dumps(theirs))
+    rows = compare_figures(made)
+    assert "near_mass" not in rows[1].differences and "psnr" in rows[1].differences
+    assert "figures near cameras are not compared" in " ".join(sentences(rows))
+
+
 def row(values: dict[str, list[float]], against: dict[str, list[float]] | None = None) -> Row:
     differences = {n: paired_difference(v, against[n]) for n, v in values.items() if against}
     name, other = ("b", "a") if against else ("a", None)
@@ -138,6 +183,7 @@ def test_a_sentence_tells_better_from_worse_and_from_chance() -> None:
     assert "changed in light in front, training rays (-0.1000" in said
     assert "no significant difference in optical depth near cameras" in said
     assert "by Student's t" in caution
+    assert "Of 4 differences, 0.2 are expected to look significant by chance." in caution
     single = replace(row({"psnr": [21.0]}, {"psnr": [20.0]}), seconds=[1.0])
     (said,) = sentences([single])
     assert said.startswith("One seed")
@@ -212,6 +258,8 @@ def test_too_few_test_views_are_refused(room: Scene) -> None:
         ({"fields": ("cube",)}, {}, "--fields: 'cube' is none of dense, vm, hash"),
         ({"presets": ()}, {}, "--presets has no value"),
         ({"seeds": 0}, {}, "--seeds must be a whole number of at least 1"),
+        ({"seeds": 1001}, {}, "--seeds must be at most 1000, not 1001"),
+        ({"scalings": ("none",)}, {}, "needs two configurations or more; name several by --sca"),
         ({}, {"seed": ("3",)}, "--seed: compare takes several, by --seeds"),
         ({"split": "all"}, {}, "no test views"),
     ],

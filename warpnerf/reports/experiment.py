@@ -1,7 +1,8 @@
 """Experiments: configurations times seeds, each a run in a folder, that end where they were cut.
 
 experiment.json             what is trained: capture, configurations, seeds
-runs/CONFIGURATION-seed-K/  a run, as ``warpnerf train`` leaves it, with measures in metrics.json
+runs/CONFIGURATION-seed-K/  a run, as ``warpnerf train`` leaves it, with measures in metrics.json;
+                            failed.json says why, where its training failed
 moments/CONFIGURATION/K.npz one camera's rendering at a few moments of the training with seed 0
 """
 
@@ -39,7 +40,7 @@ in Philip & Deschaintre 2023, figure 6."""
 MOMENT_PIXELS = 320 * 240
 """Of these renderings, at most, about."""
 
-RECORD = "experiment.json"
+RECORD, FAILED = "experiment.json", "failed.json"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,6 +138,15 @@ class Experiment:
             return None
         return read_json(path, dict[str, Any])
 
+    def failure(self, candidate: Candidate, seed: int) -> str | None:
+        """Why a training failed, a sentence; None: it did not. Without its folder it starts again.
+
+        Raises:
+            InputError: The record of it is damaged.
+        """
+        path = self.run(candidate, seed).folder / FAILED
+        return read_json(path, dict[str, str]).get("error", "") if path.exists() else None
+
     def train(
         self,
         candidate: Candidate,
@@ -145,6 +155,8 @@ class Experiment:
         on_progress: Callable[[float, str], None] = lambda done, words: None,
     ) -> bool:
         """Train to the end and measure, from where it was cut; nothing where both are done.
+
+        A training whose loss is no longer finite ends, and is recorded as failed.
 
         Args:
             candidate: What is trained.
@@ -157,9 +169,8 @@ class Experiment:
 
         Raises:
             InputError: The folder cannot be written to, or another process trains there.
-            FloatingPointError: The loss is no longer finite.
         """
-        if self.metrics(candidate, seed) is not None:
+        if self.metrics(candidate, seed) or self.failure(candidate, seed) is not None:
             return True
         run = self.run(candidate, seed)
         run.folder.parent.mkdir(exist_ok=True)
@@ -174,18 +185,24 @@ class Experiment:
                     run.log(progress)
                     on_progress(progress.fraction, str(progress))
 
-                trainer.run(
-                    report,
-                    run.save_checkpoint,
-                    stop,
-                    None if moments is None else moments.after_update,
-                    checkpoint_when_done=False,
-                )
+                try:
+                    trainer.run(
+                        report,
+                        run.save_checkpoint,
+                        stop,
+                        None if moments is None else moments.after_update,
+                        checkpoint_when_done=False,
+                    )
+                except FloatingPointError as error:
+                    text = json.dumps({"error": str(error)}) + "\n"
+                    write_atomically(run.folder / FAILED, text.encode())
+                    return True
                 if trainer.fraction < 1.0:
                     return False
-                run.save_field(trainer.field(), keep_checkpoints=False)
-                run.draw_curves(self.capture.scene.name)
+                run.save_field(trainer.field())
                 del trainer, moments
+            run.remove_checkpoints()
+            run.draw_curves(self.capture.scene.name)
             self._measure(run, candidate, on_progress)
         return True
 
