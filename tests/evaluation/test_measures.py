@@ -15,7 +15,7 @@ from tests.support.tiny_scenes import camera_at, look_at
 from warpnerf.evaluation.evaluate import evaluate
 from warpnerf.evaluation.light import absorbed, measure_light
 from warpnerf.evaluation.measures import Measuring, angle_to_nearest, depth_errors
-from warpnerf.evaluation.near_field import measure_near_field
+from warpnerf.evaluation.near_field import measure_near_field, near_masses
 from warpnerf.evaluation.sight import surfaces, training_views_that_see
 from warpnerf.fields.occupancy import FreeCells
 from warpnerf.rendering.field import Field, Rendering
@@ -171,9 +171,11 @@ def test_figures_are_of_the_pixels_that_enough_views_see() -> None:
     rendering = Rendering(rgb=rgb, depth=np.where(seen, 1.1 * depth, 0.0), opacity=opacity)
     measuring = Measuring(field, scene, "test")
     measuring.add(view, np.zeros((30, 40, 3)), rendering)
-    found = measuring.finish()
+    unseen = replace(view, camera=view.camera.moved_back(9.0), depth=np.full((30, 40), 0.5, "f4"))
+    measuring.add(unseen, np.zeros((30, 40, 3)), rendering)  # of which no training view sees any
+    found = measuring.finish(list(near_masses(field, scene)))
     two = found.seen["2"]
-    assert two.psnr == pytest.approx(20.0) and two.share == pytest.approx(seen.mean())
+    assert two.psnr == pytest.approx(20.0) and two.share == pytest.approx(seen.mean() / 2)
     assert two.coverage == pytest.approx(1.0 - 10 / seen.sum())
     assert two.relative_depth_error == pytest.approx(0.1, rel=1e-5)
     assert found.seen["1"].share > two.share and found.seen["1"].psnr < two.psnr
