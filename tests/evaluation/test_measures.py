@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +15,7 @@ from tests.support.tiny_scenes import camera_at, look_at
 from warpnerf.evaluation.evaluate import evaluate
 from warpnerf.evaluation.light import absorbed, measure_light
 from warpnerf.evaluation.measures import Measuring, angle_to_nearest, depth_errors
-from warpnerf.evaluation.near_field import measure_near_field
+from warpnerf.evaluation.near_field import measure_near_field, near_masses
 from warpnerf.evaluation.sight import surfaces, training_views_that_see
 from warpnerf.fields.occupancy import FreeCells
 from warpnerf.rendering.field import Field, Rendering
@@ -137,6 +138,21 @@ def test_a_wall_hides_what_is_behind_it(traced: bool) -> None:
     assert training_views_that_see(scene, before[None]).tolist() == [2]
 
 
+@pytest.mark.parametrize("k1", [-0.2, 0.2])
+def test_a_camera_sees_all_of_its_own_surfaces_through_its_lens(k1: float) -> None:
+    """And nothing beside them that the lens would fold into its picture."""
+    field, scene = tiny_field(), walled(True)
+    camera = replace(scene.views[0].camera, k1=k1)
+    view = replace(scene.views[0], camera=camera)
+    rays = directions_of(field, view)
+    depth = first_hit(np.broadcast_to(camera.position, rays.shape), rays).reshape(30, 40)
+    view = replace(view, depth=depth.astype(np.float32))
+    alone = replace(scene, views=[view], splits={"train": (0,)})
+    assert training_views_that_see(alone, surfaces(view, rays)).all()
+    along = np.array([[-math.sin(a), 0.0, -math.cos(a)] for a in np.radians(np.arange(55, 90))])
+    assert not training_views_that_see(alone, camera.position + along @ camera.c2w[:, :3].T).any()
+
+
 def test_figures_are_of_the_pixels_that_enough_views_see() -> None:
     """Pixels that see no wall are wrong and do not count; of the others, the field is known."""
     field, scene = tiny_field(), walled(True)
@@ -155,9 +171,11 @@ def test_figures_are_of_the_pixels_that_enough_views_see() -> None:
     rendering = Rendering(rgb=rgb, depth=np.where(seen, 1.1 * depth, 0.0), opacity=opacity)
     measuring = Measuring(field, scene, "test")
     measuring.add(view, np.zeros((30, 40, 3)), rendering)
-    found = measuring.finish()
+    unseen = replace(view, camera=view.camera.moved_back(9.0), depth=np.full((30, 40), 0.5, "f4"))
+    measuring.add(unseen, np.zeros((30, 40, 3)), rendering)  # of which no training view sees any
+    found = measuring.finish(list(near_masses(field, scene)))
     two = found.seen["2"]
-    assert two.psnr == pytest.approx(20.0) and two.share == pytest.approx(seen.mean())
+    assert two.psnr == pytest.approx(20.0) and two.share == pytest.approx(seen.mean() / 2)
     assert two.coverage == pytest.approx(1.0 - 10 / seen.sum())
     assert two.relative_depth_error == pytest.approx(0.1, rel=1e-5)
     assert found.seen["1"].share > two.share and found.seen["1"].psnr < two.psnr

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import get_args
@@ -16,7 +17,14 @@ from warpnerf.cli.compare import CompareOptions, compare_command
 from warpnerf.config import GridConfig, LossConfig, Scaling, TrainConfig
 from warpnerf.model.models import Rgb
 from warpnerf.reports.compare import require_comparable, write_comparison
-from warpnerf.reports.comparison import FIGURES, Row, candidates_of, sentences, value_at
+from warpnerf.reports.comparison import (
+    FIGURES,
+    Row,
+    candidates_of,
+    compare_figures,
+    sentences,
+    value_at,
+)
 from warpnerf.reports.experiment import MOMENTS, Candidate, Capture, Experiment
 from warpnerf.reports.paired import paired_difference
 from warpnerf.scenes.formats.load import load_scene
@@ -112,6 +120,43 @@ def test_the_report_is_one_file_and_says_what_figures_say(finished: Experiment) 
     assert all(sentence.split(" (")[0][:40] in page for sentence in record["sentences"])
 
 
+def test_a_training_that_fails_is_left_out_and_said(
+    finished: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And one that a kill left between its field and the end of its checkpoints is tidied up."""
+    whole = finished.capture.scene
+    made = experiment(tmp_path / "out", whole)
+    shutil.copytree(finished.folder, made.folder)
+    (plain, scaled), runs = made.candidates, made.folder / "runs"
+    shutil.rmtree(runs / "scaled-seed-0")
+    for name in ("metrics.json", "curves.png"):
+        (runs / "plain-seed-1" / name).unlink(missing_ok=True)
+    (runs / "plain-seed-1" / "checkpoint-00000008.safetensors").write_bytes(b"")
+
+    def fails(self: training.Trainer) -> None:
+        raise FloatingPointError("the loss is no longer finite.")
+
+    monkeypatch.setattr(training.Trainer, "update", fails)
+    made.begin()
+    assert made.train(scaled, 0) and made.train(scaled, 0) and made.train(plain, 1)
+    assert not made.run(plain, 1).checkpoints
+    rows = write_comparison(made)
+    assert [len(row.seconds) for row in rows] == [2, 1]
+    assert {difference.seeds for difference in rows[1].differences.values()} == {1}
+    mine, theirs = (made.metrics(candidate, 1) for candidate in (scaled, plain))
+    assert mine is not None and theirs is not None
+    apart = mine["mean"]["psnr"] - theirs["mean"]["psnr"]
+    assert rows[1].differences["psnr"].mean == pytest.approx(apart)
+    page = (made.folder / "report.html").read_text()
+    assert "scaled with seed 0 failed, and counts in no figure: the loss is no longer" in page
+    path = runs / "plain-seed-1" / "metrics.json"
+    theirs["floaters"]["within"] *= 2.0
+    path.write_text(json.dumps(theirs))
+    rows = compare_figures(made)
+    assert "near_mass" not in rows[1].differences and "psnr" in rows[1].differences
+    assert "figures near cameras are not compared" in " ".join(sentences(rows))
+
+
 def row(values: dict[str, list[float]], against: dict[str, list[float]] | None = None) -> Row:
     differences = {n: paired_difference(v, against[n]) for n, v in values.items() if against}
     name, other = ("b", "a") if against else ("a", None)
@@ -120,17 +165,25 @@ def row(values: dict[str, list[float]], against: dict[str, list[float]] | None =
 
 
 def test_a_sentence_tells_better_from_worse_and_from_chance() -> None:
-    plain = {"psnr": [20.0] * 3, "front_train": [0.5] * 3, "near_mass": [0.1] * 3}
-    other = {
+    plain = {
+        "psnr": [20.0] * 3,
+        "front_train": [0.5] * 3,
+        "hit_train": [0.4] * 3,
+        "near_mass": [0.1] * 3,
+    }
+    other = {  # emptier: less in front, and at the surfaces as well
         "psnr": [21.0, 21.1, 20.9],
-        "front_train": [0.6, 0.61, 0.59],
+        "front_train": [0.4, 0.41, 0.39],
+        "hit_train": [0.3, 0.31, 0.29],
         "near_mass": [0.0, 0.3, 0.1],
     }
     said, caution = sentences([row(plain), row(other, plain)])
     assert said.startswith("b against a: better in PSNR (+1.00, ")
-    assert "worse in light in front, training rays (+0.1000" in said
+    assert "worse in light at surfaces, training rays (-0.1000" in said
+    assert "changed in light in front, training rays (-0.1000" in said
     assert "no significant difference in optical depth near cameras" in said
     assert "by Student's t" in caution
+    assert "Of 4 differences, 0.2 are expected to look significant by chance." in caution
     single = replace(row({"psnr": [21.0]}, {"psnr": [20.0]}), seconds=[1.0])
     (said,) = sentences([single])
     assert said.startswith("One seed")
@@ -152,8 +205,11 @@ def test_figures_that_a_capture_lacks_are_none() -> None:
 
 
 def test_a_folder_of_something_else_is_refused(finished: Experiment, room: Scene) -> None:
-    with pytest.raises(InputError, match=r"another comparison: its seeds is 2, not 3; name a new"):
-        experiment(finished.folder, room, n_seeds=3).begin()
+    with pytest.raises(InputError, match=r"another comparison: its seeds is 2, not 1; name a new"):
+        experiment(finished.folder, room, n_seeds=1).begin()
+    swapped = {**room.splits, "test": room.splits["test"][::-1]}
+    with pytest.raises(InputError, match=r"on other photographs, masks, cameras or split; bring"):
+        experiment(finished.folder, replace(room, splits=swapped)).begin()
     other = experiment(finished.folder, room)
     longer = replace(other.candidates[1], config=replace(CONFIG, steps=17))
     other.candidates = (other.candidates[0], longer)
@@ -162,7 +218,29 @@ def test_a_folder_of_something_else_is_refused(finished: Experiment, room: Scene
     with pytest.raises(InputError, match=r"holds other files \(plain-seed-0\)"):
         experiment(finished.folder / "runs", room).begin()
     with pytest.raises(InputError, match="cannot be written"):
-        experiment(finished.folder / "figures.json" / "x", room).begin()
+        experiment(finished.folder / "experiment.json" / "x", room).begin()
+
+
+def test_more_seeds_and_configurations_are_accepted_and_leftovers_swept(
+    room: Scene, tmp_path: Path
+) -> None:
+    folder = tmp_path / "out"
+    folder.mkdir()
+    (folder / ".experiment.json.71.tmp").write_text("{")
+    made = experiment(folder, room, n_seeds=1)
+    made.begin()
+    leftovers = [folder / ".report.html.71.tmp", folder / "moments" / "plain" / ".0.npz.71.tmp"]
+    leftovers[1].parent.mkdir(parents=True)
+    for path in leftovers:
+        path.write_bytes(b"")
+    more = experiment(folder, room)
+    more.candidates += (Candidate(name="third", config=CONFIG),)
+    more.begin()
+    assert not list(folder.rglob("*.tmp"))
+    record = json.loads((folder / "experiment.json").read_text())
+    assert record["seeds"] == 2 and list(record["configurations"]) == ["plain", "scaled", "third"]
+    with pytest.raises(InputError, match="configurations has plain, scaled, third, not plain, sca"):
+        experiment(folder, room).begin()
 
 
 def test_too_few_test_views_are_refused(room: Scene) -> None:
@@ -180,6 +258,8 @@ def test_too_few_test_views_are_refused(room: Scene) -> None:
         ({"fields": ("cube",)}, {}, "--fields: 'cube' is none of dense, vm, hash"),
         ({"presets": ()}, {}, "--presets has no value"),
         ({"seeds": 0}, {}, "--seeds must be a whole number of at least 1"),
+        ({"seeds": 1001}, {}, "--seeds must be at most 1000, not 1001"),
+        ({"scalings": ("none",)}, {}, "needs two configurations or more; name several by --sca"),
         ({}, {"seed": ("3",)}, "--seed: compare takes several, by --seeds"),
         ({"split": "all"}, {}, "no test views"),
     ],

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -78,6 +77,9 @@ USUAL = Usual(
 LISTS = {"scaling": "--scalings", "field": "--fields", "seed": "--seeds"}
 """Fields of a configuration that are compared, and the option that lists them."""
 
+MAX_SEEDS = 1000
+"""More are a mistake."""
+
 
 def compare_command(options: CompareOptions, given: Annotated[Given, USUAL] = NOTHING) -> int:
     """Compare scalings, fields or presets on a scene: train each with several seeds, and report.
@@ -91,14 +93,22 @@ def compare_command(options: CompareOptions, given: Annotated[Given, USUAL] = NO
         if name in given:
             raise InputError(f"{flag_of(name)}: compare takes several, by {flag}.")
     require_whole("--seeds", options.seeds, 1)
+    if options.seeds > MAX_SEEDS:
+        raise InputError(f"--seeds must be at most {MAX_SEEDS}, not {options.seeds}.")
     configs = _configs(options, given)
+    if len(configs) < 2:
+        raise InputError(
+            "compare needs two configurations or more; name several by --scalings, --fields or "
+            "--presets."
+        )
     for config in configs.values():
         require_machine(config)
 
     from warpnerf.reports.compare import PAGE, require_comparable, write_comparison
     from warpnerf.reports.comparison import candidates_of
-    from warpnerf.reports.experiment import Experiment
+    from warpnerf.reports.experiment import Experiment, require_free
 
+    require_free(options.output)
     capture = _capture(options, next(iter(configs.values())).threads)
     require_comparable(capture.scene)
     experiment = Experiment(options.output, capture, candidates_of(configs), options.seeds)
@@ -109,15 +119,14 @@ def compare_command(options: CompareOptions, given: Annotated[Given, USUAL] = NO
             return code
         with ProgressBar("reading fields") as bar:
             rows = write_comparison(experiment, bar.report)
-    except FloatingPointError as error:
-        print(f"warpnerf: error: {error}", file=sys.stderr)
-        return FAILED
     except Stopped as stopped:
         print("stopped; the same command continues", flush=True)
         return stopped.exit_code
     _print(rows)
     print(f"wrote {options.output / PAGE}, figures.json, and pictures")
-    return 0
+    return (
+        FAILED if any(experiment.failure(*trial) is not None for trial in experiment.trials) else 0
+    )
 
 
 def _configs(
@@ -189,25 +198,23 @@ def _train_all(experiment: Experiment) -> int | None:
     for number, (candidate, seed) in enumerate(trials, 1):
         place = f"{number} of {len(trials)}"
         with StopRequest() as stop:
-            if experiment.metrics(candidate, seed) is None:
+            ended = experiment.metrics(candidate, seed) or experiment.failure(candidate, seed)
+            if ended is None:
                 with ProgressBar(f"{candidate.name}, seed {seed}") as bar:
                     experiment.train(candidate, seed, lambda: stop.asked, bar.report)
             if stop.exit_code is not None:
                 print("stopped; what was trained is saved, and the same command continues")
                 return stop.exit_code
-        metrics = experiment.metrics(candidate, seed)
-        assert metrics is not None
-        mean = metrics["mean"]
-        print(
-            f"{place:>7}  {candidate.name:{max(width, 13)}}  {seed:4}  {mean['psnr']:6.2f}  "
-            f"{mean['ssim']:6.4f}",
-            flush=True,
-        )
+        metrics, failure = experiment.metrics(candidate, seed), experiment.failure(candidate, seed)
+        said = "" if failure is None else f"failed: {failure}"
+        if metrics is not None:
+            said = f"{metrics['mean']['psnr']:6.2f}  {metrics['mean']['ssim']:6.4f}"
+        print(f"{place:>7}  {candidate.name:{max(width, 13)}}  {seed:4}  {said}", flush=True)
     return None
 
 
 def _print(rows: Sequence[Row]) -> None:
-    """Means, differences and what they say."""
+    """Means, half of the range over seeds, differences, and what they say."""
     import numpy as np
 
     from warpnerf.reports.comparison import FIGURES, in_words, sentences
@@ -220,6 +227,8 @@ def _print(rows: Sequence[Row]) -> None:
         for row in rows:
             values, difference = row.values.get(name), row.differences.get(name)
             text = "" if values is None else f"{np.mean(values):.{digits}f}"
+            if values is not None and len(values) > 1:
+                text += f" ± {np.ptp(values) / 2.0:.{digits}f}"
             if difference is not None:
                 text += f" ({in_words(difference, digits)})"
             line.append(text)

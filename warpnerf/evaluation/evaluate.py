@@ -26,6 +26,7 @@ from warpnerf.evaluation.near_field import (
     NearField,
     ends_within,
     measure_near_field,
+    near_masses,
 )
 from warpnerf.runtime.terminal import table_text
 from warpnerf.scenes.scene import Scene, View, require_split
@@ -204,11 +205,12 @@ def evaluate(
         if measuring is not None:
             measuring.add(view, target, rendering)
         on_progress(number / (len(views) + 1), f"view {number} of {len(views)}")
-    near_field = measure_near_field(field, scene)
+    masses = list(near_masses(field, scene))
+    near_field = measure_near_field(field, scene, masses)
     so_far = len(views) / (len(views) + 1)
     found = None
     if measuring is not None:
-        found = measuring.finish(lambda words: on_progress(so_far, words))
+        found = measuring.finish(masses, lambda words: on_progress(so_far, words))
     on_progress(1.0, "what is near the cameras")
     return Evaluation(images=tuple(images), near_field=near_field, measures=found)
 

@@ -5,7 +5,7 @@ docs/metrics.md has the formula, unit and source of each.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,6 @@ import numpy as np
 from warpnerf.evaluation.floater_metrics import near_density
 from warpnerf.evaluation.light import Light, measure_light
 from warpnerf.evaluation.metrics import psnr, ssim, truth
-from warpnerf.evaluation.near_field import near_masses
 from warpnerf.evaluation.sight import can_tell_sight, surfaces, training_views_that_see
 from warpnerf.rendering.rays import camera_rays
 from warpnerf.runtime.terminal import table_text
@@ -43,7 +42,7 @@ class SeenFigures:
     """Figures over the pixels whose true surface enough training views see; means over views."""
 
     share: float
-    """Of all pixels whose true depth is known, those that are measured."""
+    """Of all pixels whose true depth is known, those that are measured; a view may have none."""
     coverage: float
     """Of those that are measured, the share at which the field is at least half opaque."""
     psnr: float
@@ -191,13 +190,17 @@ class Measuring:
         known = np.isfinite(view.depth) & (view.depth > 0.0)
         if view.mask is not None:
             known &= view.mask
+        if not known.any():
+            return
         points = surfaces(view, directions.numpy())[known.ravel()]
         counts = np.zeros(known.shape, int)
         counts[known] = training_views_that_see(self._scene, points)
         nearest = NEAREST * self._scene.content_distance
         for least, found in self._seen.items():
             mask = counts >= least
-            if mask.any():
+            if not mask.any():
+                found.append({"share": 0.0})
+            else:
                 depths = rendering.depth[mask].astype(np.float64), view.depth[mask]
                 found.append(
                     {
@@ -209,10 +212,15 @@ class Measuring:
                     }
                 )
 
-    def finish(self, on_progress: Callable[[str], None] = lambda words: None) -> Measures:
+    def finish(
+        self,
+        masses: Sequence[tuple[float, int]],
+        on_progress: Callable[[str], None] = lambda words: None,
+    ) -> Measures:
         """Measure what is not of rendered views.
 
         Args:
+            masses: What ``near_masses`` has found.
             on_progress: Told what is being measured.
         """
         field, scene = self._field, self._scene
@@ -227,15 +235,18 @@ class Measuring:
                 "front, hit and behind: left out, as they need true depths and rays that are cut "
                 "at distances, which rays in normalised device coordinates are not"
             )
-        seen = {str(least): _mean(found) for least, found in self._seen.items() if found}
+        seen = {
+            str(least): _mean(found)
+            for least, found in self._seen.items()
+            if any(figures["share"] for figures in found)
+        }
         if not seen:
             left_out.append(
                 "pixels that training views see: left out, as the true depths of views say which "
                 "they are"
             )
-        on_progress("what is near each camera")
         names = [scene.views[index].name for index in scene.splits["train"]]
-        masses = [mass / n for mass, n in near_masses(field, scene)]
+        depths = [mass / n for mass, n in masses]
         on_progress("training views")
         fits = training_psnr(field, scene)
         density = None
@@ -244,7 +255,7 @@ class Measuring:
         return Measures(
             light=light,
             seen=seen,
-            near_mass=dict(zip(names, masses, strict=True)),
+            near_mass=dict(zip(names, depths, strict=True)),
             near_density=density,
             angles=tuple(self._angles),
             training_psnr=fits,
@@ -290,9 +301,9 @@ def angle_to_nearest(camera: Camera, others: list[Camera]) -> float:
 
 
 def _mean(found: list[dict[str, float | None]]) -> SeenFigures:
-    """Means over views; None where no view has a figure."""
+    """Means over the views that have a figure; None where none has. All have a share."""
     means: dict[str, Any] = {}
-    for name in found[0]:
-        values = [figures[name] for figures in found if figures[name] is not None]
+    for name in SeenFigures.__dataclass_fields__:
+        values = [value for figures in found if (value := figures.get(name)) is not None]
         means[name] = float(np.mean(np.array(values, float))) if values else None
     return SeenFigures(**means)

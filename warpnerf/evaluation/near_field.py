@@ -8,7 +8,7 @@ photographed again, views from further back show as well what hangs in front of 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -73,7 +73,9 @@ class NearField:
         return said
 
 
-def measure_near_field(field: AnyField, scene: Scene) -> NearField:
+def measure_near_field(
+    field: AnyField, scene: Scene, masses: Sequence[tuple[float, int]] | None = None
+) -> NearField:
     """Measure floaters: what hangs in front of the training cameras.
 
     near_mass = mean over rays of the integral of sigma dt over t < within = mean of -log T(within)
@@ -86,12 +88,12 @@ def measure_near_field(field: AnyField, scene: Scene) -> NearField:
         field: A trained field.
         scene: Its training views and content distance are those of the field's training; a scene
             that can be photographed again also gives PSNR of cameras pulled back.
+        masses: What ``near_masses`` has found, if it has been called.
     """
     within = NEAR_SHARE * scene.content_distance
     mass, near, n_rays = 0.0, 0, 0
-    for camera, (of_camera, n) in zip(
-        scene.training_cameras, near_masses(field, scene), strict=True
-    ):
+    found = near_masses(field, scene) if masses is None else masses
+    for camera, (of_camera, n) in zip(scene.training_cameras, found, strict=True):
         mass += of_camera
         seen = field.render(_coarse(camera))
         near += int(ends_within(seen, within).sum())

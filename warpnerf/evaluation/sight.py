@@ -5,11 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from warpnerf.scenes.cameras.camera import Camera
-from warpnerf.scenes.cameras.overlap import in_picture
+from warpnerf.scenes.cameras.undistort import directions
 from warpnerf.scenes.scene import Scene, View
 
 TOLERANCE = 0.02
 """Share by which a view's depth may fall short of the distance to a place that it sees."""
+
+SLACK = 1e-6
+"""In the cosine of the angle to the axis, within which a ray is that of a picture's corner."""
 
 
 def can_tell_sight(scene: Scene) -> bool:
@@ -38,46 +41,52 @@ def training_views_that_see(scene: Scene, points: np.ndarray) -> np.ndarray:
     return counts
 
 
-def surfaces(view: View, directions: np.ndarray) -> np.ndarray:
+def surfaces(view: View, rays: np.ndarray) -> np.ndarray:
     """True surfaces at a view's pixels, [n, 3] scene units; not finite where the depth is not.
 
     Args:
         view: With true depths.
-        directions: [n, 3] of its pixels' rays, unit vectors.
+        rays: [n, 3] directions of its pixels' rays, unit vectors.
     """
     assert view.depth is not None
     with np.errstate(invalid="ignore"):
         depth = view.depth.reshape(-1, 1).astype(np.float64)
-        return np.asarray(view.camera.position + depth * directions)
+        return np.asarray(view.camera.position + depth * rays)
 
 
 def _sees(scene: Scene, view: View, points: np.ndarray) -> np.ndarray:
     """Which places one view sees, [n] bool."""
-    seen = in_picture(view.camera, points)
-    columns, rows = _pixels(view.camera, points[seen])
-    inside = (columns >= 0) & (columns < view.camera.width)
-    inside &= (rows >= 0) & (rows < view.camera.height)
-    columns, rows = columns[inside], rows[inside]
-    candidates = np.flatnonzero(seen)[inside]
+    candidates, (columns, rows) = _in_picture(view.camera, points)
     apart = points[candidates] - view.camera.position
     distances = np.linalg.norm(apart, axis=1)
     depths = np.zeros(len(candidates))
     if scene.first_hit is not None:
-        directions = apart / distances[:, None]
-        depths = scene.first_hit(np.broadcast_to(view.camera.position, apart.shape), directions)
+        origins = np.broadcast_to(view.camera.position, apart.shape)
+        depths = scene.first_hit(origins, apart / distances[:, None])
     elif view.depth is not None:
-        depths = np.nan_to_num(view.depth[rows, columns])
+        depths = view.depth[rows, columns]
+        depths = np.where(np.isfinite(depths), depths, 0.0)
     found = depths >= (1.0 - TOLERANCE) * distances
     if view.mask is not None:
         found &= view.mask[rows, columns]
-    seen[:] = False
+    seen = np.zeros(len(points), bool)
     seen[candidates[found]] = True
     return seen
 
 
-def _pixels(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Column and row of the pixel that each point before a camera falls on."""
+def _in_picture(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which points fall into a camera's picture, [n] indices, and columns and rows there, [2, n].
+
+    Points farther off the axis than any corner of the picture do not, where a lens folds them back.
+    """
     x, y, z = ((points - camera.position) @ camera.c2w[:, :3]).T
+    right, down = float(camera.width), float(camera.height)
+    corners = directions(camera, np.array([[0.0, 0.0], [right, 0.0], [0.0, down], [right, down]]))
+    with np.errstate(invalid="ignore", over="ignore"):
+        widest = corners[:, 2].max() + SLACK
+        before = np.flatnonzero((z < 0.0) & (z <= widest * np.sqrt(x * x + y * y + z * z)))
+    x, y, z = x[before], y[before], z[before]
     on_plane, _ = camera.distort(np.stack([-x / z, y / z], axis=1))
     u, v = camera.cx + camera.fx * on_plane[:, 0], camera.cy + camera.fy * on_plane[:, 1]
-    return np.floor(u).astype(int), np.floor(v).astype(int)
+    inside = (u >= 0.0) & (u < right) & (v >= 0.0) & (v < down)
+    return before[inside], np.floor(np.stack([u, v])[:, inside]).astype(int)

@@ -29,6 +29,26 @@ class Figure:
     """Behind the point."""
 
 
+def _light(split: str, rays: str) -> dict[str, Figure]:
+    """Where light is absorbed. Only what ends at surfaces tells better from worse: an emptier field
+    has less in front of them, and misses them more."""
+    headings = {
+        "front": ("light in front", 0),
+        "hit": ("light at surfaces", 1),
+        "behind": ("light behind", 0),
+        "transmitted": ("light that passes", 0),
+    }
+    return {
+        f"{name}_{split}": Figure(
+            heading=f"{heading}, {rays}",
+            path=("measures", "light", split, name),
+            better=better,
+            digits=4,
+        )
+        for name, (heading, better) in headings.items()
+    }
+
+
 FIGURES = {
     "psnr": Figure(heading="PSNR [dB]", path=("mean", "psnr"), better=1, digits=2),
     "ssim": Figure(heading="SSIM", path=("mean", "ssim"), better=1, digits=4),
@@ -59,30 +79,8 @@ FIGURES = {
         better=-1,
         digits=4,
     ),
-    "front_test": Figure(
-        heading="light in front, test rays",
-        path=("measures", "light", "test", "front"),
-        better=-1,
-        digits=4,
-    ),
-    "behind_test": Figure(
-        heading="light behind, test rays",
-        path=("measures", "light", "test", "behind"),
-        better=-1,
-        digits=4,
-    ),
-    "front_train": Figure(
-        heading="light in front, training rays",
-        path=("measures", "light", "train", "front"),
-        better=-1,
-        digits=4,
-    ),
-    "behind_train": Figure(
-        heading="light behind, training rays",
-        path=("measures", "light", "train", "behind"),
-        better=-1,
-        digits=4,
-    ),
+    **_light("test", "test rays"),
+    **_light("train", "training rays"),
     "near_mass": Figure(
         heading="optical depth near cameras", path=("floaters", "near_mass"), better=-1, digits=4
     ),
@@ -95,6 +93,9 @@ FIGURES = {
 }
 """By name; docs/metrics.md has their formulas. A capture has those that can be measured there."""
 
+WITHIN = ("floaters", "within")
+"""Where metrics.json has the distance up to which the figures beside it were taken."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
@@ -103,11 +104,13 @@ class Row:
     candidate: Candidate
     """Which."""
     values: dict[str, list[float]]
-    """By figure, of each seed."""
+    """By figure, of each seed that did not fail."""
     seconds: list[float]
-    """Of training, of each seed."""
+    """Of training, of each seed that did not fail."""
     differences: dict[str, Difference]
     """By figure, from that which it is compared with; none where it is compared with none."""
+    left_out: tuple[str, ...] = ()
+    """Which trainings failed, and what could not be compared, a sentence each."""
 
 
 def candidates_of(
@@ -132,33 +135,62 @@ def candidates_of(
 
 
 def compare_figures(experiment: Experiment) -> list[Row]:
-    """The figures of an experiment that has finished, and their paired differences."""
-    values: dict[str, dict[str, list[float]]] = {}
-    for candidate in experiment.candidates:
-        found = [experiment.metrics(candidate, seed) for seed in experiment.seeds]
-        known = {
-            name: [value_at(metrics, figure.path) for metrics in found]
-            for name, figure in FIGURES.items()
+    """The figures of an experiment that has finished, and their paired differences.
+
+    Seeds whose trainings failed are left out of both sides.
+    """
+    found = {
+        candidate.name: {
+            seed: metrics
+            for seed in experiment.seeds
+            if (metrics := experiment.metrics(candidate, seed)) is not None
         }
-        values[candidate.name] = {
-            name: [value for value in of_seeds if value is not None]
-            for name, of_seeds in known.items()
-            if None not in of_seeds
-        }
+        for candidate in experiment.candidates
+    }
     rows = []
     for candidate in experiment.candidates:
-        own, differences = values[candidate.name], {}
-        if candidate.against is not None:
-            others = values[candidate.against]
-            differences = {
-                name: paired_difference(own[name], others[name]) for name in own if name in others
-            }
+        own, other = found[candidate.name], found.get(candidate.against or "", {})
+        left_out = [
+            f"{candidate.name} with seed {seed} failed, and counts in no figure: {failure}"
+            for seed in experiment.seeds
+            if (failure := experiment.failure(candidate, seed)) is not None
+        ]
+        paired = [seed for seed in own if seed in other]
+        mine, theirs = (_known([of[seed] for seed in paired]) for of in (own, other))
+        differences = {
+            name: paired_difference(mine[name], theirs[name]) for name in mine if name in theirs
+        }
+        reaches = {value_at(of[seed], WITHIN) for of in (own, other) for seed in paired}
+        if len(reaches) > 1:
+            differences = {n: d for n, d in differences.items() if FIGURES[n].path[0] != WITHIN[0]}
+            left_out.append(
+                f"{candidate.name} against {candidate.against}: figures near cameras are not "
+                "compared, as they were taken up to different distances."
+            )
         seconds = []
-        for seed in experiment.seeds:
+        for seed in own:
             reports = read_reports(experiment.run(candidate, seed).folder / "log.jsonl")
             seconds.append(float(reports[-1]["seconds"]) if reports else 0.0)
-        rows.append(Row(candidate=candidate, values=own, seconds=seconds, differences=differences))
+        rows.append(
+            Row(
+                candidate=candidate,
+                values=_known(list(own.values())),
+                seconds=seconds,
+                differences=differences,
+                left_out=tuple(left_out),
+            )
+        )
     return rows
+
+
+def _known(metrics: Sequence[dict[str, Any]]) -> dict[str, list[float]]:
+    """Figures that all of some trainings have, by name, a value of each."""
+    known = {}
+    for name, figure in FIGURES.items():
+        values = [value for of in metrics if (value := value_at(of, figure.path)) is not None]
+        if values and len(values) == len(metrics):
+            known[name] = values
+    return known
 
 
 def value_at(tree: Any, path: Sequence[str]) -> float | None:
@@ -170,24 +202,23 @@ def value_at(tree: Any, path: Sequence[str]) -> float | None:
 
 def sentences(rows: Sequence[Row]) -> list[str]:
     """What differs significantly and what does not, a sentence for each, and a caution."""
-    said = []
-    n_seeds, n_compared = 1, 0
-    for row in rows:
-        if row.candidate.against is None:
-            continue
-        n_seeds = len(row.seconds)
-        n_compared += len(row.differences)
-        if n_seeds > 1:
-            said.append(f"{row.candidate.name} against {row.candidate.against}: {_verdict(row)}.")
-    if n_seeds < 2:
-        return ["One seed: differences have no interval, and none can be called significant."]
-    if n_compared:
-        said.append(
-            f"{CONFIDENCE:.0%} intervals of the mean difference over {n_seeds} seeds, by Student's "
-            "t; they say nothing of other captures. Without any effect, about "
-            f"{max(1, round((1.0 - CONFIDENCE) * n_compared))} of {n_compared} differences would "
-            "look significant."
-        )
+    said = [sentence for row in rows for sentence in row.left_out]
+    compared = [row for row in rows if row.differences]
+    n_seeds = [difference.seeds for row in compared for difference in row.differences.values()]
+    if not n_seeds:
+        return [*said, "Nothing could be compared."]
+    if max(n_seeds) < 2:
+        return [
+            *said,
+            "One seed: differences have no interval, and none can be called significant.",
+        ]
+    said += [f"{r.candidate.name} against {r.candidate.against}: {_verdict(r)}." for r in compared]
+    by_chance = (1.0 - CONFIDENCE) * sum(n > 1 for n in n_seeds)
+    said.append(
+        f"{CONFIDENCE:.0%} intervals of the mean difference over {max(n_seeds)} seeds, by "
+        f"Student's t; they say nothing of other captures. Of {sum(n > 1 for n in n_seeds)} "
+        f"differences, {by_chance:.1f} are expected to look significant by chance."
+    )
     return said
 
 
@@ -235,6 +266,7 @@ def figures_to_json(experiment: Experiment, rows: Sequence[Row]) -> dict[str, An
                 "against": row.candidate.against,
                 "train": config_to_json(row.candidate.config),
                 "seconds": row.seconds,
+                "left_out": list(row.left_out),
                 "figures": {
                     name: {
                         "values": values,

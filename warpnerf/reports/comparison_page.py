@@ -68,15 +68,19 @@ $moments
 <figure>
 <img src="$cameras" alt="cameras that see a point, by its distance">
 <img src="$sampling" alt="density of rays, by the distance from a camera">
-<figcaption>How many cameras see a point, and how densely rays sample it, by its distance from a
-camera: near a camera hardly any other sees what it samples most.</figcaption>
+<figcaption>How many training cameras have a point in their pictures, and how many rays of theirs
+pass by it per area, by its distance from one of them: means over points, whatever hides one thing
+behind another. The density leaves out that pixels off the axis are more densely spaced in angle.
+</figcaption>
 </figure>
 <h2 id="figures">What the figures are</h2>
-<p>Light in front is absorbed before 0.8 of the true depth, light behind after 1.25 of it. Optical
-depth near cameras is measured up to a tenth of the content distance. Where two training views see:
-over the pixels of test views whose true surface at least two training views see; coverage is the
-share of them where the field is at least half opaque. Views pulled back are training cameras moved
-back by a fifth of the content distance.</p>
+<p>Light in front is absorbed before 0.8 of the true depth, light at surfaces from there to 1.25 of
+it, light behind after that, and light that passes nowhere: the four sum to 1. More at surfaces is
+better; each of the others alone is neither, as a field that is emptier everywhere has less light in
+front and more that passes. Optical depth near cameras is measured up to a tenth of the content
+distance. Where two training views see: over the pixels of test views whose true surface at least
+two training views see; coverage is the share of them where the field is at least half opaque. Views
+pulled back are training cameras moved back by a fifth of the content distance.</p>
 <script>
 const views = $views;
 const place = document.getElementById("views");
@@ -182,10 +186,14 @@ def _figures(rows: Sequence[Row]) -> str:
             if values is None:
                 cells.append("<td></td>")
                 continue
-            spread = f"<small>± {np.ptp(values) / 2.0:.{figure.digits}f}</small>"
+            spread = ""
+            if len(values) > 1:
+                spread = f"<small>± {np.ptp(values) / 2.0:.{figure.digits}f}</small>"
             cells.append(f"<td>{np.mean(values):.{figure.digits}f}{spread}</td>")
         lines.append(f"<tr><td>{escape(figure.heading)}</td>{''.join(cells)}</tr>")
-    seconds = "".join(f"<td>{np.mean(row.seconds):.0f}</td>" for row in rows)
+    seconds = "".join(
+        f"<td>{np.mean(row.seconds):.0f}</td>" if row.seconds else "<td></td>" for row in rows
+    )
     lines.append(f"<tr><td>seconds of training</td>{seconds}</tr>")
     return _table([row.candidate.name for row in rows], lines)
 

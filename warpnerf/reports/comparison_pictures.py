@@ -37,23 +37,26 @@ def views_of(experiment: Experiment) -> Views:
 
     A view that is pulled back has a truth where the scene can be photographed again.
     """
-    scene = experiment.capture.scene
-    fields = {c.name: experiment.field(c, experiment.seeds[0]) for c in experiment.candidates}
-    background = next(iter(fields.values())).background
+    scene, seed = experiment.capture.scene, experiment.seeds[0]
     test = scene.splits["test"]
+    views = [scene.views[index] for index in dict.fromkeys((test[0], test[len(test) // 2]))]
+    cameras = {view.name: view.camera for view in views}
+    cameras[PULLED_BACK] = scene.training_cameras[len(scene.training_cameras) // 2]
+    for name, camera in cameras.items():
+        cameras[name] = camera.downscaled(camera.block_for(MAX_PIXELS))
+    back = PULLED_SHARE * scene.content_distance
+    cameras[PULLED_BACK] = cameras[PULLED_BACK].moved_back(back)
     found: Views = {}
-    for index in dict.fromkeys((test[0], test[len(test) // 2])):
-        view = scene.views[index]
-        found[view.name] = {PHOTOGRAPH: _reduced(truth(view, background), view)}
-        camera = view.camera.downscaled(view.camera.block_for(MAX_PIXELS))
-        for name, field in fields.items():
-            found[view.name][name] = to_bytes(field.render(camera).rgb)
-    camera = scene.training_cameras[len(scene.training_cameras) // 2]
-    camera = camera.downscaled(camera.block_for(MAX_PIXELS))
-    camera = camera.moved_back(PULLED_SHARE * scene.content_distance)
-    found[PULLED_BACK] = _photographed(experiment, camera)
-    for name, field in fields.items():
-        found[PULLED_BACK][name] = to_bytes(field.render(camera).rgb)
+    for candidate in experiment.candidates:
+        if experiment.failure(candidate, seed) is not None:
+            continue
+        field = experiment.field(candidate, seed)  # one at a time: they may be large
+        if not found:
+            found = {v.name: {PHOTOGRAPH: _reduced(truth(v, field.background), v)} for v in views}
+            found[PULLED_BACK] = _photographed(experiment, cameras[PULLED_BACK])
+        for name, camera in cameras.items():
+            found[name][candidate.name] = to_bytes(field.render(camera).rgb)
+        del field
     return found
 
 

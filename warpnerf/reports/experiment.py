@@ -1,7 +1,8 @@
 """Experiments: configurations times seeds, each a run in a folder, that end where they were cut.
 
 experiment.json             what is trained: capture, configurations, seeds
-runs/CONFIGURATION-seed-K/  a run, as ``warpnerf train`` leaves it, with measures in metrics.json
+runs/CONFIGURATION-seed-K/  a run, as ``warpnerf train`` leaves it, with measures in metrics.json;
+                            failed.json says why, where its training failed
 moments/CONFIGURATION/K.npz one camera's rendering at a few moments of the training with seed 0
 """
 
@@ -20,6 +21,7 @@ from warpnerf.checks import InputError, cannot_write
 from warpnerf.config import TrainConfig
 from warpnerf.config_json import config_to_json
 from warpnerf.rendering.field import Field, Rendering
+from warpnerf.runs.files import is_leftover, sweep
 from warpnerf.runs.run import Run
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.files import read_json
@@ -27,7 +29,7 @@ from warpnerf.scenes.scene import Scene
 from warpnerf.scenes.split import Split
 from warpnerf.training.coarse import prepare_trainer
 from warpnerf.training.plan import resolve
-from warpnerf.training.state import Progress
+from warpnerf.training.state import Progress, scene_digest
 from warpnerf.training.trainer import Trainer
 from warpnerf.writing import write_atomically
 
@@ -38,7 +40,7 @@ in Philip & Deschaintre 2023, figure 6."""
 MOMENT_PIXELS = 320 * 240
 """Of these renderings, at most, about."""
 
-RECORD = "experiment.json"
+RECORD, FAILED = "experiment.json", "failed.json"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,32 +87,30 @@ class Experiment:
         return [(candidate, seed) for seed in self.seeds for candidate in self.candidates]
 
     def begin(self) -> None:
-        """Make the folder, or continue in it.
+        """Make the folder, or continue in it, with more seeds or configurations as well.
 
         Raises:
             InputError: It holds another experiment or other files, or cannot be written to.
         """
         path = self.folder / RECORD
+        require_free(self.folder)
         wanted = json.loads(json.dumps(self._record()))
-        if path.exists():
-            found = read_json(path, dict[str, Any])
-            if any(found.get(name) != wanted[name] for name in wanted):
-                raise InputError(
-                    f"--output {self.folder} holds another comparison: its "
-                    f"{_difference(found, wanted)}; name a new folder."
+        found = read_json(path, dict[str, Any]) if path.exists() else {}
+        begun = _begun(wanted, found)
+        if found and any(found.get(name) != begun[name] for name in begun):
+            wrong = f"holds another comparison: its {_difference(found, begun)}; name a new folder."
+            if found | {"views": begun["views"]} == begun:
+                wrong = (
+                    "holds a comparison on other photographs, masks, cameras or split; bring them "
+                    "back, or name a new folder."
                 )
-            return
+            raise InputError(f"--output {self.folder} {wrong}")
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            others = sorted(path.name for path in self.folder.iterdir())
-        except OSError as error:
-            raise cannot_write(f"--output {self.folder}", error) from error
-        if others:
-            raise InputError(
-                f"--output {self.folder} holds other files ({others[0]}); name a new folder."
-            )
-        try:
-            write_atomically(path, (json.dumps(wanted, indent=2) + "\n").encode())
+            for place in (self.folder, *self.folder.glob("moments/*"), *self.folder.glob("views")):
+                sweep(place)
+            if found != wanted:
+                write_atomically(path, (json.dumps(wanted, indent=2) + "\n").encode())
         except OSError as error:
             raise cannot_write(f"--output {self.folder}", error) from error
 
@@ -120,6 +120,7 @@ class Experiment:
             "downscale": self.capture.downscale,
             "masks": self.capture.masks,
             "split": self.capture.split,
+            "views": scene_digest(self.capture.scene, ("train", "test")),
             "seeds": len(self.seeds),
             "configurations": {
                 candidate.name: config_to_json(candidate.config) for candidate in self.candidates
@@ -137,6 +138,15 @@ class Experiment:
             return None
         return read_json(path, dict[str, Any])
 
+    def failure(self, candidate: Candidate, seed: int) -> str | None:
+        """Why a training failed, a sentence; None: it did not. Without its folder it starts again.
+
+        Raises:
+            InputError: The record of it is damaged.
+        """
+        path = self.run(candidate, seed).folder / FAILED
+        return read_json(path, dict[str, str]).get("error", "") if path.exists() else None
+
     def train(
         self,
         candidate: Candidate,
@@ -145,6 +155,8 @@ class Experiment:
         on_progress: Callable[[float, str], None] = lambda done, words: None,
     ) -> bool:
         """Train to the end and measure, from where it was cut; nothing where both are done.
+
+        A training whose loss is no longer finite ends, and is recorded as failed.
 
         Args:
             candidate: What is trained.
@@ -157,9 +169,8 @@ class Experiment:
 
         Raises:
             InputError: The folder cannot be written to, or another process trains there.
-            FloatingPointError: The loss is no longer finite.
         """
-        if self.metrics(candidate, seed) is not None:
+        if self.metrics(candidate, seed) or self.failure(candidate, seed) is not None:
             return True
         run = self.run(candidate, seed)
         run.folder.parent.mkdir(exist_ok=True)
@@ -174,18 +185,24 @@ class Experiment:
                     run.log(progress)
                     on_progress(progress.fraction, str(progress))
 
-                trainer.run(
-                    report,
-                    run.save_checkpoint,
-                    stop,
-                    None if moments is None else moments.after_update,
-                    checkpoint_when_done=False,
-                )
+                try:
+                    trainer.run(
+                        report,
+                        run.save_checkpoint,
+                        stop,
+                        None if moments is None else moments.after_update,
+                        checkpoint_when_done=False,
+                    )
+                except FloatingPointError as error:
+                    text = json.dumps({"error": str(error)}) + "\n"
+                    write_atomically(run.folder / FAILED, text.encode())
+                    return True
                 if trainer.fraction < 1.0:
                     return False
-                run.save_field(trainer.field(), keep_checkpoints=False)
-                run.draw_curves(self.capture.scene.name)
+                run.save_field(trainer.field())
                 del trainer, moments
+            run.remove_checkpoints()
+            run.draw_curves(self.capture.scene.name)
             self._measure(run, candidate, on_progress)
         return True
 
@@ -261,6 +278,32 @@ def camera_of_moments(scene: Scene) -> Camera:
     cameras = scene.training_cameras
     camera = cameras[len(cameras) // 2]
     return camera.downscaled(camera.block_for(MOMENT_PIXELS))
+
+
+def require_free(folder: Path) -> None:
+    """Raise InputError where a folder holds other files than those of an experiment.
+
+    Raises:
+        InputError: It does, or cannot be read.
+    """
+    try:
+        names = sorted(p.name for p in folder.iterdir() if not is_leftover(p))
+    except (FileNotFoundError, NotADirectoryError):
+        names = []  # is made later, or refused
+    except OSError as error:
+        raise cannot_write(f"--output {folder}", error) from error
+    if names and RECORD not in names:
+        raise InputError(f"--output {folder} holds other files ({names[0]}); name a new folder.")
+
+
+def _begun(wanted: dict[str, Any], found: dict[str, Any]) -> dict[str, Any]:
+    """A record without the seeds and configurations that it has besides another's."""
+    begun, configurations = dict(wanted), found.get("configurations")
+    if isinstance(found.get("seeds"), int):
+        begun["seeds"] = min(found["seeds"], wanted["seeds"])
+    if isinstance(configurations, dict) and set(configurations) <= set(wanted["configurations"]):
+        begun["configurations"] = {name: wanted["configurations"][name] for name in configurations}
+    return begun
 
 
 def _difference(found: Any, wanted: Any, where: str = "") -> str:

@@ -127,8 +127,14 @@ def _counts(path: Path) -> bool:
 def sweep(folder: Path) -> None:
     """Remove what processes left behind that were killed while saving."""
     for path in folder.glob(".*.tmp"):
-        if re.fullmatch(r"\..+\.(json|jsonl|png|safetensors)\.\d+\.tmp", path.name):
+        if is_leftover(path):
             path.unlink()
+
+
+def is_leftover(path: Path) -> bool:
+    """Whether a file is one that a process was killed while it wrote, by its name."""
+    kinds = "html|json|jsonl|npz|png|safetensors"
+    return re.fullmatch(rf"\..+\.({kinds})\.\d+\.tmp", path.name) is not None
 
 
 def set_aside(folder: Path, in_use: Path) -> None:

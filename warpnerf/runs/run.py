@@ -328,6 +328,16 @@ class Run:
         with self._writing():
             run_files.discard_figures(self.folder)
 
+    def remove_checkpoints(self) -> None:
+        """Remove what the training could be resumed from; the field must be saved.
+
+        Raises:
+            InputError: They cannot be removed.
+        """
+        with self._writing():
+            for path in self.checkpoints:
+                path.unlink()
+
     def save_field(self, field: Field, keep_checkpoints: bool = True) -> None:
         """Write the field, in half precision.
 

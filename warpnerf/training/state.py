@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
 
@@ -256,8 +256,10 @@ def require_finite(
             raise not_finite(what, plan, step)
 
 
-def scene_digest(scene: Scene) -> str:
+def scene_digest(scene: Scene, splits: Sequence[str] = ("train",)) -> str:
     """SHA-256 over what training draws from: pixels, masks and cameras of the training views.
+
+    Or of the views of other splits as well, one after the other.
 
     Poses count to 1e-5 of the content distance that the cameras tell, and pixels of the camera to
     1e-3: another machine may round what it computes of them otherwise.
@@ -266,7 +268,7 @@ def scene_digest(scene: Scene) -> str:
     if scene.content_distances is not None:  # of points, which may come and go beside a scene
         unit = find_focus(scene.training_cameras).distance
     digest = hashlib.sha256()
-    for index in scene.splits["train"]:
+    for index in [index for split in splits for index in scene.splits[split]]:
         view = scene.views[index]
         camera = view.camera
         lens = (camera.fx, camera.fy, camera.cx, camera.cy)

@@ -71,7 +71,8 @@ class RayOverlap:
     cameras: np.ndarray
     """[n] how many cameras have the point in their pictures, mean over points."""
     density: np.ndarray
-    """[n] pixels' rays of all cameras per area across them, mean over points: 1 / scene unit^2.
+    """[n] pixels' rays of all cameras per area across them, mean over points: 1 / scene unit^2. All
+    pixels count as if they were on the axis; others of a pinhole camera are denser, by 1 / cos^3.
     With samples at even distances, times one in so many scene units, samples per volume."""
 
 
