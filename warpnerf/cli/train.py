@@ -43,7 +43,7 @@ def train_command(options: TrainOptions, given: Annotated[Given, USUAL] = NOTHIN
     """
     options.require_usable()
     if processes.are_several():
-        options.require_no_page()
+        options.require_no_looks()
         return processes.together(lambda peers: _train_command(options, given, peers))
     return _train_command(options, given, ALONE)
 
