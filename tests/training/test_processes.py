@@ -143,7 +143,7 @@ def test_processes_that_train_otherwise_are_refused(tmp_path: Path) -> None:
         assert not run.exists()
     (run / "of_others").mkdir(parents=True)  # only the first process looks there
     done = several(lambda rank: command(scene, run), tmp_path)
-    assert done[0].code == 2 and done[1].code == 1, done
+    assert [ended.code for ended in done] == [2, 2], done
     (sentence,) = sentences(done)
     assert "holds other files; name a new folder" in sentence
 

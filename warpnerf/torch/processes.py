@@ -70,10 +70,18 @@ class Processes(Peers):
 
     def from_first(self, make: Callable[[], T]) -> T:
         """By a broadcast; the others wait for as long as it takes."""
-        found = [make() if self.rank == 0 else None]
+        found: list[Any] = [None, None]
+        if self.rank == 0:
+            try:
+                found[0] = make()
+            except InputError as error:
+                found[1] = str(error)
         with _lost():
             dist.broadcast_object_list(found)
-        return found[0]  # type: ignore[return-value]
+        result, refused = found
+        if refused is not None:
+            raise InputError(refused)
+        return result
 
     def require_same(self, what: Callable[[], dict[str, str]]) -> None:
         """All compare what all have, and so find the same."""

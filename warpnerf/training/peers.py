@@ -48,6 +48,7 @@ class Peers:
             make: What it returns can be pickled.
 
         Raises:
+            InputError: The function raises it; then all processes do.
             PeerLostError: One has ended.
         """
         return make()
