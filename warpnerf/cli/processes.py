@@ -47,6 +47,7 @@ def together(train: Callable[[Peers], int]) -> int:
 
     Raises:
         InputError: Input is bad, and no other process has told.
+        FloatingPointError: A short training fails likewise.
     """
     require_extra("torch", "torch", "training in several processes")
     from warpnerf.torch.processes import Processes
@@ -57,11 +58,11 @@ def together(train: Callable[[Peers], int]) -> int:
         sys.stdout = Path(os.devnull).open("w")  # noqa: SIM115
     try:
         return train(peers)
-    except InputError:
+    except (InputError, FloatingPointError) as error:
         if peers.is_first_to_fail():
             raise
-        return BAD_INPUT
-    except PeerLostError as error:  # before the first update
+        return BAD_INPUT if isinstance(error, InputError) else FAILED
+    except PeerLostError as error:  # before this training can have saved anything
         return _told(str(error)) if peers.is_first_to_fail() else FAILED
 
 
@@ -96,13 +97,19 @@ def exit_code_of(stop: StopRequest, trainer: Trainer) -> int | None:
 
 
 def follow(run: Run, trainer: Trainer) -> int:
-    """Train beside the first process, which writes."""
+    """Train beside the first process, which writes.
+
+    Raises:
+        PeerLostError: One has ended before the first update.
+    """
     from warpnerf.training.peers import PeerLostError
 
     with StopRequest(PATIENCE) as stop:
         try:
             trainer.run(None, lambda state: None, lambda: stop.asked, checkpoint_when_done=False)
         except PeerLostError as error:
+            if trainer.steps_done == 0:  # what the folder holds may be of a run before
+                raise
             return saved_alone(run, trainer, error)
         except FloatingPointError:  # of which the first process tells
             return FAILED
