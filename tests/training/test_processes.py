@@ -148,6 +148,24 @@ def test_processes_that_train_otherwise_are_refused(tmp_path: Path) -> None:
     assert "holds other files; name a new folder" in sentence
 
 
+def test_of_a_loss_that_is_not_finite_in_one_process_the_first_tells(tmp_path: Path) -> None:
+    scene, run, update = make_scene(tmp_path), tmp_path / "run", Trainer.update
+
+    def runs_away(trainer: Trainer) -> None:
+        update(trainer)
+        if trainer._updates == 3 and trainer.peers.rank == 1:
+            trainer._pass.loss.fill_(float("nan"))
+
+    def one(rank: int) -> int:
+        Trainer.update = runs_away  # type: ignore[method-assign]
+        return command(scene, run)
+
+    done = several(one, tmp_path)
+    assert [ended.code for ended in done] == [1, 1], done
+    (sentence,) = sentences(done[:1])
+    assert "the loss is not finite after step 3" in sentence and not sentences(done[1:])
+
+
 def test_one_writes_and_prints_and_one_that_is_stopped_stops_all(tmp_path: Path) -> None:
     scene, run, update = make_scene(tmp_path), tmp_path / "run", Trainer.update
 

@@ -102,13 +102,15 @@ class Processes(Peers):
             dist.all_reduce(torch.zeros(1), group=self._saving)
 
     def agree(self, signals: Signals) -> Signals:
-        """The seconds of the first process; one that stops, or the first that saves, is enough."""
+        """The seconds of the first process; one that stops, whose loss is not finite, or the first
+        that saves, is enough."""
         first = self.rank == 0
-        mine = (signals.seconds if first else 0.0, signals.stop, first and signals.save)
+        seconds, save = signals.seconds if first else 0.0, first and signals.save
+        mine = (seconds, signals.stop, save, not signals.finite)
         all_of = torch.tensor([float(value) for value in mine], dtype=torch.float64)
         self._reduce(all_of, dist.ReduceOp.MAX)
-        seconds, stop, save = all_of.tolist()
-        return Signals(seconds=seconds, stop=bool(stop), save=bool(save))
+        seconds, stop, save, failed = all_of.tolist()
+        return Signals(seconds=seconds, stop=bool(stop), save=bool(save), finite=not failed)
 
     def add(self, accumulated: Sequence[tuple[Gradients, Parameter]]) -> None:
         """Sums of touched tiles and of weights; the order of summands depends on ranks alone.

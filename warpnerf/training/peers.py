@@ -27,6 +27,8 @@ class Signals:
     """Whether one of them is asked to stop."""
     save: bool
     """Whether a checkpoint is due at the first process."""
+    finite: bool = True
+    """Whether the losses of all of them are finite numbers."""
 
 
 class Peers:
