@@ -195,6 +195,7 @@ class Trainer:
             on_checkpoint(self.state())
         else:
             self._require_finite()
+        self.peers.wait()  # torchrun ends all once one exits with other than 0
         return self.report()
 
     @property
