@@ -15,7 +15,7 @@ from warpnerf.cli.given import Given
 from warpnerf.cli.machine import FAILED
 from warpnerf.config import TrainConfig
 from warpnerf.config_json import config_to_json
-from warpnerf.runtime.memory import usable_cores
+from warpnerf.runtime.memory import processes_here, usable_cores
 from warpnerf.runtime.signals import Stopped, StopRequest
 
 if TYPE_CHECKING:
@@ -68,12 +68,11 @@ def together(train: Callable[[Peers], int]) -> int:
 
 def share_of_machine(config: TrainConfig, given: Given) -> TrainConfig:
     """A configuration with this process's share of the cores, or its own GPU."""
-    rank, count = (int(os.environ.get(name, "0")) for name in ("LOCAL_RANK", "LOCAL_WORLD_SIZE"))
     if config.device.startswith("cuda"):
-        config = replace(config, device=f"cuda:{rank}")
+        config = replace(config, device=f"cuda:{os.environ.get('LOCAL_RANK', '0')}")
     if "threads" in given:
         return config
-    return replace(config, threads=max(1, usable_cores() // max(1, count)))
+    return replace(config, threads=max(1, usable_cores() // processes_here()))
 
 
 def identity(scene: Scene, config: TrainConfig) -> dict[str, str]:
