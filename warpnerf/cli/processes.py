@@ -67,7 +67,16 @@ def together(train: Callable[[Peers], int]) -> int:
 
 
 def share_of_machine(config: TrainConfig, given: Given) -> TrainConfig:
-    """A configuration with this process's share of the cores, or its own GPU."""
+    """A configuration with this process's share of the cores, or its own GPU.
+
+    Raises:
+        InputError: One GPU is named for all processes.
+    """
+    if ":" in "".join(given.get("device", ())):
+        raise InputError(
+            f"--device {config.device} does not go with several processes, of which each has its "
+            "own GPU; give --device cuda, and choose GPUs by CUDA_VISIBLE_DEVICES."
+        )
     if config.device.startswith("cuda"):
         config = replace(config, device=f"cuda:{os.environ.get('LOCAL_RANK', '0')}")
     if "threads" in given:
@@ -80,7 +89,11 @@ def identity(scene: Scene, config: TrainConfig) -> dict[str, str]:
     from warpnerf.training.state import scene_digest
 
     same = config_to_json(replace(config, device="cpu", threads=None))
-    return {"scene": scene_digest(scene), "configuration": json.dumps(same, sort_keys=True)}
+    return {
+        "scene": scene_digest(scene),
+        "configuration": json.dumps(same, sort_keys=True),
+        "kind of device": config.device.partition(":")[0],
+    }
 
 
 def patience(peers: Peers) -> float:

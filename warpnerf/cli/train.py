@@ -44,7 +44,6 @@ def train_command(options: TrainOptions, given: Annotated[Given, USUAL] = NOTHIN
     """
     options.require_usable()
     if processes.are_several():
-        options.require_no_looks()
         return processes.together(lambda peers: _train_command(options, given, peers))
     return _train_command(options, given, ALONE)
 
@@ -56,6 +55,8 @@ def _train_command(options: TrainOptions, given: Given, peers: Peers) -> int:
         config = configured(config, given, options.model_options, options.loss)
         return config if peers.count == 1 else processes.share_of_machine(config, given)
 
+    if peers.count > 1:
+        options.require_no_looks()
     if options.resume is not None:
         for name in ("output", "preset", "config", "downscale", "split", "overwrite"):
             if getattr(options, name) is not None and getattr(options, name) is not False:

@@ -51,9 +51,7 @@ class Processes(Peers):
             )
             self._training = dist.new_group(timeout=PATIENCE)
             self._saving = dist.new_group(timeout=SAVING)
-            self._devices = None
-            if torch.cuda.is_available():
-                self._devices = dist.new_group(backend="nccl", timeout=PATIENCE)
+            self._devices: dist.ProcessGroup | None = None
         except (RuntimeError, ValueError) as error:
             why = str(error).strip().partition("\n")[0][:200].rstrip(".")
             raise InputError(
@@ -119,6 +117,7 @@ class Processes(Peers):
         """
         device = accumulated[0][0].arrays["weights"].device
         if device.is_cuda:
+            self._use(device)
             wp.synchronize_device(device)
         tiled: list[tuple[torch.Tensor, torch.Tensor]] = []
         rows: list[torch.Tensor] = []
@@ -132,7 +131,14 @@ class Processes(Peers):
         self._add_flags([touched for _, touched in tiled])
         self._add_values([_tiles(*of) for of in tiled], rows)
         if device.is_cuda:
-            torch.cuda.synchronize()
+            torch.cuda.synchronize(device.ordinal)
+
+    def _use(self, device: wp.Device) -> None:
+        """Exchange by NCCL, from this process's device; all processes have one then."""
+        torch.cuda.set_device(device.ordinal)
+        if self._devices is None:
+            with _lost():
+                self._devices = dist.new_group(backend="nccl", timeout=PATIENCE)
 
     def _add_flags(self, flags: list[torch.Tensor]) -> None:
         """Flags that any process has set."""
