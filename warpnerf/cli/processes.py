@@ -62,8 +62,8 @@ def together(train: Callable[[Peers], int]) -> int:
         if peers.is_first_to_fail():
             raise
         return BAD_INPUT if isinstance(error, InputError) else FAILED
-    except PeerLostError as error:  # before this training can have saved anything
-        return _told(str(error)) if peers.is_first_to_fail() else FAILED
+    except PeerLostError as error:  # before the first update
+        return _told_once(peers, error)
 
 
 def share_of_machine(config: TrainConfig, given: Given) -> TrainConfig:
@@ -109,11 +109,7 @@ def exit_code_of(stop: StopRequest, trainer: Trainer) -> int | None:
 
 
 def follow(run: Run, trainer: Trainer) -> int:
-    """Train beside the first process, which writes.
-
-    Raises:
-        PeerLostError: One has ended before the first update.
-    """
+    """Train beside the first process, which writes."""
     from warpnerf.training.peers import PeerLostError
 
     with StopRequest(PATIENCE) as stop:
@@ -121,7 +117,7 @@ def follow(run: Run, trainer: Trainer) -> int:
             trainer.run(None, lambda state: None, lambda: stop.asked, checkpoint_when_done=False)
         except PeerLostError as error:
             if trainer.steps_done == 0:  # what the folder holds may be of a run before
-                raise
+                return _told_once(trainer.peers, error)
             return saved_alone(run, trainer, error)
         except FloatingPointError:  # of which the first process tells
             return FAILED
@@ -154,6 +150,10 @@ def _ended(run: Run, trainer: Trainer, error: PeerLostError) -> int:
     except FloatingPointError:
         pass  # nothing to resume from; the checkpoint before stays
     return _told(f"{str(error).rstrip('.')}; {run.way_on()}.")
+
+
+def _told_once(peers: Peers, error: PeerLostError) -> int:
+    return _told(str(error)) if peers.is_first_to_fail() else FAILED
 
 
 def _told(sentence: str) -> int:

@@ -60,10 +60,10 @@ class Processes(Peers):
             ) from error
 
     def is_first_to_fail(self) -> bool:
-        """Whether no process has called this before: of one error, one tells."""
+        """By a count in the store where they met."""
         try:
             return int(self._store.add("failed", 1)) == 1
-        except RuntimeError:  # the first process keeps it, and has ended
+        except RuntimeError:  # who keeps it has ended: the first process, or torchrun
             return False
 
     def from_first(self, make: Callable[[], T]) -> T:

@@ -43,6 +43,10 @@ class Peers:
     count: int = 1
     """How many there are."""
 
+    def is_first_to_fail(self) -> bool:
+        """Whether no process has called this before: of one error, one tells."""
+        return True
+
     def from_first(self, make: Callable[[], T]) -> T:
         """What a function returns in the first process, which alone calls it.
 
