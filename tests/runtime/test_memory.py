@@ -34,10 +34,13 @@ def test_a_container_counts(
 ) -> None:
     monkeypatch.setattr(memory, "CONTAINER_LIMITS", ())
     without = memory.usable_memory()
+    assert without is not None
     if text is not None:
         (tmp_path / "memory.max").write_text(text)
     monkeypatch.setattr(memory, "CONTAINER_LIMITS", (tmp_path / "memory.max",))
     assert memory.usable_memory() == (expected or without)
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
+    assert memory.usable_memory() == (expected or without) // 2
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,9 @@ from tests.support.cli_process import make_scene
 from tests.support.several import Ended, several
 from tests.support.tiny_trainings import STEPS, ball, tiny_config
 from tests.support.tiny_trainings import early_growth as early_growth
+from warpnerf.checks import InputError
 from warpnerf.cli.main import main
+from warpnerf.cli.processes import share_of_machine
 from warpnerf.training.peers import Peers
 from warpnerf.training.trainer import Trainer
 
@@ -129,6 +131,13 @@ def test_a_lost_process_ends_the_others_with_a_checkpoint(
     assert (run / "field.safetensors").exists()
 
 
+def test_a_gpu_with_a_number_is_refused() -> None:
+    config = tiny_config(device="cuda:1")
+    with pytest.raises(InputError, match="--device cuda:1 does not go with several processes"):
+        share_of_machine(config, {"device": ("cuda:1",)})
+    assert share_of_machine(config, {}).device == "cuda:0"  # as it was begun, elsewhere
+
+
 def test_processes_that_train_otherwise_are_refused(tmp_path: Path) -> None:
     scene, run = make_scene(tmp_path), tmp_path / "run"
     for options, name in ((("--seed", "1"), "configuration"), (("--downscale", "2"), "scene")):
@@ -141,11 +150,33 @@ def test_processes_that_train_otherwise_are_refused(tmp_path: Path) -> None:
         (sentence,) = sentences(done)
         assert f"process 1 trains with another {name} than process 0" in sentence
         assert not run.exists()
+    done = several(lambda rank: command(scene, run, "--eval-every", "2"), tmp_path)
+    assert [ended.code for ended in done] == [2, 2], done
+    (sentence,) = sentences(done)
+    assert "--eval-every does not go with several processes" in sentence
     (run / "of_others").mkdir(parents=True)  # only the first process looks there
     done = several(lambda rank: command(scene, run), tmp_path)
-    assert done[0].code == 2 and done[1].code == 1, done
+    assert [ended.code for ended in done] == [2, 2], done
     (sentence,) = sentences(done)
     assert "holds other files; name a new folder" in sentence
+
+
+def test_of_a_loss_that_is_not_finite_in_one_process_the_first_tells(tmp_path: Path) -> None:
+    scene, run, update = make_scene(tmp_path), tmp_path / "run", Trainer.update
+
+    def runs_away(trainer: Trainer) -> None:
+        update(trainer)
+        if trainer._updates == 3 and trainer.peers.rank == 1:
+            trainer._pass.loss.fill_(float("nan"))
+
+    def one(rank: int) -> int:
+        Trainer.update = runs_away  # type: ignore[method-assign]
+        return command(scene, run)
+
+    done = several(one, tmp_path)
+    assert [ended.code for ended in done] == [1, 1], done
+    (sentence,) = sentences(done[:1])
+    assert "the loss is not finite after step 3" in sentence and not sentences(done[1:])
 
 
 def test_one_writes_and_prints_and_one_that_is_stopped_stops_all(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from warpnerf.cli.machine import FAILED
 from warpnerf.config import TrainConfig
 from warpnerf.config_json import config_to_json
 from warpnerf.runtime.child import is_child
-from warpnerf.runtime.memory import usable_cores
+from warpnerf.runtime.memory import processes_here, usable_cores
 from warpnerf.runtime.signals import Stopped, StopRequest
 
 if TYPE_CHECKING:
@@ -49,6 +49,7 @@ def together(train: Callable[[Peers], int]) -> int:
 
     Raises:
         InputError: Input is bad, and no other process has told.
+        FloatingPointError: A short training fails likewise.
     """
     require_extra("torch", "torch", "training in several processes")
     from warpnerf.torch.processes import Processes
@@ -59,22 +60,30 @@ def together(train: Callable[[Peers], int]) -> int:
         sys.stdout = Path(os.devnull).open("w")  # noqa: SIM115
     try:
         return train(peers)
-    except InputError:
+    except (InputError, FloatingPointError) as error:
         if peers.is_first_to_fail():
             raise
-        return BAD_INPUT
+        return BAD_INPUT if isinstance(error, InputError) else FAILED
     except PeerLostError as error:  # before the first update
-        return _told(str(error)) if peers.is_first_to_fail() else FAILED
+        return _told_once(peers, error)
 
 
 def share_of_machine(config: TrainConfig, given: Given) -> TrainConfig:
-    """A configuration with this process's share of the cores, or its own GPU."""
-    rank, count = (int(os.environ.get(name, "0")) for name in ("LOCAL_RANK", "LOCAL_WORLD_SIZE"))
+    """A configuration with this process's share of the cores, or its own GPU.
+
+    Raises:
+        InputError: One GPU is named for all processes.
+    """
+    if ":" in "".join(given.get("device", ())):
+        raise InputError(
+            f"--device {config.device} does not go with several processes, of which each has its "
+            "own GPU; give --device cuda, and choose GPUs by CUDA_VISIBLE_DEVICES."
+        )
     if config.device.startswith("cuda"):
-        config = replace(config, device=f"cuda:{rank}")
+        config = replace(config, device=f"cuda:{os.environ.get('LOCAL_RANK', '0')}")
     if "threads" in given:
         return config
-    return replace(config, threads=max(1, usable_cores() // max(1, count)))
+    return replace(config, threads=max(1, usable_cores() // processes_here()))
 
 
 def identity(scene: Scene, config: TrainConfig) -> dict[str, str]:
@@ -82,7 +91,11 @@ def identity(scene: Scene, config: TrainConfig) -> dict[str, str]:
     from warpnerf.training.state import scene_digest
 
     same = config_to_json(replace(config, device="cpu", threads=None))
-    return {"scene": scene_digest(scene), "configuration": json.dumps(same, sort_keys=True)}
+    return {
+        "scene": scene_digest(scene),
+        "configuration": json.dumps(same, sort_keys=True),
+        "kind of device": config.device.partition(":")[0],
+    }
 
 
 def patience(peers: Peers) -> float:
@@ -105,6 +118,8 @@ def follow(run: Run, trainer: Trainer) -> int:
         try:
             trainer.run(None, lambda state: None, lambda: stop.asked, checkpoint_when_done=False)
         except PeerLostError as error:
+            if trainer.steps_done == 0:  # what the folder holds may be of a run before
+                return _told_once(trainer.peers, error)
             return saved_alone(run, trainer, error)
         except FloatingPointError:  # of which the first process tells
             return FAILED
@@ -137,6 +152,10 @@ def _ended(run: Run, trainer: Trainer, error: PeerLostError) -> int:
     except FloatingPointError:
         pass  # nothing to resume from; the checkpoint before stays
     return _told(f"{str(error).rstrip('.')}; {run.way_on()}.")
+
+
+def _told_once(peers: Peers, error: PeerLostError) -> int:
+    return _told(str(error)) if peers.is_first_to_fail() else FAILED
 
 
 def _told(sentence: str) -> int:

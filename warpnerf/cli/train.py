@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -43,7 +44,6 @@ def train_command(options: TrainOptions, given: Annotated[Given, USUAL] = NOTHIN
     """
     options.require_usable()
     if processes.are_several():
-        options.require_no_page()
         return processes.together(lambda peers: _train_command(options, given, peers))
     return _train_command(options, given, ALONE)
 
@@ -55,6 +55,8 @@ def _train_command(options: TrainOptions, given: Given, peers: Peers) -> int:
         config = configured(config, given, options.model_options, options.loss)
         return config if peers.count == 1 else processes.share_of_machine(config, given)
 
+    if peers.count > 1:
+        options.require_no_looks()
     if options.resume is not None:
         for name in ("output", "preset", "config", "downscale", "split", "overwrite"):
             if getattr(options, name) is not None and getattr(options, name) is not False:
@@ -71,13 +73,10 @@ def _train_command(options: TrainOptions, given: Given, peers: Peers) -> int:
         from warpnerf.rendering.losses import parts_with
 
         parts_with(config.model, "float32", config.loss)
-    if peers.rank > 0:  # which only reads
-        return _begin_alone(options.scene, Path(), options, config, peers)
-    if options.output is not None:
-        return _begin(options.scene, options.output, options, config, peers)
-    with new_folder(options.scene) as output:
-        print(f"training into {output}", flush=True)
-        return _begin(options.scene, output, options, config, peers)
+    source = options.scene
+    with ExitStack() as stack:  # the first process alone writes
+        output = peers.from_first(lambda: stack.enter_context(_run_folder(source, options)))
+        return _begin(source, output, options, config, peers)
 
 
 def _starting_point(options: TrainOptions) -> tuple[TrainConfig, TrainOptions]:
@@ -102,14 +101,18 @@ def _starting_point(options: TrainOptions) -> tuple[TrainConfig, TrainOptions]:
     return run.train, options
 
 
-def _begin(
-    source: str, output: Path, options: TrainOptions, config: TrainConfig, peers: Peers
-) -> int:
-    """Train from the first step on."""
-    _require_free(output, options.overwrite)
-    with lock.only_writer(output):
+@contextmanager
+def _run_folder(source: str, options: TrainOptions) -> Iterator[Path]:
+    """The folder of a new run, which nobody else writes to meanwhile."""
+    with ExitStack() as stack:
+        output = options.output
+        if output is None:
+            output = stack.enter_context(new_folder(source))
+            print(f"training into {output}", flush=True)
+        _require_free(output, options.overwrite)
+        stack.enter_context(lock.only_writer(output))
         _require_free(output, options.overwrite)  # once more, now that nobody else begins there
-        return _begin_alone(source, output, options, config, peers)
+        yield output
 
 
 def _require_free(output: Path, overwrite: bool) -> None:
@@ -124,12 +127,11 @@ def _require_free(output: Path, overwrite: bool) -> None:
         Run.require_free(output, overwrite)
 
 
-def _begin_alone(
+def _begin(
     source: str, output: Path, options: TrainOptions, config: TrainConfig, peers: Peers
 ) -> int:
-    """Train from the first step on, as the only one that writes to the folder."""
+    """Train from the first step on."""
     require_machine(config)
-    output = peers.from_first(lambda: output)
     split = None if options.split is None else read_split(options.split)
     photographs, masks = source, options.masks
     downscale = 1 if options.downscale is None else options.downscale
@@ -187,11 +189,11 @@ def _resume(
     """Train from the last checkpoint on."""
     from warpnerf.runs.run import Run
 
-    Run(folder).read_config()
-    if peers.rank > 0:  # which only reads
-        return _go_on(Run(folder), options, changed, peers)
-    with Run(folder).only_writer():
-        return _go_on(Run(folder), options, changed, peers)
+    run = Run(folder)
+    run.read_config()
+    with ExitStack() as stack:  # the first process alone writes
+        peers.from_first(lambda: stack.enter_context(run.only_writer()))
+        return _go_on(run, options, changed, peers)
 
 
 def _go_on(

@@ -93,9 +93,14 @@ class TrainOptions:
             what = f"--log {self.log}"
             require_extra({"tensorboard": "tensorboardX"}.get(self.log, self.log), self.log, what)
 
-    def require_no_page(self) -> None:
-        """Raise InputError where a page is to be served: the other processes of a training would
-        wait for whoever looks at it."""
+    def require_no_looks(self) -> None:
+        """Raise InputError where one process is to render between updates: the other processes of
+        the training would wait for it."""
+        if self.eval_every is not None:
+            raise InputError(
+                "--eval-every does not go with several processes; leave it out: test views are "
+                "looked at when training is done."
+            )
         if self.page is not None:
             raise InputError(
                 "--view does not go with several processes; leave it out, and look at the run by "

@@ -32,7 +32,7 @@ from warpnerf.fields.parameters import Parameter
 from warpnerf.model.interface import Model, loader
 from warpnerf.model.storage_kinds import StorageKind
 from warpnerf.optim_config import OptimConfig
-from warpnerf.runtime.memory import prefer_large_pages, usable_memory
+from warpnerf.runtime.memory import prefer_large_pages, processes_here, usable_memory
 from warpnerf.runtime.parallel import NODES, Workers
 from warpnerf.scenes.cameras.camera import Camera
 
@@ -378,7 +378,9 @@ def require_memory(
         )
     own = kind.training_bytes(model, size)
     total = device.total_memory if device.is_cuda else usable_memory()
-    where = device if device.is_cuda else "this machine"
+    where = str(device) if device.is_cuda else "this machine"
+    if not device.is_cuda and processes_here() > 1:
+        where = f"each of {processes_here()} processes on this machine"
     if total is None or own + besides <= total:
         return
     both = f"of the {(own + besides) / 2**30:.1f} GiB that training needs"

@@ -42,10 +42,17 @@ CORE_LIMITS = (
 def usable_memory() -> int | None:
     """Bytes that this process can hope for: the machine's, its container's or its own limit's.
 
+    It has its share of the machine and the container where torchrun has started several processes.
     None where the system does not tell.
     """
-    limits = [limit for limit in (_machine(), *map(_container, CONTAINER_LIMITS), _own()) if limit]
-    return min(limits, default=None)
+    of_all = [limit for limit in (_machine(), *map(_container, CONTAINER_LIMITS)) if limit]
+    limits = [limit // processes_here() for limit in of_all]
+    return min((*limits, *filter(None, [_own()])), default=None)
+
+
+def processes_here() -> int:
+    """How many processes torchrun has started on this machine; 1 where it has started none."""
+    return max(1, int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
 
 
 def available_memory() -> int | None:

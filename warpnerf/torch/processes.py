@@ -51,9 +51,7 @@ class Processes(Peers):
             )
             self._training = dist.new_group(timeout=PATIENCE)
             self._saving = dist.new_group(timeout=SAVING)
-            self._devices = None
-            if torch.cuda.is_available():
-                self._devices = dist.new_group(backend="nccl", timeout=PATIENCE)
+            self._devices: dist.ProcessGroup | None = None
         except (RuntimeError, ValueError) as error:
             why = str(error).strip().partition("\n")[0][:200].rstrip(".")
             raise InputError(
@@ -62,18 +60,26 @@ class Processes(Peers):
             ) from error
 
     def is_first_to_fail(self) -> bool:
-        """Whether no process has called this before: of one error, one tells."""
+        """By a count in the store where they met."""
         try:
             return int(self._store.add("failed", 1)) == 1
-        except RuntimeError:  # the first process keeps it, and has ended
+        except RuntimeError:  # who keeps it has ended: the first process, or torchrun
             return False
 
     def from_first(self, make: Callable[[], T]) -> T:
         """By a broadcast; the others wait for as long as it takes."""
-        found = [make() if self.rank == 0 else None]
+        found: list[Any] = [None, None]
+        if self.rank == 0:
+            try:
+                found[0] = make()
+            except InputError as error:
+                found[1] = str(error)
         with _lost():
             dist.broadcast_object_list(found)
-        return found[0]  # type: ignore[return-value]
+        result, refused = found
+        if refused is not None:
+            raise InputError(refused)
+        return result
 
     def require_same(self, what: Callable[[], dict[str, str]]) -> None:
         """All compare what all have, and so find the same."""
@@ -94,13 +100,15 @@ class Processes(Peers):
             dist.all_reduce(torch.zeros(1), group=self._saving)
 
     def agree(self, signals: Signals) -> Signals:
-        """The seconds of the first process; one that stops, or the first that saves, is enough."""
+        """The seconds of the first process; one that stops, whose loss is not finite, or the first
+        that saves, is enough."""
         first = self.rank == 0
-        mine = (signals.seconds if first else 0.0, signals.stop, first and signals.save)
+        seconds, save = signals.seconds if first else 0.0, first and signals.save
+        mine = (seconds, signals.stop, save, not signals.finite)
         all_of = torch.tensor([float(value) for value in mine], dtype=torch.float64)
         self._reduce(all_of, dist.ReduceOp.MAX)
-        seconds, stop, save = all_of.tolist()
-        return Signals(seconds=seconds, stop=bool(stop), save=bool(save))
+        seconds, stop, save, failed = all_of.tolist()
+        return Signals(seconds=seconds, stop=bool(stop), save=bool(save), finite=not failed)
 
     def add(self, accumulated: Sequence[tuple[Gradients, Parameter]]) -> None:
         """Sums of touched tiles and of weights; the order of summands depends on ranks alone.
@@ -109,6 +117,7 @@ class Processes(Peers):
         """
         device = accumulated[0][0].arrays["weights"].device
         if device.is_cuda:
+            self._use(device)
             wp.synchronize_device(device)
         tiled: list[tuple[torch.Tensor, torch.Tensor]] = []
         rows: list[torch.Tensor] = []
@@ -122,7 +131,14 @@ class Processes(Peers):
         self._add_flags([touched for _, touched in tiled])
         self._add_values([_tiles(*of) for of in tiled], rows)
         if device.is_cuda:
-            torch.cuda.synchronize()
+            torch.cuda.synchronize(device.ordinal)
+
+    def _use(self, device: wp.Device) -> None:
+        """Exchange by NCCL, from this process's device; all processes have one then."""
+        torch.cuda.set_device(device.ordinal)
+        if self._devices is None:
+            with _lost():
+                self._devices = dist.new_group(backend="nccl", timeout=PATIENCE)
 
     def _add_flags(self, flags: list[torch.Tensor]) -> None:
         """Flags that any process has set."""

@@ -27,6 +27,8 @@ class Signals:
     """Whether one of them is asked to stop."""
     save: bool
     """Whether a checkpoint is due at the first process."""
+    finite: bool = True
+    """Whether the losses of all of them are finite numbers."""
 
 
 class Peers:
@@ -41,6 +43,10 @@ class Peers:
     count: int = 1
     """How many there are."""
 
+    def is_first_to_fail(self) -> bool:
+        """Whether no process has called this before: of one error, one tells."""
+        return True
+
     def from_first(self, make: Callable[[], T]) -> T:
         """What a function returns in the first process, which alone calls it.
 
@@ -48,6 +54,7 @@ class Peers:
             make: What it returns can be pickled.
 
         Raises:
+            InputError: The function raises it; then all processes do.
             PeerLostError: One has ended.
         """
         return make()

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+import warp as wp
 
 from warpnerf.config import TrainConfig
 from warpnerf.fields.lattice import Lattice
@@ -38,7 +39,13 @@ from warpnerf.training.optim import adam_step, first_states
 from warpnerf.training.peers import ALONE, Peers, Signals
 from warpnerf.training.plan import TrainingPlan, resolve
 from warpnerf.training.resampling import first_proposal, grown_proposal, resampling_of
-from warpnerf.training.state import Progress, TrainingState, require_finite, scene_digest
+from warpnerf.training.state import (
+    Progress,
+    TrainingState,
+    not_finite,
+    require_finite,
+    scene_digest,
+)
 from warpnerf.training.warmup import training_kernels
 
 REPORT_EVERY = 25
@@ -158,10 +165,15 @@ class Trainer:
         self._load_kernels()
         self.peers.wait()
         saved_step, saved_at = self.steps_done, time.monotonic()
+        finite = True
         while True:
             late = time.monotonic() - saved_at >= self.config.checkpoint_every
             due = late and self.steps_done > saved_step
-            agreed = self.peers.agree(Signals(seconds=self._seconds, stop=stop(), save=due))
+            agreed = self.peers.agree(
+                Signals(seconds=self._seconds, stop=stop(), save=due, finite=finite)
+            )
+            if not agreed.finite:
+                raise not_finite("the loss is", self.plan, self.steps_done)
             self._seconds = agreed.seconds
             if agreed.save and on_checkpoint is not None:
                 on_checkpoint(self.state())
@@ -174,15 +186,16 @@ class Trainer:
                 began = time.perf_counter()
                 between()
                 self._started += time.perf_counter() - began
-            if self.report_due:
-                progress = self.report()
-                if on_progress is not None:
-                    on_progress(progress)
+            if self.report_due or self.peers.count > 1:  # of which one may be about to save
+                finite = math.isfinite(self._mean(self._pass.loss))
+            if finite and self.report_due and on_progress is not None:
+                on_progress(self.report())
         unsaved = self.steps_done > saved_step
         if on_checkpoint is not None and unsaved and (checkpoint_when_done or self.fraction < 1.0):
             on_checkpoint(self.state())
         else:
             self._require_finite()
+        self.peers.wait()  # torchrun ends all once one exits with other than 0
         return self.report()
 
     @property
@@ -261,9 +274,7 @@ class Trainer:
         """Where training stands; FloatingPointError where the loss is not finite."""
         if self._progress is not None and self._progress.step == self.steps_done:
             return self._progress
-        n_rays = self._pass.n_rays
-        error = float(self._pass.error.numpy()[:n_rays].mean())
-        loss = float(self._pass.loss.numpy()[:n_rays].mean())
+        error, loss = self._mean(self._pass.error), self._mean(self._pass.loss)
         require_finite([("the loss is", loss)], self.plan, self.steps_done)
         self._progress = Progress(
             step=self.steps_done,
@@ -271,12 +282,16 @@ class Trainer:
             seconds=self._seconds,
             loss=loss,
             psnr=-10.0 * math.log10(max(error / 3.0, 1e-12)),
-            samples_per_ray=float(self._pass.n_samples.numpy()[:n_rays].mean()),
+            samples_per_ray=self._mean(self._pass.n_samples),
             size=self.lattice.size,
             occupied=self._occupied,
             seen=self._seen,
         )
         return self._progress
+
+    def _mean(self, of_rays: wp.array) -> float:
+        """Over the rays of the last pass."""
+        return float(of_rays.numpy()[: self._pass.n_rays].mean())
 
     def state(self) -> TrainingState:
         """All that it takes to resume, in the trainer's own arrays, which the next update changes.
