@@ -35,6 +35,7 @@ ARCHIVES = (".zip", ".r3d", ".tar", ".gz", ".tgz", ".7z", ".rar")
 
 BUILTIN = "builtin:"
 BUILTIN_NAMES = ("room", "room-sparse")
+BUILTIN_KNOWN = ", ".join(BUILTIN + name for name in (*BUILTIN_NAMES, "building-N"))
 
 
 @checked_arguments
@@ -92,9 +93,8 @@ def load_scene(
     path = Path(path)
     masks = None if masks is None else Path(masks)
     if not exists(path):
-        known = ", ".join(BUILTIN + name for name in BUILTIN_NAMES)
         raise InputError(
-            f"{path}: does not exist; give a scene's folder, or a built-in scene ({known})."
+            f"{path}: does not exist; give a scene's folder, or a built-in scene ({BUILTIN_KNOWN})."
         )
     how: dict[str, Any] = {
         "downscale": downscale,
@@ -190,8 +190,7 @@ def _load_builtin(name: str, downscale: int) -> Scene:
 
         return building_scene(int(rooms[1]), downscale=downscale)
     if name not in BUILTIN_NAMES:
-        known = ", ".join(BUILTIN + known for known in (*BUILTIN_NAMES, "building-N"))
-        raise InputError(f"{BUILTIN}{name}: no such built-in scene; there are {known}.")
+        raise InputError(f"{BUILTIN}{name}: no such built-in scene; there are {BUILTIN_KNOWN}.")
     from warpnerf.scenes.builtin.room import (
         room_scene,  # a ray tracer: loaded only where it is used
     )
