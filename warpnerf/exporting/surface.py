@@ -34,7 +34,7 @@ Crop = tuple[Sequence[float], Sequence[float]]
 
 
 class NothingThereError(InputError):
-    """A field holds nothing of what is requested."""
+    """A field holds nothing of what is to be written."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
