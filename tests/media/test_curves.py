@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from warpnerf.media.curves import _TEST, SIZE, CurvePoint, curves, running_mean
-from warpnerf.media.plots import _round_numbers
+from warpnerf.media.plots import _round_numbers, _ticks
 
 
 def point(step: int, test: float | None = None) -> CurvePoint:
@@ -41,3 +41,17 @@ def test_round_numbers(low: float, high: float) -> None:
     numbers = _round_numbers(low, high)
     assert 2 <= len(numbers) <= 8
     assert min(numbers) >= low - 1e-9 and max(numbers) <= high + 1e-9
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "expected"),
+    [
+        (0.5, 70.0, [0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0]),
+        (0.01, 3000.0, [0.01, 0.1, 1.0, 10.0, 100.0, 1000.0]),
+        (2.1, 4.9, [2.5, 3.0, 3.5, 4.0, 4.5]),
+        (1e-9, 1e9, [1e-5, 1.0, 1e5]),
+    ],
+)
+def test_ticks_of_logarithmic_axes(low: float, high: float, expected: list[float]) -> None:
+    found = [10.0**value for value in _ticks(np.log10(low), np.log10(high), logarithmic=True)]
+    np.testing.assert_allclose(found, expected, rtol=1e-9)

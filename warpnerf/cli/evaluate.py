@@ -53,6 +53,10 @@ def eval_command(
         distance = Lpips(lpips)
     run = open_trained(folder)
     config = run.read_config()
+    its_own = scene is None and masks is None and split == "test"
+    kept = run if isinstance(run, Run) and its_own and measures else None
+    if kept is not None:
+        kept.read_metrics()  # refused now, if it is damaged
     field, notes = run.load_field(device, threads)
     for note in notes:
         print(f"warpnerf: note: {note}", file=sys.stderr)
@@ -72,9 +76,10 @@ def eval_command(
             field, views, split, lpips=distance, on_progress=bar.report, measures=measures
         )
     print(result)
-    its_own = scene is None and masks is None and split == "test"
-    if isinstance(run, Run) and its_own and result.measures is not None:
-        run.add_measures(result.measures)
     if json is not None:
         write_json(json, result.to_json())
+    if kept is not None and result.measures is not None:
+        path = kept.add_measures(result.measures)
+        if path is not None:
+            print(f"added measures to {path}")
     return 0

@@ -25,6 +25,9 @@ COLOURS = (
 SIZE = (760, 460)
 """Of a plot, pixels."""
 
+MAX_TICKS = 8
+"""Along a logarithmic axis."""
+
 _GRID = (225, 225, 225)
 _TEXT, _TITLE = 15, 20
 _LEFT, _RIGHT, _TOP, _BOTTOM = 70, 20, 34, 46
@@ -120,12 +123,12 @@ class Frame:
         """
         draw, small = self._draw, font(_TEXT)
         draw.text((self._left, self._top - 6), beside, INK, small, anchor="lb")
-        for value in _round_numbers(*self._x):
+        for value in _ticks(*self._x, logarithmic[0]):
             x, _ = self.place(value, self._y[0])
             draw.line([(x, self._top), (x, self._bottom)], _GRID)
             text = _number(value, logarithmic[0])
             draw.text((x, self._bottom + 6), text, FAINT, small, anchor="mt")
-        for value in _round_numbers(*self._y):
+        for value in _ticks(*self._y, logarithmic[1]):
             _, y = self.place(self._x[0], value)
             draw.line([(self._left, y), (self._right, y)], _GRID)
             text = _number(value, logarithmic[1])
@@ -150,6 +153,27 @@ class Frame:
         for number, (name, colour) in enumerate(reversed(entries)):
             at = (self._right - 8, self._bottom - 8 - 1.3 * _TEXT * number)
             self._draw.text(at, name, colour, font(_TEXT), anchor="rb")
+
+
+def _ticks(low: float, high: float, logarithmic: bool) -> list[float]:
+    """About five round numbers in a range, or logarithms of such.
+
+    Logarithms are of 1, 2 and 5 times powers of ten; over many powers, of ten and its powers alone,
+    and over less than a power of ten, of numbers in even steps.
+    """
+    if not logarithmic:
+        return _round_numbers(low, high)
+    powers = range(math.floor(low), math.ceil(high) + 1)
+    for leading in ((1.0, 2.0, 5.0), (1.0,)):
+        found = [k + math.log10(n) for k in powers for n in leading]
+        found = [value for value in found if low <= value <= high]
+        if len(found) <= MAX_TICKS:
+            break
+    else:
+        return [value for value in _round_numbers(low, high) if value.is_integer()]
+    if len(found) >= 2:
+        return found
+    return [math.log10(n) for n in _round_numbers(10.0**low, 10.0**high) if n > 0.0]
 
 
 def _round_numbers(low: float, high: float) -> list[float]:

@@ -133,10 +133,7 @@ class Experiment:
 
     def metrics(self, candidate: Candidate, seed: int) -> dict[str, Any] | None:
         """metrics.json of a training; None: it has not finished."""
-        path = self.run(candidate, seed).folder / "metrics.json"
-        if not path.exists():
-            return None
-        return read_json(path, dict[str, Any])
+        return self.run(candidate, seed).read_metrics()
 
     def failure(self, candidate: Candidate, seed: int) -> str | None:
         """Why a training failed, a sentence; None: it did not. Without its folder it starts again.

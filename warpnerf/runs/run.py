@@ -25,7 +25,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -48,6 +48,7 @@ from warpnerf.runs.config import Keep, RunConfig, describe
 from warpnerf.runs.logs import Log, LogKind, open_log, read_reports
 from warpnerf.runs.pictures import evaluate_into
 from warpnerf.runs.tensor_file import DamagedFileError
+from warpnerf.scenes.files import read_json
 from warpnerf.scenes.scene import Scene
 from warpnerf.scenes.split import Split
 from warpnerf.training.state import MAY_GROW, Progress, TrainingState, differences
@@ -392,18 +393,32 @@ class Run:
         """
         return evaluate_into(self.folder, field, scene, split, self._writing, on_progress, measures)
 
-    def add_measures(self, measures: Measures) -> None:
-        """Add measures of the test views to metrics.json; nothing where there is none.
+    def read_metrics(self) -> dict[str, Any] | None:
+        """What metrics.json says; None: there is none.
 
         Raises:
-            InputError: It cannot be written.
+            InputError: It cannot be read.
         """
         path = self.folder / "metrics.json"
-        if not path.exists():
-            return
+        return read_json(path, dict[str, Any]) if path.exists() else None
+
+    def add_measures(self, measures: Measures) -> Path | None:
+        """Add measures of the test views to metrics.json; nothing where there is none.
+
+        Returns:
+            The file, where there is one.
+
+        Raises:
+            InputError: It cannot be read or written.
+        """
+        metrics = self.read_metrics()
+        if metrics is None:
+            return None
+        path = self.folder / "metrics.json"
         with self._writing():
-            content = json.loads(path.read_bytes()) | {"measures": measures.to_dict()}
+            content = metrics | {"measures": measures.to_dict()}
             write_atomically(path, (json.dumps(content, indent=2) + "\n").encode())
+        return path
 
     def way_on(self) -> str:
         """How to resume, or that there is nothing to resume from: half a sentence."""
