@@ -18,7 +18,7 @@ from candidates.warpnerf_step import WarpStep
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("model", ["rgb", "per_sample"])
+@pytest.mark.parametrize("model", ["per_sample"])
 def test_compiled_torch_agrees(model):
     """Apart from the rest, for it takes long to compile."""
     found, missing = candidates.find("cpu", model)
