@@ -257,7 +257,7 @@ def test_training(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     )
     result = train(flat_scene(), config, on_progress=lambda p: losses.append(p.loss))
     assert len(losses) == 60
-    assert losses[-1] < 0.2 * losses[0]
+    assert losses[-1] < 0.1 * losses[0]
     camera = flat_scene().views[-1].camera
     assert np.isfinite(result.field.render(camera).rgb).all()
 
@@ -324,7 +324,7 @@ def test_training_in_another_space(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     config = TrainConfig(
         model="rgb",
         loss=SQUARED,
-        steps=100,
+        steps=220,  # free space is looked for at 200
         rays_per_step=200,
         threads=1,
         background="black",
@@ -334,7 +334,7 @@ def test_training_in_another_space(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     )
     scene = replace(flat_scene(), unbounded=True)
     field = train(scene, config, on_progress=lambda p: losses.append(p.loss)).field
-    assert losses[-1] < 0.2 * losses[0]
+    assert losses[-1] < 0.1 * losses[0]
     assert field.lattice.contracted and field.free.size == (5, 5, 5)
     path, camera = tmp_path / "field.safetensors", scene.views[-1].camera
     save_field(path, field)
