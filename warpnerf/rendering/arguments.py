@@ -1,7 +1,5 @@
 """Arguments of a differentiable rendering that frameworks share, and their checks."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterable, Sequence
