@@ -63,7 +63,7 @@ def test_a_library_that_cannot_be_loaded(
     def fail(words: list[str]) -> int:
         raise error
 
-    monkeypatch.setattr(command, "_parsed", fail)
+    monkeypatch.setattr(command, "call_of", fail)
     assert main(["runs"]) == BAD_INPUT
     said = capsys.readouterr().err
     assert said.startswith("warpnerf: error: a library cannot be loaded (") and "ulimit -v" in said
@@ -76,7 +76,7 @@ def test_names_that_cannot_be_those_of_files(
     def fail(words: list[str]) -> int:
         raise OSError(number, "so", "x")
 
-    monkeypatch.setattr(command, "_parsed", fail)
+    monkeypatch.setattr(command, "call_of", fail)
     assert main(["runs"]) == code
     assert capsys.readouterr().err.startswith("warpnerf: error: x: so; ")
 

@@ -388,7 +388,7 @@ def test_what_is_given_in_place_of_a_scene_a_field_or_a_configuration_is_refused
         with pytest.raises(InputError, match=rf"{part} must be a \w+Config, not \{{"):
             wn.TrainConfig(**{part: {}})  # type: ignore[arg-type]
     for function in (what.evaluate, what.export):
-        with pytest.raises(InputError, match=r"field must be a Field, not 'runs/a'; load_field"):
+        with pytest.raises(InputError, match=r"field must be a Field.*, not 'runs/a'; load_field"):
             function("runs/a", tiny_scene(ring(4)))
     with pytest.raises(InputError, match=r"evaluate: scene must be a Scene, not 'photos'"):
         what.evaluate(ball_field(), "photos")
