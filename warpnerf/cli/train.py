@@ -367,10 +367,10 @@ def _train(
         except Stopped as stopped:  # asked a second time
             print(f"stopped; {run.way_on()}", flush=True)
             return stopped.exit_code
-        exit_code = processes.exit_code_of(stop, trainer)
         if trainer.fraction >= 1.0:
             run.save_field(trainer.field(), keep == "checkpoint")
             run.draw_curves(scene.name)
+        exit_code = processes.exit_code_of(stop, trainer)
     if session is not None:
         session.notify("The training has ended", f"warpnerf view {run.folder} shows what it left.")
     if log is not None and (exit_code is not None or options.eval_views == "none"):
