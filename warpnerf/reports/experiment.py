@@ -173,16 +173,16 @@ class Experiment:
         run.folder.parent.mkdir(exist_ok=True)
         with run.only_writer():
             if not (run.folder / "field.safetensors").exists():
-                trainer = self._trainer(run, candidate, seed)
-                moments = _Moments(trainer, self._moments(candidate)) if seed == 0 else None
-                if trainer.steps_done == 0 and moments is not None:
-                    moments.discard()
 
                 def report(progress: Progress) -> None:
                     run.log(progress)
                     on_progress(progress.fraction, str(progress))
 
                 try:
+                    trainer = self._trainer(run, candidate, seed)
+                    moments = _Moments(trainer, self._moments(candidate)) if seed == 0 else None
+                    if trainer.steps_done == 0 and moments is not None:
+                        moments.discard()
                     trainer.run(
                         report,
                         run.save_checkpoint,
