@@ -3,36 +3,31 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 from warpnerf.checks import InputError
 from warpnerf.cli import processes
 from warpnerf.cli.configured import begun_with, configured
 from warpnerf.cli.given import NOTHING, Given
-from warpnerf.cli.machine import FAILED, require_machine
+from warpnerf.cli.machine import require_machine
 from warpnerf.cli.pose import with_poses
 from warpnerf.cli.train_options import USUAL, TrainOptions
+from warpnerf.cli.training import describe, evaluate_run, split_to_look_at, train_to_the_end
 from warpnerf.cli.view import training_page
 from warpnerf.config import TrainConfig
 from warpnerf.presets import PRESETS
 from warpnerf.runs import lock
 from warpnerf.runs.names import new_folder
 from warpnerf.runtime.progress import ProgressBar
-from warpnerf.runtime.signals import Stopped, StopRequest
 from warpnerf.scenes.split import Split, read_split
-from warpnerf.training.peers import ALONE, PeerLostError, Peers
+from warpnerf.training.peers import ALONE, Peers
 
 if TYPE_CHECKING:
     from warpnerf.runs.run import Run
     from warpnerf.scenes.scene import Scene
-    from warpnerf.training.plan import TrainingPlan
-    from warpnerf.training.state import Progress
-    from warpnerf.training.trainer import Trainer
-    from warpnerf.viewer.session import Session
 
 
 def train_command(options: TrainOptions, given: Annotated[Given, USUAL] = NOTHING) -> int:
@@ -163,7 +158,7 @@ def _begin(
     if peers.rank > 0:
         return processes.follow(Run(output), trainer)
     trained = trainer.scene  # in which box and distance may be other ones
-    _describe(trained, trainer)
+    describe(trained, trainer)
     distance, near, looked = trainer.plan.content_distance, config.march.near, plan.looks_first
     found_odd = diagnostics(
         trained, survey(source), distance, near, looked=looked, threads=config.threads
@@ -177,7 +172,7 @@ def _begin(
         keep = options.keep or "field"
         of_scene = (_absolute(source), downscale, distance)
         run.create(trained, *of_scene, config, folder, found, keep, split)
-        return _train(run, trained, trainer, session, options)
+        return train_to_the_end(run, trained, trainer, session, options)
 
 
 def _resume(
@@ -222,7 +217,7 @@ def _go_on(
         scene = _read(
             source, begun.downscale, masks, run.folder, options, config.threads, begun.split
         )
-        return _evaluate(run, begun.as_trained(scene), options, config.device, config.threads)
+        return evaluate_run(run, begun.as_trained(scene), options, config.device, config.threads)
     state, notes = run.load_state()
     config = changed(
         dataclasses.replace(state.config, **{n: getattr(begun.train, n) for n in MAY_GROW})
@@ -240,7 +235,7 @@ def _go_on(
     if peers.rank > 0:
         return processes.follow(run, trainer)
     scene = begun.as_trained(scene)
-    _describe(scene, trainer)
+    describe(scene, trainer)
     for note in notes:
         print(f"  note: {note}")
     for name in ("device", "threads"):
@@ -261,7 +256,7 @@ def _go_on(
             run.set_keep(options.keep)
         run.rewind_log(trainer.steps_done)
         del state  # the trainer has copies
-        return _train(run, scene, trainer, session, options)
+        return train_to_the_end(run, scene, trainer, session, options)
 
 
 def _read(
@@ -289,180 +284,12 @@ def _read(
         split=split,
     )
     if options.eval_views != "none":
-        require_measurable(scene, _split_to_look_at(scene))
+        require_measurable(scene, split_to_look_at(scene))
     if options.eval_every is not None:
         from warpnerf.training.held_out import require_eval  # loads Warp
 
         require_eval(scene, options.eval_every)
     return scene
-
-
-def _split_to_look_at(scene: Scene) -> str:
-    return "test" if scene.splits.get("test") else "train"
-
-
-def _some_views(scene: Scene, split: str, count: Literal["all"] | int) -> Scene:
-    """The scene with so many of a split's views, spread."""
-    indices = scene.splits[split]
-    if count == "all" or count >= len(indices):
-        return scene
-    chosen = tuple(indices[len(indices) * k // count] for k in range(count))
-    return dataclasses.replace(scene, splits={**scene.splits, split: chosen})
-
-
-def _train(
-    run: Run,
-    scene: Scene,
-    trainer: Trainer,
-    session: Session | None,
-    options: TrainOptions,
-) -> int:
-    """Train to the end, or until asked to stop; look at the test views."""
-    from warpnerf.reports.limits import voxel_pixels, what_limits
-    from warpnerf.training.held_out import HeldOut
-
-    keep = run.read_config().keep
-    held_out = None if options.eval_every is None else HeldOut(trainer, options.eval_every)
-    log = None if options.log is None else run.open_log(options.log)
-    reports: list[Progress] = []
-    if trainer.fraction < 1.0:
-        run.discard_figures()
-
-    def between() -> None:
-        if session is not None:
-            session.after_update()
-        if held_out is not None:
-            held_out.after_update()
-
-    with StopRequest(processes.patience(trainer.peers)) as stop:
-        try:
-            with ProgressBar("first step") as bar:
-
-                def on_progress(progress: Progress) -> None:
-                    shown = progress
-                    if held_out is not None:
-                        progress = held_out.added_to(progress)
-                        shown = dataclasses.replace(progress, test_psnr=held_out.psnr)
-                    run.log(progress)
-                    if log is not None:
-                        run.write_to(log, progress)
-                    reports.append(progress)
-                    bar.report(progress.fraction, str(shown))
-
-                trainer.run(
-                    on_progress,
-                    run.save_checkpoint,
-                    lambda: stop.asked,
-                    between,
-                    checkpoint_when_done=keep == "checkpoint",
-                )
-        except FloatingPointError as error:
-            kept = "Nothing was saved before."
-            if run.last_step is not None:
-                kept = f"Step {run.last_step} is saved: warpnerf eval {run.folder} looks at it."
-            print(f"warpnerf: error: {error} {kept}", file=sys.stderr)
-            return FAILED
-        except PeerLostError as error:
-            return processes.saved_alone(run, trainer, error)
-        except Stopped as stopped:  # asked a second time
-            print(f"stopped; {run.way_on()}", flush=True)
-            return stopped.exit_code
-        if trainer.fraction >= 1.0:
-            run.save_field(trainer.field(), keep == "checkpoint")
-            run.draw_curves(scene.name)
-        exit_code = processes.exit_code_of(stop, trainer)
-    if session is not None:
-        session.notify("The training has ended", f"warpnerf view {run.folder} shows what it left.")
-    if log is not None and (exit_code is not None or options.eval_views == "none"):
-        log.close({})
-    if exit_code is not None:
-        step = trainer.steps_done
-        saved = f"stopped and saved after step {step}; continue with: {run.resume_command}"
-        print(saved if run.last_step == step else f"stopped; {run.way_on()}", flush=True)
-        return exit_code
-    if options.eval_views == "none":
-        print(f"wrote {run.folder}: field.safetensors, log.jsonl and config.json")
-        return 0
-    device, threads, pixels = trainer.config.device, trainer.config.threads, voxel_pixels(trainer)
-    del trainer  # its grid, and what its optimiser keeps
-
-    def at_end(metrics: Mapping[str, float], split: str) -> None:
-        limit = what_limits(reports, pixels, metrics["psnr"] if split == "test" else None)
-        if limit is not None:
-            print(limit)
-        if log is not None:
-            log.close(metrics)
-
-    return _evaluate(run, scene, options, device, threads, at_end)
-
-
-def _evaluate(
-    run: Run,
-    scene: Scene,
-    options: TrainOptions,
-    device: str,
-    threads: int | None,
-    at_end: Callable[[Mapping[str, float], str], None] = lambda metrics, split: None,
-) -> int:
-    """Look at the test views of a finished run, by the field that it keeps.
-
-    Args:
-        run: Whose field is saved.
-        scene: Its photographs.
-        options: How many of them.
-        device: Where to render.
-        threads: CPU threads.
-        at_end: Called with the mean metrics, and the split that they are of.
-    """
-    split = _split_to_look_at(scene)
-    assert options.eval_views != "none"
-    scene = _some_views(scene, split, options.eval_views)
-    print(f"rendering the {'test' if split == 'test' else 'training'} views", flush=True)
-    try:
-        with ProgressBar("first view") as bar:
-            field, _ = run.load_field(device, threads)
-            result = run.evaluate(field, scene, split, bar.report)
-        print(result)
-        at_end(result.mean, split)
-    except Stopped as stopped:
-        print(f"stopped; the field is saved. Continue with: {run.resume_command}", flush=True)
-        return stopped.exit_code
-    print(
-        f"wrote {run.folder}: field.safetensors, metrics.json, log.jsonl, config.json, and test/ "
-        f"with truth, rendering and depth of {len(result.images)} views\nlook at {run.sheet}",
-    )
-    return 0
-
-
-def _scaling(plan: TrainingPlan) -> str:
-    """How gradients are scaled, and up to where if that is not the content distance."""
-    scaling, distances = f"scaling {plan.config.scaling}", plan.content_distances
-    least, most = f"{min(distances):.3g}", f"{max(distances):.3g}"
-    if plan.config.scaling == "none" or set(distances) == {plan.content_distance}:
-        return scaling
-    return f"{scaling} below {least}" + (f" to {most}, by camera" if least != most else "")
-
-
-def _describe(scene: Scene, trainer: Trainer) -> None:
-    """What was understood of a scene."""
-    from warpnerf.scenes.extent.sharpness import in_words
-
-    train, test = len(scene.splits["train"]), len(scene.splits["test"])
-    sizes = sorted({(c.width, c.height) for c in scene.cameras})
-    shown = ", ".join(f"{w} x {h}" for w, h in sizes[:3]) + (", ..." if len(sizes) > 3 else "")
-    print(f"{scene.name}: {train} training and {test} test views, {shown} pixels")
-    for warning in scene.warnings:
-        print(f"  warning: {warning}")
-    for note in scene.notes:
-        print(f"  note: {note}")
-    plan = trainer.plan
-    print(f"  content distance {plan.content_distance:.4g} scene units, {_scaling(plan)}")
-    print(f"  rays are {plan.sampler.past}")
-    space = trainer.lattice.space  # of an object that is resumed, tighter than the plan's
-    print(f"  box {in_words(space, space.kind.words)}")
-    if trainer.steps_done == 0:
-        print(f"  voxels {plan.voxel_pixels}")
-    sys.stdout.flush()
 
 
 def _absolute(source: str) -> str:
