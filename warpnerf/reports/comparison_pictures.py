@@ -14,7 +14,7 @@ from warpnerf.media.pictures import INK, depth_legend, depth_picture, font, to_b
 from warpnerf.media.plots import line_plot
 from warpnerf.rendering.field import Rendering
 from warpnerf.reports.experiment import MOMENTS, Candidate, Experiment
-from warpnerf.runs.logs import read_reports
+from warpnerf.runs.logs import read_points
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.scene import View
 
@@ -103,13 +103,10 @@ def curves_picture(experiment: Experiment) -> np.ndarray:
 
 
 def _curve(experiment: Experiment, candidate: Candidate) -> tuple[np.ndarray, np.ndarray]:
-    reports = read_reports(experiment.run(candidate, experiment.seeds[0]).folder / "log.jsonl")
-    seen = np.array([report["seen"] for report in reports], float)
-    psnr = np.array([report["psnr"] for report in reports], float)
-    steps = np.array([report["step"] for report in reports], float)
-    if not len(steps):
-        return steps, psnr
-    return steps, running_mean(psnr - 10.0 * np.log10(seen))  # over whole pictures
+    points = read_points(experiment.run(candidate, experiment.seeds[0]).folder / "log.jsonl")
+    steps = np.array([point.step for point in points], float)
+    psnr = np.array([point.psnr for point in points], float)
+    return steps, running_mean(psnr) if points else psnr
 
 
 def _panels(seen: Sequence[Rendering], far: float) -> list[np.ndarray]:

@@ -5,12 +5,16 @@ from __future__ import annotations
 import csv
 import io
 import json
+import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
+import msgspec
+
 from warpnerf.checks import InputError
+from warpnerf.media.curves import CurvePoint
 from warpnerf.training.state import Progress
 
 LogKind = Literal["csv", "tensorboard", "wandb"]
@@ -153,6 +157,41 @@ def read_reports(log: Path) -> list[dict[str, Any]]:
             if _is_report(whole):
                 found.append(whole)
     return found
+
+
+def read_points(log: Path) -> list[CurvePoint]:
+    """What curves show of the reports of log.jsonl, over whole pictures."""
+    return [
+        CurvePoint(
+            step=report["step"],
+            seconds=report["seconds"],
+            loss=report["loss"] * report["seen"],  # rays that are not drawn have none
+            psnr=report["psnr"] - 10.0 * math.log10(report["seen"]),
+            test_psnr=report["test_psnr"],
+        )
+        for report in read_reports(log)
+    ]
+
+
+def rewound(log: bytes, step: int) -> bytes:
+    """The content of log.jsonl without reports of later steps, and without a line that a crash cut
+    off."""
+    lines = log.splitlines(keepends=True)
+    return b"".join(line for line in lines if _reported_step(line) <= step)
+
+
+class _Step(msgspec.Struct):
+    """A line of log.jsonl, as far as a resumed training reads it."""
+
+    step: int
+
+
+def _reported_step(line: bytes) -> float:
+    """The step of a report; infinity where a line is none."""
+    try:
+        return msgspec.json.decode(line, type=_Step).step
+    except msgspec.DecodeError:
+        return float("inf")
 
 
 def _is_report(report: Mapping[str, Any]) -> bool:

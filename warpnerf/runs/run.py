@@ -19,7 +19,6 @@ previous/                    a run that was replaced, until this one has saved s
 from __future__ import annotations
 
 import json
-import math
 import shlex
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -27,13 +26,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
 
-import msgspec
-
 from warpnerf.checks import InputError, cannot_write
 from warpnerf.config import TrainConfig
 from warpnerf.evaluation.evaluate import Evaluation
 from warpnerf.evaluation.measures import Measures
-from warpnerf.media.curves import CurvePoint, curves
+from warpnerf.media.curves import curves
 from warpnerf.media.pictures import write_png
 from warpnerf.rendering.field import Field
 from warpnerf.runs import files as run_files
@@ -45,7 +42,7 @@ from warpnerf.runs.checkpoint import (
     save_field,
 )
 from warpnerf.runs.config import Keep, RunConfig, describe
-from warpnerf.runs.logs import Log, LogKind, open_log, read_reports
+from warpnerf.runs.logs import Log, LogKind, open_log, read_points, read_reports, rewound
 from warpnerf.runs.pictures import evaluate_into
 from warpnerf.runs.tensor_file import DamagedFileError
 from warpnerf.scenes.files import read_json
@@ -292,16 +289,7 @@ class Run:
         Raises:
             InputError: It cannot be written.
         """
-        points = [
-            CurvePoint(
-                step=report["step"],
-                seconds=report["seconds"],
-                loss=report["loss"] * report["seen"],  # rays that are not drawn have none
-                psnr=report["psnr"] - 10.0 * math.log10(report["seen"]),
-                test_psnr=report["test_psnr"],
-            )
-            for report in read_reports(self.folder / "log.jsonl")
-        ]
+        points = read_points(self.folder / "log.jsonl")
         if points:
             title = f"{name}: {points[-1].step} steps in {points[-1].seconds:.0f} s"
             with self._writing():
@@ -315,10 +303,10 @@ class Run:
         """
         path = self.folder / "log.jsonl"
         with self._writing():
-            lines = path.read_bytes().splitlines(keepends=True) if path.exists() else []
-            kept = [line for line in lines if _reported_step(line) <= step]
-            if kept != lines:
-                write_atomically(path, b"".join(kept))
+            content = path.read_bytes() if path.exists() else b""
+            kept = rewound(content, step)
+            if kept != content:
+                write_atomically(path, kept)
 
     def discard_figures(self) -> None:
         """Remove metrics and pictures, before the field becomes another one.
@@ -456,17 +444,3 @@ def _first_whole(paths: list[Path], load: Callable[[Path], T]) -> tuple[Path, T,
         except DamagedFileError:
             notes.append(f"{path} is damaged; the checkpoint before it is used instead")
     return oldest, load(oldest), notes
-
-
-class _Report(msgspec.Struct):
-    """A line of log.jsonl, as far as it is read again."""
-
-    step: int
-
-
-def _reported_step(line: bytes) -> float:
-    """The step of a report; infinity where a line is none."""
-    try:
-        return msgspec.json.decode(line, type=_Report).step
-    except msgspec.DecodeError:
-        return float("inf")
