@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, get_args
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +11,7 @@ import numpy as np
 from warpnerf.checks import InputError, require_one_of, require_positive
 from warpnerf.config import Scaling
 from warpnerf.jax.arrays import array_of, constant, known
+from warpnerf.rendering.arguments import require_broadcasts, require_samples
 
 
 def scale_gradient(
@@ -48,25 +49,9 @@ def scale_gradient(
         array_of(field, value)
         for field, value in (("colors", colors), ("sigmas", sigmas), ("distances", distances))
     )
-    if sigmas.shape != distances.shape:
-        raise InputError(
-            f"sigmas and distances must have one shape, not {list(sigmas.shape)} and "
-            f"{list(distances.shape)}."
-        )
-    # One distance for all channels of a color.
-    flat = colors.ndim != distances.ndim
-    per_color = (*distances.shape, 1) if flat else distances.shape
-    if per_color[:-1] != colors.shape[:-1] or per_color[-1:] != (1,):
-        raise InputError(
-            f"colors must be [..., C] over sigmas [...] or [..., 1], not {list(colors.shape)} over "
-            f"{list(sigmas.shape)}."
-        )
+    require_samples(colors.shape, sigmas.shape, distances.shape)
     if isinstance(content_distance, (jax.Array, np.ndarray)):
-        if not _broadcasts_over(content_distance.shape, distances.shape):
-            raise InputError(
-                f"content_distance must broadcast over distances {list(distances.shape)}, not be "
-                f"{list(content_distance.shape)}."
-            )
+        require_broadcasts(content_distance.shape, distances.shape)
         values = known("content_distance", content_distance)
         if values is not None and not (values > 0).all():
             raise InputError("content_distance must be above 0 everywhere.")
@@ -79,7 +64,8 @@ def scale_gradient(
     scale = ratio * ratio
     if scaling == "clamped":
         scale = jnp.minimum(scale, 1.0)
-    return _scaled(colors, scale[..., None] if flat else scale), _scaled(sigmas, scale), distances
+    of_color = scale if colors.ndim == distances.ndim else scale[..., None]
+    return _scaled(colors, of_color), _scaled(sigmas, scale), distances
 
 
 @jax.custom_vjp
@@ -97,10 +83,3 @@ def _backward(scale: jax.Array, gradient: jax.Array) -> tuple[jax.Array, None]:
 
 
 _scaled.defvjp(_forward, _backward)
-
-
-def _broadcasts_over(shape: tuple[int, ...], other: Any) -> bool:
-    try:
-        return np.broadcast_shapes(shape, other) == other
-    except ValueError:
-        return False

@@ -1,4 +1,4 @@
-"""Arguments of a differentiable rendering that frameworks share, and their checks."""
+"""Arguments that the operations of several frameworks share, and their checks."""
 
 import itertools
 import math
@@ -38,6 +38,36 @@ class Head(NamedTuple):
     """The model's MLP, as torch.nn.Linear holds it: weight [outputs, inputs] and bias [outputs] of
     each layer, in turn; so ``network.parameters()``. Inputs are channels or features, then the
     encoded direction. Its gradient is scaled where it passes samples, so for per_sample."""
+
+
+def require_samples(colors: Sequence[int], sigmas: Sequence[int], distances: Sequence[int]) -> None:
+    """Raise InputError unless the shapes of samples' arrays fit: one distance for all channels of a
+    colour."""
+    if tuple(sigmas) != tuple(distances):
+        raise InputError(
+            f"sigmas and distances must have one shape, not {list(sigmas)} and {list(distances)}."
+        )
+    flat = len(colors) != len(distances)
+    of_color = (*distances, 1) if flat else tuple(distances)
+    if of_color[:-1] != tuple(colors[:-1]) or of_color[-1:] != (1,):
+        raise InputError(
+            f"colors must be [..., C] over sigmas [...] or [..., 1], not {list(colors)} over "
+            f"{list(sigmas)}."
+        )
+
+
+def require_broadcasts(content_distance: Sequence[int], distances: Sequence[int]) -> None:
+    """Raise InputError unless an array of content distances of some shape broadcasts over
+    distances."""
+    try:
+        fits = np.broadcast_shapes(tuple(content_distance), tuple(distances)) == tuple(distances)
+    except ValueError:
+        fits = False
+    if not fits:
+        raise InputError(
+            f"content_distance must broadcast over distances {list(distances)}, not be "
+            f"{list(content_distance)}."
+        )
 
 
 def steps_of(step: float | March) -> Steps:

@@ -8,6 +8,7 @@ import torch
 
 from warpnerf.checks import InputError, require_one_of, require_positive
 from warpnerf.config import Scaling
+from warpnerf.rendering.arguments import require_broadcasts, require_samples
 from warpnerf.torch.tensors import require_constant, require_dense, require_tensor
 
 
@@ -43,26 +44,11 @@ def scale_gradient(
     require_one_of("scaling", scaling, get_args(Scaling))
     for field, value in (("colors", colors), ("sigmas", sigmas), ("distances", distances)):
         require_tensor(field, value, colors)
-    if sigmas.shape != distances.shape:
-        raise InputError(
-            f"sigmas and distances must have one shape, not {list(sigmas.shape)} and "
-            f"{list(distances.shape)}."
-        )
-    # One distance for all channels of a color.
-    per_color = distances if colors.dim() == distances.dim() else distances.unsqueeze(-1)
-    if per_color.shape[:-1] != colors.shape[:-1] or per_color.shape[-1] != 1:
-        raise InputError(
-            f"colors must be [..., C] over sigmas [...] or [..., 1], not {list(colors.shape)} over "
-            f"{list(sigmas.shape)}."
-        )
+    require_samples(colors.shape, sigmas.shape, distances.shape)
     if isinstance(content_distance, torch.Tensor):
         require_dense("content_distance", content_distance)
         content_distance = content_distance.to(distances.device)
-        if not _broadcasts_over(content_distance, distances):
-            raise InputError(
-                f"content_distance must broadcast over distances {list(distances.shape)}, not be "
-                f"{list(content_distance.shape)}."
-            )
+        require_broadcasts(content_distance.shape, distances.shape)
         if not bool((content_distance > 0).all()):
             raise InputError("content_distance must be above 0 everywhere.")
     else:
@@ -89,10 +75,3 @@ class _Scaled(torch.autograd.Function):
     def backward(ctx: Any, grad: torch.Tensor) -> tuple[torch.Tensor, None]:
         (scale,) = ctx.saved_tensors
         return grad * scale.to(grad.dtype), None
-
-
-def _broadcasts_over(value: torch.Tensor, other: torch.Tensor) -> bool:
-    try:
-        return torch.broadcast_shapes(value.shape, other.shape) == other.shape
-    except RuntimeError:
-        return False
