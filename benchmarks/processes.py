@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import torch
 from measuring import machine, median_interval, options, show, write_record
+from training import path_of
 
 import warpnerf as wn
 from warpnerf.config import TrainConfig
@@ -143,9 +144,9 @@ def main(words: Sequence[str] | None = None) -> dict[str, Any]:
         grid = {**vars(fast.grid), "voxels": args.voxels}
         config = TrainConfig(**{**vars(config), "grid": type(fast.grid)(**grid)})
     each = TrainConfig(**{**vars(config), "threads": 1})
-    several = Several(n, args.exchange, args.scene, each)
+    several = Several(n, args.exchange, path_of(args.scene), each)
     together = TrainConfig(**{**vars(config), "threads": n})
-    alone = Side(wn.load_scene(args.scene), together, Peers())
+    alone = Side(wn.load_scene(path_of(args.scene)), together, Peers())
     for side in (alone, several):
         side.updates(1)  # compiles
     blocks: list[dict[str, float]] = []

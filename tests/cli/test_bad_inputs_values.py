@@ -361,6 +361,7 @@ def test_70_read_only_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     assert_trained(assert_fell_back(outcome, "/proc/self/.cache"))
 
 
+@pytest.mark.slow  # compiles what another cache has
 def test_70_damaged_cached_kernel(tmp_path: Path) -> None:
     assert_trained(train(make_scene(tmp_path), folder=tmp_path))
     cache = tmp_path / "run" / "cache"

@@ -303,7 +303,7 @@ def test_json_is_read(tmp_path: Path) -> None:
 # --- Shell, run ---------------------------------------------------------------------------------
 
 SHORT = {
-    "train": ("--time-limit", "4", "--voxels", "20000"),
+    "train": ("--steps", "150", "--voxels", "20000"),
     "render": ("--seconds", "0.2", "--size", "64", "48"),
     "demo": ("--steps", "20", "--downscale", "8"),
     "pose": (),

@@ -82,7 +82,8 @@ def test_a_training_compiles_for_cuda(model: Model, contraction: Any, tmp_path: 
     assert ".entry" in compiled(assembly.render_train_kernel(variant).module, tmp_path)
 
 
-@pytest.mark.parametrize("name", ["float32", pytest.param("float64", marks=pytest.mark.slow)])
+@pytest.mark.slow  # compiles for seconds
+@pytest.mark.parametrize("name", ["float32", "float64"])
 def test_factors_compile_for_cuda(name: str, tmp_path: Path) -> None:
     wp.init()
     factors = precision.load(name, "fields.factors")

@@ -97,6 +97,8 @@ def test_cut_anywhere_it_ends_with_the_same_bits(
     done = updates
     assert all(again.train(candidate, seed) for candidate, seed in again.trials)
     assert updates == done
+    of_seeds = [finished.metrics(finished.candidates[0], seed) for seed in finished.seeds]
+    assert of_seeds[0] != of_seeds[1]
 
 
 def test_the_report_is_one_file_and_says_what_figures_say(finished: Experiment) -> None:

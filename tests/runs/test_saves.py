@@ -166,7 +166,7 @@ def whole_steps(folder: Path) -> set[int]:
     return steps
 
 
-@pytest.mark.parametrize("finished", [False, True])
+@pytest.mark.parametrize("finished", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_killed_while_replacing_a_run_one_of_the_two_is_whole(
     tmp_path: Path, finished: bool
 ) -> None:

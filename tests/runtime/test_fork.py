@@ -87,6 +87,7 @@ def test_a_fork_amid_a_launch(on_cpu: None, monkeypatch: pytest.MonkeyPatch) -> 
         caller.join()
 
 
+@pytest.mark.slow  # compiles for seconds
 def test_torch_operations_in_a_fork(on_cpu: None) -> None:
     """As a DataLoader's workers call them, whose parent has done so before."""
     torch = pytest.importorskip("torch")

@@ -70,6 +70,7 @@ def psnr(train: Scene, test: Scene, device: str) -> float:
     return evaluate(wn.train(train, config).field, test).mean["psnr"]
 
 
+@pytest.mark.slow  # three trainings of seconds
 def test_it_trains_as_well_as_a_lens_without_distortion(
     rooms: tuple[Scene, Scene], device: str
 ) -> None:

@@ -368,6 +368,7 @@ def with_person(view: View, rng: np.random.Generator, masked: bool) -> View:
     return replace(view, image=image, mask=~where if masked else None)
 
 
+@pytest.mark.slow  # three trainings of seconds
 def test_what_masks_hide_is_not_learnt(device: str) -> None:
     """With masks photographs with people in them are worth nearly as much as clean ones."""
     clean = room_scene(4)

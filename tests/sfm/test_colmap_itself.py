@@ -99,14 +99,12 @@ def errors(scene: Scene) -> tuple[float, float]:
     return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).max()), float(apart)
 
 
+@pytest.mark.slow  # COLMAP takes seconds
 @pytest.mark.parametrize(
     "config",
     [
         PoseConfig(camera_model="PINHOLE"),
-        pytest.param(
-            PoseConfig(camera_model="PINHOLE", mapper="global", matching="sequential"),
-            marks=pytest.mark.slow,
-        ),
+        PoseConfig(camera_model="PINHOLE", mapper="global", matching="sequential"),
     ],
     ids=["incremental", "global"],
 )

@@ -121,6 +121,10 @@ def coarse_bound_when_packed(method: Callable[..., Any]) -> Callable[..., Any]:
     return bound
 
 
+def slow(*case: Any) -> Any:
+    return pytest.param(*case, marks=pytest.mark.slow)
+
+
 passed: set[tuple[str, ...]] = set()
 """Words of checks that do not fail where nothing is spoilt."""
 
@@ -129,15 +133,15 @@ passed: set[tuple[str, ...]] = set()
     ("method", "spoil", "words"),
     [
         ("gradient", times(1.0 + 1e-6), ["differences, plain", "differences, contracted space"]),
-        ("gradient", times(1.0 + 1e-5, "weights"), ["differences, deferred"]),
+        slow("gradient", times(1.0 + 1e-5, "weights"), ["differences, deferred"]),
         ("gradient", times(1.0 + 1e-6), ["differences, frustum"]),
         ("train", trained_times(1.0 + 1e-6), ["differences, losses"]),
         ("scatter", times(1.0 + 1e-5), ["gather"]),
         ("gradient", times(1.0 + 1e-6, "planes"), ["differences, field vm"]),
-        ("gradient", times(1.0 + 1e-6, "lines"), ["differences, field vm"]),
-        ("gradient", times(1.0 + 1e-6, "decoder"), ["differences, field vm"]),
+        slow("gradient", times(1.0 + 1e-6, "lines"), ["differences, field vm"]),
+        slow("gradient", times(1.0 + 1e-6, "decoder"), ["differences, field vm"]),
         ("gradient", times(1.0 + 1e-6, "values"), ["differences, field hash"]),
-        ("gradient", times(1.0 + 1e-6, "decoder"), ["differences, field hash"]),
+        slow("gradient", times(1.0 + 1e-6, "decoder"), ["differences, field hash"]),
         ("bound", trained_times(1.0 + 1e-6), ["differences, bound"]),
         ("bound", coarse_bound_when_packed, ["in packs of sixteen to float64, bound"]),
         ("gradient", without_scaling, ["s(t)", "t = 0"]),
