@@ -2,9 +2,9 @@
 
     python benchmarks/write_docs.py
 
-Each function under "Sections", here and in page_quality.py, writes one section. Its words hold
-whatever was measured, what follows from figures is in docs/decisions; its figures are read from the
-records, none is written by hand. After a new record, run it again.
+Each function under "Sections", here, in page_quality.py and in page_jobs.py, writes one section.
+Its words hold whatever was measured, what follows from figures is in docs/decisions; its figures
+are read from the records, none is written by hand. After a new record, run it again.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from measuring import RESULTS, ROOT, named, show
+from page_jobs import jobs
 from page_parts import Records, below, medians, middle, of, place, table, text, values
 from page_quality import calibration, extents, resampling, scaling
 
@@ -302,6 +303,7 @@ SECTIONS: dict[str, Callable[[Records], str]] = {
     "Resampled steps": resampling,
     "Poses and exposures": calibration,
     "Start, memory, rendering": machine,
+    "Several processes, scenes in blocks": jobs,
     "Exports": exports,
     "Viewer and nerfbaselines": served,
 }
