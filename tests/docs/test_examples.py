@@ -78,6 +78,17 @@ def test_scale_in_torch() -> None:
     assert 10.0 < scaled < 30.0 and 10.0 < plain < 30.0 and scaled != plain
 
 
+def test_scale_in_flax() -> None:
+    for package in ("jax", "flax", "optax"):
+        pytest.importorskip(package)
+    options = (SMALL[0], "--downscale", "16", "--steps", "15")
+    scaled, plain = (
+        example("scale_in_flax").main([*options, "--scaling", scaling])
+        for scaling in ("clamped", "none")
+    )
+    assert 8.0 < scaled < 30.0 and 8.0 < plain < 30.0 and scaled != plain
+
+
 def test_own_loss() -> None:
     found = example("own_loss").main([*SMALL, "--steps", "120", "--weight", "0.05"])
     without, with_it = (found[name].near_field.near_mass for name in found)
