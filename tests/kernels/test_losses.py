@@ -264,7 +264,7 @@ def test_opacity_by_auto_is_that_of_photographs_that_show_something_everywhere()
         (flat_scene(), black, 0.0),
     ):
         found, given = (
-            train(scene, config_of(losses, **changes)).field.storage.values.numpy()
+            train(scene, config_of(losses, steps=8, **changes)).field.storage.values.numpy()
             for losses in (auto, LossConfig(opacity=weight))
         )
         assert np.array_equal(found, given)

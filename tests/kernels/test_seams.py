@@ -319,12 +319,13 @@ def test_gradients_in_another_space(kernels64: Kernels) -> None:
 def test_training_in_another_space(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """By its name: it learns, and files hold it; who does not know it is told."""
     monkeypatch.setattr(trainer, "REPORT_EVERY", 1)
+    monkeypatch.setattr(trainer, "FIRST_LOOK", 50)  # for free space
     losses: list[float] = []
     grid = GridConfig(voxels=1000, grow_at=(0.7,), alpha_init=0.05, contraction="smooth")
     config = TrainConfig(
         model="rgb",
         loss=SQUARED,
-        steps=220,  # free space is looked for at 200
+        steps=70,
         rays_per_step=200,
         threads=1,
         background="black",

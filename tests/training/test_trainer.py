@@ -43,7 +43,7 @@ from warpnerf.training.trainer import Trainer
         ("deferred", 1, False),
         ("deferred", 3, True),
         ("rgb", 3, False),
-        ("per_sample", 3, False),
+        pytest.param("per_sample", 3, False, marks=pytest.mark.slow),
     ],
 )
 def test_resumed_after_any_step_it_ends_the_same(
