@@ -344,6 +344,7 @@ def looked_at(folder: Path, cache: Path) -> Outcome:
     return outcome
 
 
+@pytest.mark.slow  # compiles what another cache has
 def test_70_kernel_cache_unwritable(tmp_path: Path) -> None:
     assert_trained(train(make_scene(tmp_path), folder=tmp_path))
     cache = tmp_path / "cache"

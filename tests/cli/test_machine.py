@@ -40,10 +40,9 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(1000)  # all of it compiles for minutes where the machine is busy
-@pytest.mark.parametrize(
-    "fewer", [pytest.param(True, id="some"), pytest.param(False, id="all", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("fewer", [pytest.param(True, id="some"), pytest.param(False, id="all")])
 def test_check_needs_neither_torch_nor_the_tests(fewer: bool, tmp_path: Path, on_cpu: None) -> None:
     program = WITHOUT_TORCH.replace("FEWER", str(fewer))
     done = subprocess.run(

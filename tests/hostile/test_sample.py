@@ -81,11 +81,11 @@ def test_a_sample_of_all_families() -> None:
     """Each ends in success or in one sentence."""
     with one_at_a_time("commands"):
         done = subprocess.run(
-            [sys.executable, "-m", "tests.hostile", "--seed", "0", "--cases", "40"],
+            [sys.executable, "-m", "tests.hostile", "--seed", "0", "--cases", "24"],
             cwd=ROOT,
             capture_output=True,
             text=True,
             timeout=280,
         )
     assert done.returncode == 0, done.stdout + done.stderr
-    assert done.stdout.startswith("40 cases in ") and "0 failed" in done.stdout
+    assert done.stdout.startswith("24 cases in ") and "0 failed" in done.stdout

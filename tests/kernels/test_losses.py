@@ -256,6 +256,7 @@ def test_photographs_with_alpha_need_not_be_opaque() -> None:
         Trainer(mostly_opaque, config_of(losses, background="auto"))
 
 
+@pytest.mark.slow  # compiles for seconds
 def test_opacity_by_auto_is_that_of_photographs_that_show_something_everywhere() -> None:
     auto, black = LossConfig(opacity="auto"), {"background": "black"}
     for scene, changes, weight in (
@@ -293,7 +294,7 @@ def config_of(losses: LossConfig, **changes: Any) -> TrainConfig:
     )
 
 
-@pytest.mark.parametrize("name", ["squared", "huber", "all"])
+@pytest.mark.parametrize("name", ["squared", pytest.param("huber", marks=pytest.mark.slow), "all"])
 def test_training(name: str, monkeypatch: pytest.MonkeyPatch, device: str) -> None:
     """The loss falls, and is the same again; PSNR is that of the squared error."""
     monkeypatch.setattr(trainer, "REPORT_EVERY", 1)

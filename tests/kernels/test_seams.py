@@ -147,6 +147,7 @@ def test_value_of_the_loss_on_samples(kernels64: Kernels) -> None:
         assert np.abs(gradient - other).max() > 0.01 * np.abs(other).max()
 
 
+@pytest.mark.slow  # compiles for seconds
 def test_loss_on_samples_that_an_mlp_colours(kernels64: Kernels) -> None:
     """Only some have a colour, in either form."""
     problems = [problem_of(SmoothFeatures(threshold=0.02), seed) for seed in range(2)]

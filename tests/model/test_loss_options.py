@@ -67,6 +67,7 @@ def test_the_command_refuses_in_a_sentence_and_writes_nothing(tmp_path: Path) ->
         assert not folder.exists()
 
 
+@pytest.mark.slow  # compiles for seconds
 def test_a_run_keeps_its_losses(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     options = ["--model", "rgb", "--steps", "30", "--keep", "checkpoint", "--output", folder]

@@ -166,11 +166,21 @@ def whole_steps(folder: Path) -> set[int]:
     return steps
 
 
-@pytest.mark.parametrize("finished", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("finished", "every"),
+    [
+        (False, 3),
+        pytest.param(False, 1, marks=pytest.mark.slow),
+        pytest.param(True, 1, marks=pytest.mark.slow),
+    ],
+)
 def test_killed_while_replacing_a_run_one_of_the_two_is_whole(
-    tmp_path: Path, finished: bool
+    tmp_path: Path, finished: bool, every: int
 ) -> None:
-    """Up to the first checkpoint of the new run, the old one is in the folder or in previous/."""
+    """Up to the first checkpoint of the new run, the old one is in the folder or in previous/.
+
+    Killed at each call, or at every third one.
+    """
 
     def old_run(name: str) -> Path:
         run = run_with(tmp_path / name, 8, 9)
@@ -185,7 +195,7 @@ def test_killed_while_replacing_a_run_one_of_the_two_is_whole(
 
     counted = old_run("counted")
     n_calls = len(calls_of(lambda: replaced(counted, None)))
-    for at in range(1, n_calls + 1):
+    for at in range(1, n_calls + 1, every):
         folder = old_run(f"run{at}")
         assert in_child(lambda folder=folder, at=at: replaced(folder, at)) == KILLED
         assert whole_steps(folder) & {1, 9}

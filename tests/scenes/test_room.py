@@ -180,6 +180,7 @@ def test_images_show_something(scene: Scene) -> None:
         assert 1.0 < steps < 0.6 * view.image.std(), view.name
 
 
+@pytest.mark.slow  # builds all of the room twice
 def test_building_twice_gives_the_same() -> None:
     first = room.room_scene(downscale=5)
     room._tracer.cache_clear()
