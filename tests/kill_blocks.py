@@ -59,7 +59,7 @@ def main() -> None:
             assert fields(blocks) == expected, "a field differs from that of a training unkilled"
             repeated += 1
     of = ", ".join(f"{n} of {what}" for what, n in sorted(kills.items()))
-    print(f"{kills.total()} kills ({of}) in {repeated} trainings of 2 blocks: the same bits")
+    print(f"{kills.total()} kills ({of}): blocks have the bits of those that nobody killed")
 
 
 def cut(folder: Path) -> BlockFolder:
