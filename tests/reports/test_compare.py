@@ -159,6 +159,20 @@ def test_a_training_that_fails_is_left_out_and_said(
     assert "figures near cameras are not compared" in " ".join(sentences(rows))
 
 
+def test_seeds_may_have_found_other_extents(
+    finished: Experiment, room: Scene, tmp_path: Path
+) -> None:
+    """Figures near cameras are compared where both of a pair were taken up to one distance."""
+    shutil.copytree(finished.folder, tmp_path / "other")
+    made = experiment(tmp_path / "other", room)
+    for candidate in made.candidates:
+        metrics = made.metrics(candidate, 1)
+        assert metrics is not None
+        metrics["floaters"]["within"] *= 2.0
+        (made.run(candidate, 1).folder / "metrics.json").write_text(json.dumps(metrics))
+    assert "near_mass" in compare_figures(made)[1].differences
+
+
 def row(values: dict[str, list[float]], against: dict[str, list[float]] | None = None) -> Row:
     differences = {n: paired_difference(v, against[n]) for n, v in values.items() if against}
     name, other = ("b", "a") if against else ("a", None)

@@ -160,8 +160,7 @@ def compare_figures(experiment: Experiment) -> list[Row]:
         differences = {
             name: paired_difference(mine[name], theirs[name]) for name in mine if name in theirs
         }
-        reaches = {value_at(of[seed], WITHIN) for of in (own, other) for seed in paired}
-        if len(reaches) > 1:
+        if any(value_at(own[seed], WITHIN) != value_at(other[seed], WITHIN) for seed in paired):
             differences = {n: d for n, d in differences.items() if FIGURES[n].path[0] != WITHIN[0]}
             left_out.append(
                 f"{candidate.name} against {candidate.against}: figures near cameras are not "
