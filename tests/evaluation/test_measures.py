@@ -171,7 +171,8 @@ def test_figures_are_of_the_pixels_that_enough_views_see() -> None:
     rendering = Rendering(rgb=rgb, depth=np.where(seen, 1.1 * depth, 0.0), opacity=opacity)
     measuring = Measuring(field, scene, "test")
     measuring.add(view, np.zeros((30, 40, 3)), rendering)
-    unseen = replace(view, camera=view.camera.moved_back(9.0), depth=np.full((30, 40), 0.5, "f4"))
+    away = view.camera.moved_back(9.0)
+    unseen = replace(view, name="4", camera=away, depth=np.full((30, 40), 0.5, "f4"))
     measuring.add(unseen, np.zeros((30, 40, 3)), rendering)  # of which no training view sees any
     found = measuring.finish(list(near_masses(field, scene)))
     two = found.seen["2"]

@@ -8,6 +8,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import get_args
+from unittest.mock import Mock
 
 import pytest
 
@@ -15,6 +16,7 @@ from tests.support.tiny_scenes import write_transforms
 from warpnerf.checks import InputError
 from warpnerf.cli.compare import CompareOptions, compare_command
 from warpnerf.config import GridConfig, LossConfig, Scaling, TrainConfig
+from warpnerf.evaluation import sight
 from warpnerf.model.models import Rgb
 from warpnerf.reports.compare import require_comparable, write_comparison
 from warpnerf.reports.comparison import (
@@ -56,11 +58,15 @@ def experiment(folder: Path, scene: Scene, n_seeds: int = 2) -> Experiment:
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory, room: Scene) -> Experiment:
-    """One that was never interrupted."""
+    """One that was never interrupted, and in which each test view's sight was counted once."""
     made = experiment(tmp_path_factory.mktemp("experiments") / "whole", room)
     made.begin()
-    for candidate, seed in made.trials:
-        assert made.train(candidate, seed)
+    count = Mock(side_effect=sight.training_views_that_see)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sight, "training_views_that_see", count)
+        for candidate, seed in made.trials:
+            assert made.train(candidate, seed)
+    assert count.call_count == len(room.splits["test"])
     return made
 
 

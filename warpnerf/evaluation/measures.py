@@ -14,8 +14,7 @@ import numpy as np
 from warpnerf.evaluation.floater_metrics import near_density
 from warpnerf.evaluation.light import Light, measure_light
 from warpnerf.evaluation.metrics import psnr, ssim, truth
-from warpnerf.evaluation.sight import can_tell_sight, surfaces, training_views_that_see
-from warpnerf.rendering.rays import camera_rays
+from warpnerf.evaluation.sight import NO_SURFACE, Sight
 from warpnerf.runtime.terminal import table_text
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.scene import Scene, View
@@ -155,16 +154,19 @@ def _shares(light: Light) -> list[float]:
 class Measuring:
     """Gathers measures while the views of a split are rendered."""
 
-    def __init__(self, field: AnyField, scene: Scene, split: str) -> None:
+    def __init__(
+        self, field: AnyField, scene: Scene, split: str, sight: Sight | None = None
+    ) -> None:
         """Begin.
 
         Args:
             field: A trained field.
             scene: Its training views are those of the field's training.
             split: Whose views will be added.
+            sight: Of the scene, where other fields of it are measured as well.
         """
         self._field, self._scene, self._split = field, scene, split
-        self._tells = can_tell_sight(scene)
+        self._sight = Sight(scene) if sight is None else sight
         self._seen: dict[int, list[dict[str, float | None]]] = {least: [] for least in SEEN_BY}
         self._angles: list[ViewAngle] = []
 
@@ -184,17 +186,12 @@ class Measuring:
                 psnr=psnr(rgb, target, view.mask),
             )
         )
-        if view.depth is None or not self._tells:
+        counts = self._sight.counts(view, self._field.workers)
+        if counts is None or view.depth is None:
             return
-        _, directions = camera_rays(view.camera, self._field.workers)
-        known = np.isfinite(view.depth) & (view.depth > 0.0)
-        if view.mask is not None:
-            known &= view.mask
+        known = counts != NO_SURFACE
         if not known.any():
             return
-        points = surfaces(view, directions.numpy())[known.ravel()]
-        counts = np.zeros(known.shape, int)
-        counts[known] = training_views_that_see(self._scene, points)
         nearest = NEAREST * self._scene.content_distance
         for least, found in self._seen.items():
             mask = counts >= least

@@ -2,17 +2,63 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
+from warpnerf.rendering.rays import camera_rays
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.cameras.undistort import directions
 from warpnerf.scenes.scene import Scene, View
+
+if TYPE_CHECKING:
+    from warpnerf.runtime.parallel import Workers
 
 TOLERANCE = 0.02
 """Share by which a view's depth may fall short of the distance to a place that it sees."""
 
 SLACK = 1e-6
 """In the cosine of the angle to the axis, within which a ray is that of a picture's corner."""
+
+NO_SURFACE = -1
+"""Stands for a count at pixels whose true surface is not known, or which do not count."""
+
+
+class Sight:
+    """How many training views see the surfaces of a scene's views; each is looked at once.
+
+    Cameras and true depths say so, whatever was trained.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        """Of a scene; nothing is counted yet."""
+        self._scene = scene
+        self._tells = can_tell_sight(scene)
+        self._counts: dict[str, np.ndarray] = {}
+
+    def counts(self, view: View, workers: Workers) -> np.ndarray | None:
+        """How many training views see the surface of each of a view's pixels.
+
+        Args:
+            view: One of the scene's.
+            workers: On which its rays are made.
+
+        Returns:
+            [H, W] int16, NO_SURFACE where none is known; None where nothing tells.
+        """
+        if view.depth is None or not self._tells:
+            return None
+        if view.name not in self._counts:
+            known = np.isfinite(view.depth) & (view.depth > 0.0)
+            if view.mask is not None:
+                known &= view.mask
+            counts = np.full(known.shape, NO_SURFACE, np.int16)
+            if known.any():
+                _, rays = camera_rays(view.camera, workers)
+                points = surfaces(view, rays.numpy())[known.ravel()]
+                counts[known] = training_views_that_see(self._scene, points)
+            self._counts[view.name] = counts
+        return self._counts[view.name]
 
 
 def can_tell_sight(scene: Scene) -> bool:
