@@ -22,6 +22,10 @@ FIRST = f"{COMPARE}test_each_is_compared_with_the_first_scaling_of_its_own_kind"
 WORDS = f"{COMPARE}test_a_sentence_tells_better_from_worse_and_from_chance"
 REFUSED = f"{COMPARE}test_a_folder_of_something_else_is_refused"
 REPORT = f"{COMPARE}test_the_report_is_one_file_and_says_what_figures_say"
+TABLE = (
+    "reports/test_demonstration.py::test_the_table_says_of_each_row_whether_it_is_better_or_why_not"
+)
+PLAN = "evaluation/test_near_plan.py::test_vertical_lines_through_balls_around_cameras_in_even_density"
 OVERLAP = "scenes/test_overlap.py::test_overlap_along_rays_of_two_cameras_side_by_side"
 
 MUTANTS = [
@@ -37,6 +41,7 @@ MUTANTS = [
     of_host("sight: upside down", SIGHT, "-x / z, y / z", "-x / z, -y / z", HIDES),
     of_host("sight: test views see as well", SIGHT, 'for index in scene.splits["train"]:', "for index in range(len(scene.views)):",
             HIDES),
+    of_host("sight: counted for each training", SIGHT, "if view.name not in self._counts:", "if True:", CUT),
     of_host("measures: one view more", MEASURES, "counts >= least", "counts > least", SEEN),
     of_host("measures: of all pixels", MEASURES, "psnr(rgb, target, mask)", "psnr(rgb, target, known)", SEEN),
     of_host("measures: coverage of all that is there", MEASURES, "rendering.opacity[mask] >= 0.5", "rendering.opacity[mask] > 0.0",
@@ -56,6 +61,16 @@ MUTANTS = [
             "int(np.sign(difference.mean))", WORDS),
     of_host("compare: differences the other way", "reports/comparison.py", "paired_difference(mine[name], theirs[name])",
             "paired_difference(theirs[name], mine[name])", REPORT),
+    of_host("near plan: radius in place of the chord", "evaluation/near_plan.py", "half = np.sqrt(radius**2 - apart[rows, columns] ** 2)",
+            "half = np.full(len(rows), radius)", PLAN),
+    of_host("near plan: the last camera", "evaluation/near_plan.py", "np.fmax(depths[rows, columns], found)", "found", PLAN),
+    of_host("near plan: parts that begin before the near plane", "evaluation/near_plan.py", "origins[:, up] -= half + near",
+            "origins[:, up] -= half", PLAN),
+    of_host("film: as far as content", "reports/comparison_film.py", "distance = BACK_SHARE * scene.content_distance",
+            "distance = scene.content_distance", REPORT),
+    of_host("film: one configuration", "reports/comparison_film.py", "there = [c for c in experiment.candidates if",
+            "there = [c for c in experiment.candidates[:1] if", REPORT),
+    of_host("demo: better is more", "reports/demonstration.py", "round(better * (values", "round((values", TABLE),
     of_host("compare: cut trainings start again", "reports/experiment.py", "if run.checkpoints:", "if False:", CUT),
     of_host("compare: the seed of the configuration", "reports/experiment.py", "replace(candidate.config, seed=seed)", "candidate.config",
             CUT),

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import get_args
 from unittest.mock import Mock
 
+import av
 import pytest
 
 from tests.support.tiny_scenes import write_transforms
@@ -18,6 +19,7 @@ from warpnerf.cli.compare import CompareOptions, compare_command
 from warpnerf.config import GridConfig, LossConfig, Scaling, TrainConfig
 from warpnerf.evaluation import sight
 from warpnerf.model.models import Rgb
+from warpnerf.reports import comparison_film
 from warpnerf.reports.compare import require_comparable, write_comparison
 from warpnerf.reports.comparison import (
     FIGURES,
@@ -27,6 +29,7 @@ from warpnerf.reports.comparison import (
     sentences,
     value_at,
 )
+from warpnerf.reports.comparison_film import usual_path
 from warpnerf.reports.experiment import MOMENTS, Candidate, Capture, Experiment
 from warpnerf.reports.paired import paired_difference
 from warpnerf.scenes.formats.load import load_scene
@@ -107,12 +110,23 @@ def test_cut_anywhere_it_ends_with_the_same_bits(
     assert of_seeds[0] != of_seeds[1]
 
 
-def test_the_report_is_one_file_and_says_what_figures_say(finished: Experiment) -> None:
+def test_the_report_is_one_file_and_says_what_figures_say(
+    finished: Experiment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(comparison_film, "N_FRAMES", 2)
     rows = write_comparison(finished)
     names = {path.name for path in finished.folder.iterdir()}
     assert {"report.html", "figures.json", "moments.png", "cameras.png", "curves.png"} <= names
+    with av.open(finished.folder / "floaters.mp4") as film:
+        assert film.streams.video[0].frames == 2 and film.streams.video[0].width == 2 * 320 + 6
+    first, last = (camera.position for camera in usual_path(finished))
+    scene = finished.capture.scene
+    camera = scene.training_cameras[1]
+    assert first == pytest.approx(camera.position)
+    assert last == pytest.approx(camera.position - 0.5 * scene.content_distance * camera.forward)
     page = (finished.folder / "report.html").read_text()
     assert not re.search(r"(src|href)=\"(?!data:|#)", page) and "$" not in page.split("<script>")[0]
+    assert page.count("data:video/mp4") == 1
     assert page.count("data:image/jpeg") == 3 * 3  # photograph and two configurations
     record = json.loads((finished.folder / "figures.json").read_text())
     plain, scaled = record["configurations"]

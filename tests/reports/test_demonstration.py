@@ -1,76 +1,71 @@
-"""The demonstration, made tiny: both trainings, the figures, the picture and the film."""
+"""The demonstration without its trainings: the table, the picture, and what is refused."""
 
 from __future__ import annotations
 
-import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from tests.support.tiny_fields import tiny_field
 from warpnerf.checks import InputError
-from warpnerf.config import Scaling
+from warpnerf.config import Scaling, TrainConfig
 from warpnerf.media.camera_path import backing_away
 from warpnerf.media.pictures import depth_colours
 from warpnerf.rendering.field import Field
 from warpnerf.reports import demonstration
-from warpnerf.reports.demonstration import BACK, CAMERAS, SCALINGS, comparison_picture, demo
+from warpnerf.reports.comparison import Row
+from warpnerf.reports.demonstration import (
+    BACK,
+    CAMERAS,
+    NAMES,
+    SHOWN,
+    Demo,
+    comparison_picture,
+    demo,
+)
+from warpnerf.reports.experiment import Candidate
 from warpnerf.scenes.builtin.room import first_hit, photograph
 from warpnerf.scenes.cameras.camera import Camera
 
-
-@pytest.fixture
-def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(demonstration, "FRAMES_PER_CAMERA", 2)
-    monkeypatch.setattr(demonstration, "FRAME_SIZE", (32, 24))
-    monkeypatch.setattr(demonstration, "PICTURE_SIZE", (64, 48))
+VALUES = dict.fromkeys(SHOWN, 0.5)
 
 
-def test_it_trains_both_and_shows_them(tiny: None, tmp_path: Path) -> None:
-    reports: list[tuple[str, float, str]] = []
-    result = demo(
-        tmp_path / "demo",
-        steps=50,
-        downscale=8,
-        threads=1,
-        report=lambda *report: reports.append(report),
-    )
-    assert {path.name for path in (tmp_path / "demo").iterdir()} == {
-        "floaters.png",
-        "floaters.mp4",
-        "figures.json",
-    }
-    figures = json.loads(result.record.read_text())["figures"]
-    assert figures == result.figures
-    for scaling in SCALINGS:
-        row = figures[scaling]
-        assert set(row) - {"flip"} == {"psnr", "ssim", "depth_error", "near_density", "seconds"}
-        assert row["near_density"] > 0.0
-        assert f"{row['psnr']:.2f}" in str(result)
-    none, clamped = (result.fields[s].storage.values.numpy() for s in ("none", "clamped"))
-    assert (none != clamped).any()
-    stages = list(dict.fromkeys(stage for stage, _, _ in reports))
-    assert [stage for stage in stages if stage.startswith("training")] == [
-        "training without scaling",
-        "training with scaling",
+def test_the_table_says_of_each_row_whether_it_is_better_or_why_not(tmp_path: Path) -> None:
+    rows = [
+        Row(
+            candidate=Candidate(name=name, config=TrainConfig(scaling=scaling)),
+            values={key: [value + by, value - by] for key, value in values.items()},
+            seconds=[1.0, 2.0],
+            differences={},
+        )
+        for (scaling, name), values, by in zip(
+            NAMES.items(),
+            (VALUES, {**VALUES, "psnr": 0.6, "front_train": 0.4, "seen_depth_error": 0.7}),
+            (0.0, 0.2),
+            strict=True,
+        )
     ]
-    assert ("training with scaling", 1.0) in [report[:2] for report in reports]
-    with Image.open(result.picture) as picture:
-        assert picture.width > 2 * 64 and picture.height > 3 * 48
-    import av
+    made = Demo(
+        rows=rows, fields={}, picture=tmp_path, video=tmp_path, record=tmp_path, page=tmp_path
+    )
+    lines = {re.split("  |: ", line)[0]: line.split() for line in str(made).splitlines()}
+    assert lines["PSNR [dB]"][2:] == ["0.50", "0.60", "better"]
+    assert lines["light in front, training rays"][-1] == "better"
+    assert lines["depth error there [scene units]"][-3:] == ["0.7000", "no", "better"]
+    assert lines["seconds of training"][-2:] == ["2", "2"]
+    said = str(made)
+    assert "depth error there: no better, as light that ends in front, on test rays, makes" in said
+    assert "\nSSIM, PSNR of views pulled back, " in said and ": no better, with these seeds" in said
 
-    with av.open(result.video) as film:
-        assert len(list(film.decode(video=0))) == 2 * len(CAMERAS)
 
-
-def test_the_first_row_of_the_picture_is_the_truth(tiny: None) -> None:
+def test_the_first_row_of_the_picture_is_the_truth(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(demonstration, "PICTURE_SIZE", (64, 48))
     scene = demonstration.load_scene("builtin:room-sparse", downscale=8)
-    row = {"psnr": 1.0, "ssim": 0.5, "depth_error": 1.0, "near_density": 0.1}
     fields: dict[Scaling, Field] = {"none": tiny_field(), "clamped": tiny_field(density=0.0)}
-    picture = comparison_picture(scene, fields, {"none": row, "clamped": row}, 4.0)
+    picture = comparison_picture(scene, fields, {"none": VALUES, "clamped": VALUES}, 4.0)
     camera = next(view.camera for view in scene.views if view.name == CAMERAS[0])
     small = replace(
         camera, width=64, height=48, fx=3.2 * camera.fx, fy=3.2 * camera.fy, cx=32, cy=24
@@ -109,7 +104,7 @@ def test_bad_input_is_refused_before_anything_is_trained(tmp_path: Path) -> None
     file.write_text("mine")
     for output in (file, file / "below"):
         with pytest.raises(InputError, match="--output"):
-            demo(output)
+            demo(output, downscale=8)
     with pytest.raises(InputError, match="steps"):
         demo(tmp_path / "demo", steps=0)
     with pytest.raises(InputError, match=r"holds other files \(file\); name a new folder"):

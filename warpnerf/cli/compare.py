@@ -104,8 +104,10 @@ def compare_command(options: CompareOptions, given: Annotated[Given, USUAL] = NO
     for config in configs.values():
         require_machine(config)
 
+    from warpnerf.media.video import video_file
     from warpnerf.reports.compare import PAGE, require_comparable, write_comparison
     from warpnerf.reports.comparison import candidates_of
+    from warpnerf.reports.comparison_film import FILM, FPS
     from warpnerf.reports.experiment import Experiment, require_free
 
     require_free(options.output)
@@ -114,7 +116,7 @@ def compare_command(options: CompareOptions, given: Annotated[Given, USUAL] = NO
     experiment = Experiment(options.output, capture, candidates_of(configs), options.seeds)
     experiment.begin()
     try:
-        code = _train_all(experiment)
+        code = train_all(experiment)
         if code is not None:
             return code
         with ProgressBar("reading fields") as bar:
@@ -123,7 +125,10 @@ def compare_command(options: CompareOptions, given: Annotated[Given, USUAL] = NO
         print("stopped; the same command continues", flush=True)
         return stopped.exit_code
     _print(rows)
-    print(f"wrote {options.output / PAGE}, figures.json, and pictures")
+    film, note = video_file(options.output / FILM, FPS)
+    if note is not None:
+        print(note)
+    print(f"wrote {options.output / PAGE}, figures.json, {film.name}, and pictures")
     return (
         FAILED if any(experiment.failure(*trial) is not None for trial in experiment.trials) else 0
     )
@@ -186,7 +191,7 @@ def _capture(options: CompareOptions, threads: int | None) -> Capture:
     )
 
 
-def _train_all(experiment: Experiment) -> int | None:
+def train_all(experiment: Experiment) -> int | None:
     """Train what has not been trained yet, a line of a table each.
 
     Returns:

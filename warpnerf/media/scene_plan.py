@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from PIL import Image, ImageDraw
 
 from warpnerf.checked import checked_arguments
+from warpnerf.evaluation.near_plan import NearPlan
 from warpnerf.inspection.inspection import Inspection
 from warpnerf.media.pictures import FAINT, INK, font
 from warpnerf.scenes.cameras.camera import Camera
-from warpnerf.scenes.cameras.focus import up_direction
+from warpnerf.scenes.cameras.focus import horizontal_axes
 from warpnerf.scenes.cameras.observations import Observations
 from warpnerf.scenes.cameras.undistort import directions
 from warpnerf.scenes.scene import Scene
@@ -26,6 +27,7 @@ _SIGHT, _SIGHT_END = (206, 226, 204), (56, 140, 66)
 _GRID, _BOX = (232, 232, 236), (120, 40, 130)
 _WIDER = (196, 120, 214)
 _POINT = (150, 150, 158)
+_EMPTY = (238, 240, 228)
 _SHARP, _BLURRED = (70, 150, 190), (214, 40, 40)
 """Places seen at a pixel a voxel or finer, and at ``_RED_AT`` or coarser."""
 _RED_AT = 8.0
@@ -34,6 +36,9 @@ TWICE = 2.0
 """As wide as in the box are voxels at the outline that is drawn around it."""
 _FRUSTUM = 0.035
 """Length of a camera's pyramid, in widths of a panel."""
+
+_PLANS = 3
+"""Plans of fields side by side, at most."""
 
 Colour = tuple[int, int, int]
 
@@ -112,11 +117,7 @@ def blocks_picture(scene: Scene, cores: np.ndarray, boxes: np.ndarray) -> np.nda
     Returns:
         [H, W, 3] uint8.
     """
-    direction = up_direction(scene.training_cameras)
-    up = int(np.abs(direction).argmax())
-    right, ahead = (up + 1) % 3, (up + 2) % 3
-    if direction[up] < 0.0:
-        right, ahead = ahead, right
+    right, ahead = horizontal_axes(scene.training_cameras)
     points = np.concatenate([boxes.reshape(-1, 3), [c.position for c in scene.cameras]])
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     extent = 1.08 * float(np.ptp(points, axis=0)[[right, ahead]].max())
@@ -145,6 +146,52 @@ def blocks_picture(scene: Scene, cores: np.ndarray, boxes: np.ndarray) -> np.nda
         for index in scene.splits[split]:
             panel.camera(scene.views[index].camera, colour)
     return np.asarray(sheet.resize((size[0] // _FINE, size[1] // _FINE), Image.Resampling.BOX))
+
+
+def near_picture(scene: Scene, plans: Mapping[str, NearPlan]) -> np.ndarray:
+    """Plot the density around the training cameras of a scene from above, fields side by side.
+
+    Args:
+        scene: That was trained on.
+        plans: Of its fields, by what they are called; at least one. They have the colours of one
+            range, from 0 to what nineteen in twenty of all their cells are below.
+
+    Returns:
+        [H, W, 3] uint8.
+    """
+    known = np.concatenate([plan.depths[np.isfinite(plan.depths)] for plan in plans.values()])
+    most = max(float(np.quantile(known, 0.95)), 1e-6)
+    across, down = min(len(plans), _PLANS), -(-len(plans) // _PLANS)
+    size = (across * (_PANEL + _MARGIN) + _MARGIN, _HEADER + down * (_PANEL + _MARGIN))
+    sheet = Image.new("RGB", size, "white")
+    draw = ImageDraw.Draw(sheet)
+    title = f"{scene.name}: optical depth around the training cameras"
+    draw.text((_MARGIN, 12 * _FINE), title, INK, font(20 * _FINE))
+    width, x = 12 * _FINE, float(_MARGIN)
+    for share in (0.0, 0.25, 0.5, 0.75, 1.0):
+        colour, text = _density_colour(np.array(share)), f"{share * most:.2g}"
+        text = text if share < 1.0 else f"{text} or more"
+        draw.rectangle((x, 46 * _FINE, x + width, 46 * _FINE + width), tuple(colour), FAINT)
+        draw.text((x + 1.5 * width, 52 * _FINE), text, INK, font(15 * _FINE), anchor="lm")
+        x += 1.5 * width + draw.textlength(text, font(15 * _FINE)) + 20 * _FINE
+    for number, (name, plan) in enumerate(plans.items()):
+        row, column = divmod(number, _PLANS)
+        place = _MARGIN + column * (_PANEL + _MARGIN), _HEADER + row * (_PANEL + _MARGIN)
+        panel = _Panel(draw, place, plan.axes, (1.0, 1.0), plan.middle, plan.extent)
+        colours = _density_colour(plan.depths / most).transpose(1, 0, 2)[::-1]
+        picture = Image.fromarray(np.ascontiguousarray(colours))
+        sheet.paste(picture.resize((_PANEL, _PANEL), Image.Resampling.NEAREST), place)
+        panel.frame(name)
+        for camera in scene.training_cameras:
+            panel.camera(camera, _TRAIN)
+    return np.asarray(sheet.resize((size[0] // _FINE, size[1] // _FINE), Image.Resampling.BOX))
+
+
+def _density_colour(share: np.ndarray) -> np.ndarray:
+    """From pale to red, [..., 3] uint8; white where a share is NaN."""
+    part = np.clip(share, 0.0, 1.0)[..., None]
+    colours = (1.0 - part) * np.array(_EMPTY) + part * np.array(_BLURRED)
+    return np.where(np.isnan(part), 255.0, colours).round().astype(np.uint8)
 
 
 def _header(draw: ImageDraw.ImageDraw, inspection: Inspection) -> None:

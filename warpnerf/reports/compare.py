@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from warpnerf.checks import InputError, cannot_write
 from warpnerf.evaluation.evaluate import require_measurable
 from warpnerf.media.overlap_plots import overlap_plots
 from warpnerf.media.pictures import picture_files, png
+from warpnerf.media.video import video_file, write_video
 from warpnerf.reports.comparison import Row, compare_figures, figures_to_json
+from warpnerf.reports.comparison_film import FILM, FPS, film_frames, usual_path
 from warpnerf.reports.comparison_page import comparison_page
-from warpnerf.reports.comparison_pictures import curves_picture, moments_picture, views_of
+from warpnerf.reports.comparison_pictures import (
+    curves_picture,
+    moments_picture,
+    near_plans_picture,
+    views_of,
+)
 from warpnerf.reports.experiment import Experiment
+from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.scene import Scene
 from warpnerf.writing import write_atomically
 
@@ -37,16 +45,20 @@ def require_comparable(scene: Scene) -> None:
 
 
 def write_comparison(
-    experiment: Experiment, on_progress: Callable[[float, str], None] = lambda done, words: None
+    experiment: Experiment,
+    on_progress: Callable[[float, str], None] = lambda done, words: None,
+    path: Sequence[Camera] | None = None,
 ) -> list[Row]:
     """Write the report of an experiment that has finished.
 
     report.html holds all of it in one file; figures.json the figures; beside them moments.png,
-    curves.png, cameras.png, sampling.png, and views/ with renderings and photographs.
+    near.png, curves.png, cameras.png, sampling.png, floaters.mp4 (.gif where PyAV is missing), and
+    views/ with renderings and photographs.
 
     Args:
         experiment: All of its trainings have ended.
         on_progress: Called with the share that is done, and a few words.
+        path: Cameras of the film; None: ``usual_path``.
 
     Returns:
         Figures and differences.
@@ -56,14 +68,23 @@ def write_comparison(
     """
     folder, scene = experiment.folder, experiment.capture.scene
     rows = compare_figures(experiment)
-    on_progress(0.1, "rendering views")
+    on_progress(0.05, "rendering views")
     views = views_of(experiment)
-    on_progress(0.8, "drawing")
+    film, _ = video_file(folder / FILM, FPS)
+    frames = film_frames(
+        experiment,
+        usual_path(experiment) if path is None else path,
+        lambda done, words: on_progress(0.2 + 0.7 * done, words),
+    )
+    try:
+        write_video(film, frames, FPS)
+    except OSError as error:
+        raise cannot_write(f"--output {folder}", error) from error
+    on_progress(0.9, "drawing")
     plots = {name.removesuffix(".png"): plot for name, plot in overlap_plots(scene).items()}
     pictures = plots | {"curves": curves_picture(experiment)}
-    moments = moments_picture(experiment)
-    if moments is not None:
-        pictures["moments"] = moments
+    drawn = {"moments": moments_picture(experiment), "near": near_plans_picture(experiment)}
+    pictures |= {name: picture for name, picture in drawn.items() if picture is not None}
     files = {f"{name}.png": png(picture) for name, picture in pictures.items()}
     stems = picture_files(list(views), stems=True)
     for view, of_view in views.items():
@@ -73,7 +94,7 @@ def write_comparison(
     files[RECORD] = (json.dumps(record, indent=2) + "\n").encode()
     title = f"{scene.name}: {len(rows)} configurations compared"
     files[PAGE] = comparison_page(
-        title, _what(experiment), rows, views, pictures, experiment.seeds[0]
+        title, _what(experiment), rows, views, pictures, film, experiment.seeds[0]
     )
     try:
         (folder / "views").mkdir(exist_ok=True)

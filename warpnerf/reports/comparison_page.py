@@ -7,6 +7,7 @@ import json
 from collections.abc import Mapping, Sequence
 from html import escape
 from io import BytesIO
+from pathlib import Path
 from string import Template
 from typing import Any
 
@@ -36,7 +37,7 @@ td small { display: block; color: #70707a; }
 .better { background: #dff2e1; }
 .worse { background: #fae0dd; }
 .wide { overflow-x: auto; }
-img { max-width: 100%; }
+img, video { max-width: 100%; }
 .names, .slider, .view input { width: min(100%, 44rem); }
 .names { display: flex; justify-content: space-between; margin-bottom: 0.4rem; }
 .slider { position: relative; }
@@ -61,7 +62,11 @@ better, red significantly worse.</p>
 <h2>Views</h2>
 <p>Of the trainings with seed $seed. The bar uncovers one beside the other.</p>
 <div id="views"></div>
+<h2>A camera that backs away</h2>
+<figure>$film<figcaption>From where a training camera stood, backwards; colour above depth.
+</figcaption></figure>
 $moments
+$near
 <h2>Training</h2>
 <figure><img src="$curves" alt="PSNR of training rays over steps"></figure>
 <h2>The capture</h2>
@@ -132,6 +137,7 @@ def comparison_page(
     rows: Sequence[Row],
     views: Views,
     pictures: Mapping[str, np.ndarray],
+    film: Path,
     seed: int,
 ) -> bytes:
     """Write the page.
@@ -141,7 +147,9 @@ def comparison_page(
         what: A sentence on what was trained.
         rows: Figures and differences.
         views: For the sliders.
-        pictures: ``curves``, ``cameras``, ``sampling``, and ``moments`` where there are, [H, W, 3].
+        pictures: ``curves``, ``cameras``, ``sampling``, and ``moments`` and ``near`` where there
+            are, [H, W, 3].
+        film: .mp4 or .gif.
         seed: Of the trainings that pictures are of.
 
     Returns:
@@ -155,6 +163,15 @@ def comparison_page(
             "<figcaption>A training camera: where depth is yellow, light ends close to it."
             "</figcaption></figure>"
         )
+    near = ""
+    if "near" in pictures:
+        near = (
+            "<h2>Density around the training cameras, from above</h2>\n"
+            f'<figure><img src="{_uri(pictures["near"], "PNG")}" alt="density near cameras">'
+            "<figcaption>Optical depth of vertical lines, as far as they lie within a tenth of the "
+            "content distance of a training camera; nothing is there, unless something was "
+            "photographed from so close.</figcaption></figure>"
+        )
     in_page = {
         view: {name: _uri(picture, "JPEG") for name, picture in of_view.items()}
         for view, of_view in views.items()
@@ -167,9 +184,11 @@ def comparison_page(
         differences=_differences(rows),
         seed=seed,
         moments=moments,
+        near=near,
+        film=_moving(film),
         views=_script(in_page),
         photograph=PHOTOGRAPH,
-        **{name: _uri(picture, "PNG") for name, picture in pictures.items() if name != "moments"},
+        **{name: _uri(pictures[name], "PNG") for name in ("curves", "cameras", "sampling")},
     )
     return text.encode()
 
@@ -231,6 +250,14 @@ def _uri(picture: np.ndarray, kind: str) -> str:
     options: dict[str, Any] = {"quality": JPEG_QUALITY} if kind == "JPEG" else {}
     Image.fromarray(picture).save(buffer, kind, **options)
     return f"data:image/{kind.lower()};base64,{base64.b64encode(buffer.getvalue()).decode()}"
+
+
+def _moving(film: Path) -> str:
+    """A film as an element that plays it."""
+    data = base64.b64encode(film.read_bytes()).decode()
+    if film.suffix == ".gif":
+        return f'<img src="data:image/gif;base64,{data}" alt="a camera that backs away">'
+    return f'<video src="data:video/mp4;base64,{data}" controls loop muted playsinline></video>'
 
 
 def _script(value: Any) -> str:

@@ -9,9 +9,11 @@ from PIL import Image, ImageDraw
 
 from warpnerf.evaluation.metrics import truth
 from warpnerf.evaluation.near_field import PULLED_SHARE
+from warpnerf.evaluation.near_plan import near_plan
 from warpnerf.media.curves import running_mean
 from warpnerf.media.pictures import INK, depth_legend, depth_picture, font, to_bytes
 from warpnerf.media.plots import line_plot
+from warpnerf.media.scene_plan import near_picture
 from warpnerf.rendering.field import Rendering
 from warpnerf.reports.experiment import MOMENTS, Candidate, Experiment
 from warpnerf.runs.logs import read_points
@@ -58,6 +60,24 @@ def views_of(experiment: Experiment) -> Views:
             found[name][candidate.name] = to_bytes(field.render(camera).rgb)
         del field
     return found
+
+
+def near_plans_picture(experiment: Experiment) -> np.ndarray | None:
+    """Where floaters are, from above: see ``near_plan``; of trainings with seed 0.
+
+    Returns:
+        [H, W, 3] uint8; None in normalised device coordinates.
+    """
+    scene, seed = experiment.capture.scene, experiment.seeds[0]
+    plans = {}
+    for candidate in experiment.candidates:
+        if experiment.failure(candidate, seed) is not None:
+            continue
+        trained = experiment.run(candidate, seed).read_config().as_trained(scene)
+        plan = near_plan(experiment.field(candidate, seed), trained)
+        if plan is not None:
+            plans[candidate.name] = plan
+    return near_picture(scene, plans) if plans else None
 
 
 def moments_picture(experiment: Experiment) -> np.ndarray | None:

@@ -208,6 +208,18 @@ def up_direction(cameras: Sequence[Camera]) -> np.ndarray:
     return normal if level and normal @ mean > 0.5 else mean
 
 
+def horizontal_axes(cameras: Sequence[Camera]) -> tuple[int, int]:
+    """Axes of the scene that a plan from above has to the right and ahead.
+
+    These are the two besides the axis nearest to ``up_direction``, in the order that is not
+    mirrored from there.
+    """
+    direction = up_direction(cameras)
+    up = int(np.abs(direction).argmax())
+    right, ahead = (up + 1) % 3, (up + 2) % 3
+    return (right, ahead) if direction[up] >= 0.0 else (ahead, right)
+
+
 def estimate_extent(cameras: Sequence[Camera], *, unbounded: bool) -> Extent:
     """Estimate content distance and box, a cube around what the cameras look at, and say how.
 
