@@ -25,7 +25,9 @@ REPORT = f"{COMPARE}test_the_report_is_one_file_and_says_what_figures_say"
 TABLE = (
     "reports/test_demonstration.py::test_the_table_says_of_each_row_whether_it_is_better_or_why_not"
 )
-PLAN = "evaluation/test_near_plan.py::test_vertical_lines_through_balls_around_cameras_in_even_density"
+PLAN = (
+    "evaluation/test_near_plan.py::test_vertical_lines_through_balls_around_cameras_in_even_density"
+)
 OVERLAP = "scenes/test_overlap.py::test_overlap_along_rays_of_two_cameras_side_by_side"
 
 MUTANTS = [
