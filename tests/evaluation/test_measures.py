@@ -16,10 +16,11 @@ from warpnerf.evaluation.evaluate import evaluate
 from warpnerf.evaluation.light import absorbed, measure_light
 from warpnerf.evaluation.measures import Measuring, angle_to_nearest, depth_errors
 from warpnerf.evaluation.near_field import measure_near_field, near_masses
-from warpnerf.evaluation.sight import surfaces, training_views_that_see
+from warpnerf.evaluation.sight import Sight, surfaces, training_views_that_see, true_depths
 from warpnerf.fields.occupancy import FreeCells
 from warpnerf.rendering.field import Field, Rendering
 from warpnerf.rendering.rays import camera_rays
+from warpnerf.scenes.cameras.tracks import Tracks
 from warpnerf.scenes.scene import Scene, View
 
 LIGHT = ("front", "hit", "behind", "transmitted")
@@ -182,6 +183,46 @@ def test_figures_are_of_the_pixels_that_enough_views_see() -> None:
     assert found.seen["1"].share > two.share and found.seen["1"].psnr < two.psnr
     assert "2 or more" in str(found) and "front" in str(found)
     assert list(found.light) == ["test", "train"] and found.near_density is not None
+
+
+def test_points_stand_in_where_no_depths_are_known() -> None:
+    """Five points of structure from motion, one of them hidden behind another."""
+    field, scene = thin_field(), walled(False)
+    position = scene.views[3].camera.position
+    points = np.array(
+        [[WALL, y, z] for y, z in ((0.0, 0.1), (0.6, 0.3), (-0.7, -0.4), (0.3, -0.5))]
+    )
+    points = np.concatenate([points, position + 1.2 * (points[:1] - position)])
+    shown = {"0": [0, 1, 4], "1": [1, 0, 2, 2], "2": [4], "3": [0, 1, 2, 3, 4]}
+    tracks = Tracks(positions=points, shown={name: np.array(of) for name, of in shown.items()})
+    bare = [replace(view, depth=None) for view in scene.views]
+    scene = replace(scene, views=bare, tracks=tracks)
+    view = scene.views[3]
+    x, y, z = ((points[:4] - position) @ view.camera.c2w[:, :3]).T
+    columns, rows = (20.0 - 30.0 * x / z).astype(int), (15.0 + 30.0 * y / z).astype(int)
+    away = np.linalg.norm(points[:4] - position, axis=1)
+    depths = true_depths(scene, view)
+    assert depths is not None and np.isfinite(depths).sum() == 4
+    np.testing.assert_allclose(depths[rows, columns], away)
+    counts = Sight(scene).counts(view, field.workers)
+    assert counts is not None and counts[rows, columns].tolist() == [2, 2, 1, 0]
+
+    rendering = Rendering(
+        rgb=np.full((30, 40, 3), 0.9), depth=1.1 * np.nan_to_num(depths), opacity=np.ones((30, 40))
+    )
+    rendering.rgb[rows[:2], columns[:2]] = 0.1
+    measuring = Measuring(field, scene, "test")
+    measuring.add(view, np.zeros((30, 40, 3)), rendering)
+    found = measuring.finish(list(near_masses(field, scene)))
+    two = found.seen["2"]
+    assert found.points_only and two.share == 0.5 and two.ssim is None
+    assert two.psnr == pytest.approx(20.0) and found.seen["1"].psnr < 10.0
+    assert two.relative_depth_error == pytest.approx(0.1)
+    assert found.light["test"].rays == 4 and found.light["train"].rays == 2 + 3 + 1
+    top = np.arange(30)[:, None] < 15
+    hidden = replace(view, mask=np.broadcast_to(top, (30, 40)).copy())
+    known = true_depths(scene, hidden)
+    assert known is not None and np.isfinite(known).sum() == (rows < 15).sum() == 2
 
 
 def test_depth_errors_by_hand() -> None:

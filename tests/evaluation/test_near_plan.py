@@ -15,14 +15,14 @@ from warpnerf.scenes.scene import Scene, View
 
 
 def test_vertical_lines_through_balls_around_cameras_in_even_density() -> None:
-    """Two upright cameras, 0.2 apart; z is up, and x is to the right."""
+    """Two upright cameras, one just below the top of the box; z is up, and x is to the right."""
     field = tiny_field()
     values = field.storage.values.numpy()
     values[:, 0] = 1.0
     field.storage.values.assign(values)
     field = replace(field, free=FreeCells.none(field.workers))
     sigma = field.storage.density_scale * np.log1p(np.exp(1.0 + field.storage.density_shift))
-    places, radius = np.array([[0.0, 0.0, 0.1], [0.2, 0.1, -0.1]]), 0.3
+    places, radius = np.array([[0.0, 0.0, 0.8], [0.2, 0.1, -0.1]]), 0.3
     views = [
         View(
             name=str(place),
@@ -45,11 +45,16 @@ def test_vertical_lines_through_balls_around_cameras_in_even_density() -> None:
     n = len(plan.depths)
     cells = (np.arange(n) + 0.5) * plan.extent / n - 0.5 * plan.extent
     x, y = np.meshgrid(0.1 + cells, 0.05 + cells, indexing="ij")
-    apart = np.stack([np.hypot(x - a, y - b) for a, b, _ in places]).min(axis=0)
-    with np.errstate(invalid="ignore"):
-        truth = sigma * 2.0 * np.sqrt(radius**2 - apart**2)
+    lengths = []
+    for a, b, c in places:
+        with np.errstate(invalid="ignore"):
+            half = np.sqrt(radius**2 - (x - a) ** 2 - (y - b) ** 2)
+        lengths.append(np.minimum(c + half, 1.0) - (c - half))
+    truth = sigma * np.fmax(*lengths)
     assert np.array_equal(np.isnan(plan.depths), np.isnan(truth)) and np.isnan(truth).mean() > 0.1
-    inside = apart < 0.9 * radius
-    np.testing.assert_allclose(plan.depths[inside], truth[inside], rtol=1e-3)
+    known = ~np.isnan(truth)
+    off = np.abs(plan.depths - truth)[known]
+    assert off.max() < 0.6 * sigma * field.steps.step  # of a step that the box cuts
+    assert np.median(off) < 1e-3
     picture = near_picture(scene, {"a": plan, "b": plan})
     assert (picture == [214, 40, 40]).all(axis=2).any() and picture.shape[1] > 2 * 640

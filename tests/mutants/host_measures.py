@@ -9,6 +9,7 @@ HIDES = f"{TESTS}test_a_wall_hides_what_is_behind_it"
 SEEN = f"{TESTS}test_figures_are_of_the_pixels_that_enough_views_see"
 BY_HAND = f"{TESTS}test_depth_errors_by_hand"
 NEAREST = f"{TESTS}test_the_angle_is_that_to_the_nearest_camera"
+POINTS = f"{TESTS}test_points_stand_in_where_no_depths_are_known"
 WITHOUT = f"{TESTS}test_a_capture_without_depths_is_measured_as_far_as_it_can_be"
 
 LIGHT, SIGHT, MEASURES = (f"evaluation/{name}.py" for name in ("light", "sight", "measures"))
@@ -44,6 +45,10 @@ MUTANTS = [
     of_host("sight: test views see as well", SIGHT, 'for index in scene.splits["train"]:', "for index in range(len(scene.views)):",
             HIDES),
     of_host("sight: counted for each training", SIGHT, "if view.name not in self._counts:", "if True:", CUT),
+    of_host("sight: the farthest point of a pixel", SIGHT, "np.argsort(-away", "np.argsort(away", POINTS),
+    of_host("sight: test views show points as well", SIGHT, 'for index in scene.splits["train"])', "for index in range(len(scene.views)))",
+            POINTS),
+    of_host("tracks: a point that is matched twice", "scenes/cameras/tracks.py", "np.unique(self.shown", "(lambda a: a)(self.shown", POINTS),
     of_host("measures: one view more", MEASURES, "counts >= least", "counts > least", SEEN),
     of_host("measures: of all pixels", MEASURES, "psnr(rgb, target, mask)", "psnr(rgb, target, known)", SEEN),
     of_host("measures: coverage of all that is there", MEASURES, "rendering.opacity[mask] >= 0.5", "rendering.opacity[mask] > 0.0",

@@ -118,7 +118,7 @@ def test_the_report_is_one_file_and_says_what_figures_say(
     names = {path.name for path in finished.folder.iterdir()}
     assert {"report.html", "figures.json", "moments.png", "cameras.png", "curves.png"} <= names
     with av.open(finished.folder / "floaters.mp4") as film:
-        assert film.streams.video[0].frames == 2 and film.streams.video[0].width == 2 * 320 + 6
+        assert film.streams.video[0].frames == 2 and film.streams.video[0].width == 2 * 40 + 6
     first, last = (camera.position for camera in usual_path(finished))
     scene = finished.capture.scene
     camera = scene.training_cameras[1]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from warpnerf.exporting.cameras import write_scene
 from warpnerf.exporting.ply import surface_columns
 from warpnerf.exporting.surface import Surface
 from warpnerf.runs.config import RunConfig, describe
+from warpnerf.scenes.cameras.tracks import Tracks
 from warpnerf.scenes.formats.load import load_scene
 from warpnerf.scenes.formats.ply import read_ply
 from warpnerf.scenes.scene import Scene
@@ -63,11 +65,16 @@ def test_scenes_near_the_origin_stay_where_they_are(
 
 def test_there_and_back_again(tmp_path: Path) -> None:
     scene = georeferenced(tmp_path / "scene")
+    assert scene.points is not None
+    scene = replace(scene, tracks=Tracks(positions=scene.points, shown={}))
     back = scene.at_offset(None)
     assert back.offset is None and scene.at_offset(scene.offset) is scene
     np.testing.assert_allclose(back.cameras[2].position - UTM, ring(9)[2][:3, 3], atol=1e-8)
     again = back.at_offset(scene.offset)
     assert scene.observations is not None and again.observations is not None
+    assert back.tracks is not None and again.tracks is not None
+    np.testing.assert_allclose(again.tracks.positions, scene.points, atol=1e-8)
+    assert np.abs(back.tracks.positions - UTM).max() < 3.0
     for name in ("box_min", "box_max", "points", "offset"):
         np.testing.assert_allclose(getattr(again, name), getattr(scene, name), atol=1e-8)
     np.testing.assert_allclose(

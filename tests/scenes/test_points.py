@@ -168,6 +168,9 @@ def test_a_model_s_points_give_the_extent(tmp_path: Path) -> None:
     write_points(model, ball(radius=0.3) + np.array([0.0, 0.0, 0.1]))
     scene = load_scene(tmp_path)
     assert by_points(scene) and scene.points is not None and scene.points.shape == (400, 3)
+    assert (
+        scene.tracks is not None and (scene.tracks.counts(v.name for v in scene.views) == 4).all()
+    )
     assert scene.content_distance == pytest.approx(np.sqrt(10.0), rel=0.1)
     np.testing.assert_allclose(scene.box_min, [-0.32, -0.32, -0.22], atol=0.02)
     np.testing.assert_allclose(scene.box_max, [0.32, 0.32, 0.42], atol=0.02)

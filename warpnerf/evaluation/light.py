@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from warpnerf.evaluation.sight import goes_by_points, true_depths
 from warpnerf.rendering.rays import camera_rays
 from warpnerf.scenes.scene import Scene, View, require_split
 
@@ -49,7 +50,7 @@ def measure_light(field: AnyField, scene: Scene, split: str) -> Light | None:
 
     Args:
         field: A trained field.
-        scene: Photographs with true depths.
+        scene: Photographs with ``true_depths``.
         split: Which of them.
 
     Returns:
@@ -59,7 +60,7 @@ def measure_light(field: AnyField, scene: Scene, split: str) -> Light | None:
     if field.in_ndc:
         return None
     views = [scene.views[index] for index in require_split(scene, split)]
-    rays = [found for found in (_rays(field, view) for view in views) if found is not None]
+    rays = [found for view in views if (found := _rays(field, scene, view)) is not None]
     if not rays:
         return None
     origins, directions, depths = (np.concatenate(parts) for parts in zip(*rays, strict=True))
@@ -97,19 +98,24 @@ def absorbed(
     return np.stack([*shares, light], axis=1)
 
 
-def _rays(field: AnyField, view: View) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+def _rays(
+    field: AnyField, scene: Scene, view: View
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Origins, directions and true depths of some of a view's pixels whose depth is known."""
-    if view.depth is None:
+    depths = true_depths(scene, view)
+    if depths is None:
         return None
-    known = np.isfinite(view.depth) & (view.depth > 0.0)
-    if view.mask is not None:
-        known &= view.mask
-    gap = view.camera.block_for(MAX_RAYS)
-    chosen = np.zeros_like(known)
-    chosen[gap // 2 :: gap, gap // 2 :: gap] = True
-    pixels = np.flatnonzero(known & chosen)
+    chosen = np.isfinite(depths)
+    if goes_by_points(scene):
+        pixels = np.flatnonzero(chosen)
+        pixels = pixels[:: max(1, -(-len(pixels) // MAX_RAYS))]
+    else:
+        gap = view.camera.block_for(MAX_RAYS)
+        lattice = np.zeros_like(chosen)
+        lattice[gap // 2 :: gap, gap // 2 :: gap] = True
+        pixels = np.flatnonzero(chosen & lattice)
     if len(pixels) == 0:
         return None
     origins, directions = (rays.numpy() for rays in camera_rays(view.camera, field.workers))
     origins = np.broadcast_to(origins, directions.shape)
-    return origins[pixels], directions[pixels], view.depth.ravel()[pixels]
+    return origins[pixels], directions[pixels], depths.ravel()[pixels]

@@ -14,7 +14,7 @@ import numpy as np
 from warpnerf.evaluation.floater_metrics import near_density
 from warpnerf.evaluation.light import Light, measure_light
 from warpnerf.evaluation.metrics import psnr, ssim, truth
-from warpnerf.evaluation.sight import NO_SURFACE, Sight
+from warpnerf.evaluation.sight import NO_SURFACE, Sight, goes_by_points, true_depths
 from warpnerf.runtime.terminal import table_text
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.scene import Scene, View
@@ -47,7 +47,7 @@ class SeenFigures:
     psnr: float
     """dB."""
     ssim: float | None
-    """At most 1; None where the pixels leave no window."""
+    """At most 1; None where the pixels leave no window, or show single points."""
     depth_error: float
     """Mean |depth - true depth|, scene units."""
     relative_depth_error: float
@@ -74,6 +74,9 @@ class Measures:
 
     light: dict[str, Light]
     """Front, hit, behind and transmitted, by split: the one that is measured, and train."""
+    points_only: bool
+    """Whether these are of pixels that show a point of structure from motion, as nothing else tells
+    where surfaces are."""
     seen: dict[str, SeenFigures]
     """By how many training views, at least, see a pixel's surface, as text."""
     near_mass: dict[str, float]
@@ -187,8 +190,10 @@ class Measuring:
             )
         )
         counts = self._sight.counts(view, self._field.workers)
-        if counts is None or view.depth is None:
+        truths = true_depths(self._scene, view)
+        if counts is None or truths is None:
             return
+        sparse = goes_by_points(self._scene)
         known = counts != NO_SURFACE
         if not known.any():
             return
@@ -198,13 +203,13 @@ class Measuring:
             if not mask.any():
                 found.append({"share": 0.0})
             else:
-                depths = rendering.depth[mask].astype(np.float64), view.depth[mask]
+                depths = rendering.depth[mask].astype(np.float64), truths[mask]
                 found.append(
                     {
                         "share": float(mask.sum() / known.sum()),
                         "coverage": float(np.mean(rendering.opacity[mask] >= 0.5)),
                         "psnr": psnr(rgb, target, mask),
-                        "ssim": ssim(rgb, target, mask),
+                        "ssim": None if sparse else ssim(rgb, target, mask),
                         **depth_errors(*depths, nearest),
                     }
                 )
@@ -229,8 +234,9 @@ class Measuring:
                 light[split] = found
         if not light:
             left_out.append(
-                "front, hit and behind: left out, as they need true depths and rays that are cut "
-                "at distances, which rays in normalised device coordinates are not"
+                "front, hit and behind: left out, as they need true depths, or points of structure "
+                "from motion with tracks, and rays that are cut at distances, which those in "
+                "normalised device coordinates are not"
             )
         seen = {
             str(least): _mean(found)
@@ -239,8 +245,8 @@ class Measuring:
         }
         if not seen:
             left_out.append(
-                "pixels that training views see: left out, as the true depths of views say which "
-                "they are"
+                "pixels that training views see: left out, as true depths, or points of structure "
+                "from motion with tracks, say which they are"
             )
         names = [scene.views[index].name for index in scene.splits["train"]]
         depths = [mass / n for mass, n in masses]
@@ -251,6 +257,7 @@ class Measuring:
             density = near_density(field, scene.training_cameras, scene.first_hit)
         return Measures(
             light=light,
+            points_only=bool(seen or light) and goes_by_points(scene),
             seen=seen,
             near_mass=dict(zip(names, depths, strict=True)),
             near_density=density,

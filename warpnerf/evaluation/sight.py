@@ -27,13 +27,12 @@ NO_SURFACE = -1
 class Sight:
     """How many training views see the surfaces of a scene's views; each is looked at once.
 
-    Cameras and true depths say so, whatever was trained.
+    Cameras and true depths say so, or tracks of points, whatever was trained.
     """
 
     def __init__(self, scene: Scene) -> None:
         """Of a scene; nothing is counted yet."""
         self._scene = scene
-        self._tells = can_tell_sight(scene)
         self._counts: dict[str, np.ndarray] = {}
 
     def counts(self, view: View, workers: Workers) -> np.ndarray | None:
@@ -46,19 +45,68 @@ class Sight:
         Returns:
             [H, W] int16, NO_SURFACE where none is known; None where nothing tells.
         """
-        if view.depth is None or not self._tells:
+        scene = self._scene
+        depths = true_depths(scene, view)
+        if depths is None or not (can_tell_sight(scene) or goes_by_points(scene)):
             return None
         if view.name not in self._counts:
-            known = np.isfinite(view.depth) & (view.depth > 0.0)
-            if view.mask is not None:
-                known &= view.mask
+            known = np.isfinite(depths)
             counts = np.full(known.shape, NO_SURFACE, np.int16)
-            if known.any():
+            if goes_by_points(scene):
+                counts[known] = _shown(scene, view)[1][known]
+            elif known.any():
                 _, rays = camera_rays(view.camera, workers)
                 points = surfaces(view, rays.numpy())[known.ravel()]
-                counts[known] = training_views_that_see(self._scene, points)
+                counts[known] = training_views_that_see(scene, points)
             self._counts[view.name] = counts
         return self._counts[view.name]
+
+
+def true_depths(scene: Scene, view: View) -> np.ndarray | None:
+    """True distances along a view's rays, as far as they are known of pixels that count.
+
+    They are those of the view, or, where the scene has none of any view, the distances of the
+    points of structure from motion that its photograph shows, each at its pixel.
+
+    Args:
+        scene: The view's.
+        view: Any of its views.
+
+    Returns:
+        [H, W] scene units, NaN where none is known; None where that is everywhere so.
+    """
+    if view.depth is not None:
+        depths = np.where(np.isfinite(view.depth) & (view.depth > 0.0), view.depth, np.nan)
+    elif goes_by_points(scene):
+        depths = _shown(scene, view)[0]
+    else:
+        return None
+    return depths if view.mask is None else np.where(view.mask, depths, np.nan)
+
+
+def goes_by_points(scene: Scene) -> bool:
+    """Whether only points of structure from motion tell where surfaces are, and who sees them."""
+    dense = scene.first_hit is not None or any(view.depth is not None for view in scene.views)
+    return scene.tracks is not None and not dense
+
+
+def _shown(scene: Scene, view: View) -> tuple[np.ndarray, np.ndarray]:
+    """Distances of the points that a view's photograph shows, NaN elsewhere, and how many training
+    views show each: [H, W] both; of several in a pixel the nearest."""
+    tracks = scene.tracks
+    assert tracks is not None
+    chosen = tracks.of(view.name)
+    points = tracks.positions[chosen]
+    inside, (columns, rows) = _in_picture(view.camera, points)
+    away = np.linalg.norm(points[inside] - view.camera.position, axis=1)
+    training = (scene.views[index].name for index in scene.splits["train"])
+    counts = tracks.counts(training)[chosen[inside]]
+    far_first = np.argsort(-away, kind="stable")
+    size = (view.camera.height, view.camera.width)
+    depths, of_pixels = np.full(size, np.nan), np.zeros(size, int)
+    depths[rows[far_first], columns[far_first]] = away[far_first]
+    of_pixels[rows[far_first], columns[far_first]] = counts[far_first]
+    return depths, of_pixels
 
 
 def can_tell_sight(scene: Scene) -> bool:

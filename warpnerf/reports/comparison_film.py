@@ -23,6 +23,9 @@ N_FRAMES = 48
 LONGER_SIDE = 320
 """Pixels of a rendering, where there is room for it."""
 
+MAX_SHARE = 2.0
+"""Of the photographs' sides: of small ones a rendering has no more detail."""
+
 MAX_WIDTH = 1920
 """Pixels of all renderings side by side, about."""
 
@@ -38,7 +41,7 @@ def film_path(experiment: Experiment, cameras: Sequence[Camera], distance: float
         distance: How far it gets, scene units.
     """
     longer = min(LONGER_SIDE, MAX_WIDTH // len(experiment.candidates))
-    share = longer / max(cameras[0].width, cameras[0].height)
+    share = min(MAX_SHARE, longer / max(cameras[0].width, cameras[0].height))
     size = max(1, round(share * cameras[0].width)), max(1, round(share * cameras[0].height))
     lenses = [path_lens([camera], size) for camera in cameras]
     return [moved for lens in lenses for moved in backing_away(lens, distance, N_FRAMES)]

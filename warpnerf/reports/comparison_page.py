@@ -84,7 +84,8 @@ it, light behind after that, and light that passes nowhere: the four sum to 1. M
 better; each of the others alone is neither, as a field that is emptier everywhere has less light in
 front and more that passes. Optical depth near cameras is measured up to a tenth of the content
 distance. Where two training views see: over the pixels of test views whose true surface at least
-two training views see; coverage is the share of them where the field is at least half opaque. Views
+two training views see (on captures without depths, those that show a point of structure from
+motion); coverage is the share of them where the field is at least half opaque. Views
 pulled back are training cameras moved back by a fifth of the content distance.</p>
 <script>
 const views = $views;

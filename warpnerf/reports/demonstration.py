@@ -65,10 +65,7 @@ Report = Callable[[str, float, str], None]
 """Told what is being done and why, the fraction of it that is done, and a few words."""
 
 
-BEFORE_TEST_CAMERAS = (
-    "test cameras stand away from training cameras, where scaling also slows the clearing of what "
-    "early steps leave"
-)
+ELSEWHERE = "scaling keeps space before training cameras free, and test cameras stand elsewhere"
 
 PASSES = "light that no longer ends in front may pass the surface as well"
 
@@ -83,7 +80,7 @@ SHOWN: dict[str, tuple[int, str | None]] = {
     "hit_train": (1, None),
     "behind_train": (-1, PASSES),
     "transmitted_train": (-1, PASSES),
-    "front_test": (-1, BEFORE_TEST_CAMERAS),
+    "front_test": (-1, ELSEWHERE),
     "hit_test": (1, "what ends in front, on test rays, does not reach surfaces"),
     "behind_test": (-1, PASSES),
     "transmitted_test": (-1, PASSES),

@@ -13,6 +13,7 @@ from warpnerf.checks import InputError, require_kind, require_positive, said
 from warpnerf.optim_config import SceneKind
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.cameras.observations import Observations
+from warpnerf.scenes.cameras.tracks import Tracks
 
 FirstHit = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """From origins [n, 3] and unit directions [n, 3] to the distance of the first surface along each
@@ -190,6 +191,8 @@ class Scene:
     """[n, 3] float64, some of these points, scene units."""
     observations: Observations | None = None
     """Some of these points, as training cameras see them."""
+    tracks: Tracks | None = None
+    """All of these points, with the photographs that show them; None: not known."""
     bounds: np.ndarray | None = None
     """[n_views, 2] float64, depth of the nearest and of the farthest content that each camera sees,
     scene units, as the file gives them: not checked. None where it gives none."""
@@ -265,6 +268,7 @@ class Scene:
             box_max=self.box_max + by,
             points=None if self.points is None else self.points + by,
             observations=None if seen is None else replace(seen, positions=seen.positions + by),
+            tracks=None if self.tracks is None else self.tracks.moved(by),
             offset=offset,
         )
 

@@ -14,6 +14,7 @@ from warpnerf.checks import InputError
 from warpnerf.runtime.memory import usable_cores
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.cameras.focus import estimate_extent
+from warpnerf.scenes.cameras.tracks import Tracks
 from warpnerf.scenes.cameras.undistort import seen_pixels
 from warpnerf.scenes.extent.conventions import check_against_photographs
 from warpnerf.scenes.extent.points import Points, extent_by_points
@@ -145,9 +146,11 @@ def assemble(
     except InputError as error:
         place = _field(file, "$.frames[].transform_matrix")
         raise InputError(f"{file}:{place} {error}") from None
-    observed = None
+    observed = tracks = None
     if points is not None:
         extent, observed = extent_by_points(extent, points, views, indices["train"], unbounded)
+        if observed is not None and points.tracks is not None:
+            tracks = Tracks(positions=points.positions, shown=points.tracks)
     return Scene(
         name=folder.resolve().name,
         views=views,
@@ -160,6 +163,7 @@ def assemble(
         guessed=extent.guessed and observed is None,
         near_content=None if observed is None else observed.near_content,
         observations=None if observed is None else observed.observations,
+        tracks=tracks,
         points=None if observed is None or points is None else points.sample,
         bounds=_bounds(frames, views),
         offset=offset,
