@@ -16,7 +16,12 @@ from warpnerf.evaluation.evaluate import evaluate
 from warpnerf.evaluation.light import absorbed, measure_light
 from warpnerf.evaluation.measures import Measuring, angle_to_nearest, depth_errors
 from warpnerf.evaluation.near_field import measure_near_field, near_masses
-from warpnerf.evaluation.sight import Sight, surfaces, training_views_that_see, true_depths
+from warpnerf.evaluation.sight import (
+    SurfaceVisibility,
+    surfaces,
+    training_views_that_see,
+    true_depths,
+)
 from warpnerf.fields.occupancy import FreeCells
 from warpnerf.rendering.field import Field, Rendering
 from warpnerf.rendering.rays import camera_rays
@@ -204,7 +209,7 @@ def test_points_stand_in_where_no_depths_are_known() -> None:
     depths = true_depths(scene, view)
     assert depths is not None and np.isfinite(depths).sum() == 4
     np.testing.assert_allclose(depths[rows, columns], away)
-    counts = Sight(scene).counts(view, field.workers)
+    counts = SurfaceVisibility(scene).counts(view, field.workers)
     assert counts is not None and counts[rows, columns].tolist() == [2, 2, 1, 0]
 
     rendering = Rendering(

@@ -33,7 +33,7 @@ from warpnerf.scenes.scene import Scene, View, require_split
 
 if TYPE_CHECKING:
     from warpnerf.evaluation.measures import Measures
-    from warpnerf.evaluation.sight import Sight
+    from warpnerf.evaluation.sight import SurfaceVisibility
     from warpnerf.rendering.composite import CompositeField
     from warpnerf.rendering.field import Field, Rendering
 
@@ -150,7 +150,7 @@ def evaluate(
     on_image: Callable[[View, np.ndarray, Rendering], None] | None = None,
     lpips: Distance | None = None,
     on_progress: Callable[[float, str], None] = lambda done, words: None,
-    measures: bool | Sight = False,
+    measures: bool | SurfaceVisibility = False,
 ) -> Evaluation:
     """Evaluate a field: render a split's views and compare them with the photographs.
 
@@ -162,8 +162,8 @@ def evaluate(
             and its rendering.
         lpips: A ``warpnerf.evaluation.lpips.Lpips``, if LPIPS is wanted.
         on_progress: Called with the share that is done, in (0, 1], and what was last, in words.
-        measures: Whether to measure what takes longer as well: see ``Measures``. The ``Sight`` of
-            the scene says so too, where several of its fields are measured.
+        measures: Whether to measure what takes longer as well: see ``Measures``. The scene's
+            ``SurfaceVisibility`` says so too, where several of its fields are measured.
 
     Returns:
         Figures of each image and their means, and what hangs in front of the training cameras.

@@ -14,7 +14,7 @@ import numpy as np
 from warpnerf.evaluation.floater_metrics import near_density
 from warpnerf.evaluation.light import Light, measure_light
 from warpnerf.evaluation.metrics import psnr, ssim, truth
-from warpnerf.evaluation.sight import NO_SURFACE, Sight, goes_by_points, true_depths
+from warpnerf.evaluation.sight import NO_SURFACE, SurfaceVisibility, goes_by_points, true_depths
 from warpnerf.runtime.terminal import table_text
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.scene import Scene, View
@@ -158,7 +158,7 @@ class Measuring:
     """Gathers measures while the views of a split are rendered."""
 
     def __init__(
-        self, field: AnyField, scene: Scene, split: str, sight: Sight | None = None
+        self, field: AnyField, scene: Scene, split: str, visibility: SurfaceVisibility | None = None
     ) -> None:
         """Begin.
 
@@ -166,10 +166,10 @@ class Measuring:
             field: A trained field.
             scene: Its training views are those of the field's training.
             split: Whose views will be added.
-            sight: Of the scene, where other fields of it are measured as well.
+            visibility: Of the scene, where other fields of it are measured as well.
         """
         self._field, self._scene, self._split = field, scene, split
-        self._sight = Sight(scene) if sight is None else sight
+        self._visibility = SurfaceVisibility(scene) if visibility is None else visibility
         self._seen: dict[int, list[dict[str, float | None]]] = {least: [] for least in SEEN_BY}
         self._angles: list[ViewAngle] = []
 
@@ -189,7 +189,7 @@ class Measuring:
                 psnr=psnr(rgb, target, view.mask),
             )
         )
-        counts = self._sight.counts(view, self._field.workers)
+        counts = self._visibility.counts(view, self._field.workers)
         truths = true_depths(self._scene, view)
         if counts is None or truths is None:
             return

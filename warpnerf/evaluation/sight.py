@@ -24,7 +24,7 @@ NO_SURFACE = -1
 """Stands for a count at pixels whose true surface is not known, or which do not count."""
 
 
-class Sight:
+class SurfaceVisibility:
     """How many training views see the surfaces of a scene's views; each is looked at once.
 
     Cameras and true depths say so, or tracks of points, whatever was trained.

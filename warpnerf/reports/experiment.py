@@ -20,7 +20,7 @@ import numpy as np
 from warpnerf.checks import InputError, cannot_write
 from warpnerf.config import TrainConfig
 from warpnerf.config_json import config_to_json
-from warpnerf.evaluation.sight import Sight
+from warpnerf.evaluation.sight import SurfaceVisibility
 from warpnerf.rendering.field import Field, Rendering
 from warpnerf.runs.files import is_leftover, sweep
 from warpnerf.runs.run import Run
@@ -81,7 +81,9 @@ class Experiment:
         """Name all; nothing is read or written yet."""
         self.folder, self.capture = folder, capture
         self.candidates, self.seeds = tuple(candidates), tuple(range(n_seeds))
-        self._sight = Sight(capture.scene)  # of cameras and depths, which no training changes
+        self._visibility = SurfaceVisibility(
+            capture.scene
+        )  # of cameras and depths, which no training changes
 
     @property
     def trials(self) -> list[tuple[Candidate, int]]:
@@ -244,7 +246,7 @@ class Experiment:
         config = candidate.config
         field, _ = run.load_field(config.device, config.threads)
         scene = run.read_config().as_trained(self.capture.scene)
-        run.evaluate(field, scene, "test", on_progress, measures=self._sight)
+        run.evaluate(field, scene, "test", on_progress, measures=self._visibility)
 
 
 class _Moments:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from warpnerf.evaluation.evaluate import Evaluation, evaluate
-from warpnerf.evaluation.sight import Sight
+from warpnerf.evaluation.sight import SurfaceVisibility
 from warpnerf.media.contact_sheet import SheetRow, contact_sheet, spread
 from warpnerf.media.filming import depth_range, range_of
 from warpnerf.media.pictures import comparison, picture_files, write_png
@@ -26,7 +26,7 @@ def evaluate_into(
     split: str,
     writing: Callable[[], AbstractContextManager[None]],
     on_progress: Callable[[float, str], None],
-    measures: bool | Sight = False,
+    measures: bool | SurfaceVisibility = False,
 ) -> Evaluation:
     """Measure a split, and write metrics.json, its pictures, and a sheet of a few of them.
 

@@ -30,7 +30,7 @@ from warpnerf.checks import InputError, cannot_write
 from warpnerf.config import TrainConfig
 from warpnerf.evaluation.evaluate import Evaluation
 from warpnerf.evaluation.measures import Measures
-from warpnerf.evaluation.sight import Sight
+from warpnerf.evaluation.sight import SurfaceVisibility
 from warpnerf.media.curves import curves
 from warpnerf.media.pictures import write_png
 from warpnerf.rendering.field import Field
@@ -369,7 +369,7 @@ class Run:
         scene: Scene,
         split: str,
         on_progress: Callable[[float, str], None] = lambda done, words: None,
-        measures: bool | Sight = False,
+        measures: bool | SurfaceVisibility = False,
     ) -> Evaluation:
         """Measure a split, and write metrics.json, its pictures, and a sheet of a few of them.
 
