@@ -18,14 +18,14 @@ class Tracks:
     """Indices of the points that a photograph shows, by the name of its view."""
 
     def of(self, name: str) -> np.ndarray:
-        """Indices of the points that a view's photograph shows, [k], each once."""
-        return np.unique(self.shown.get(name, np.empty(0, np.int64)))
+        """Indices of the points that a view's photograph shows, [k]; one may be matched twice."""
+        return self.shown.get(name, np.empty(0, np.int64))
 
     def counts(self, names: Iterable[str]) -> np.ndarray:
         """How many of some views' photographs show each point, [n] int."""
         counts = np.zeros(len(self.positions), int)
         for name in names:
-            counts[self.of(name)] += 1
+            counts[self.of(name)] += 1  # once, however often it is matched
         return counts
 
     def moved(self, by: np.ndarray) -> Tracks:
