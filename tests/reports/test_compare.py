@@ -60,16 +60,20 @@ def experiment(folder: Path, scene: Scene, n_seeds: int = 2) -> Experiment:
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory, room: Scene) -> Experiment:
-    """One that was never interrupted, and in which each test view's sight was counted once."""
+def looked() -> Mock:
+    """Counts how often it is looked which training views see some surfaces."""
+    return Mock(side_effect=sight.training_views_that_see)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory, room: Scene, looked: Mock) -> Experiment:
+    """One that was never interrupted."""
     made = experiment(tmp_path_factory.mktemp("experiments") / "whole", room)
     made.begin()
-    count = Mock(side_effect=sight.training_views_that_see)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sight, "training_views_that_see", count)
+        patch.setattr(sight, "training_views_that_see", looked)
         for candidate, seed in made.trials:
             assert made.train(candidate, seed)
-    assert count.call_count == len(room.splits["test"])
     return made
 
 
@@ -81,9 +85,14 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def test_cut_anywhere_it_ends_with_the_same_bits(
-    finished: Experiment, room: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    finished: Experiment,
+    looked: Mock,
+    room: Scene,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Each training is stopped once, by a process that does not know the others."""
+    assert looked.call_count == len(room.splits["test"])
     updates = 0
     update = training.Trainer.update
 

@@ -53,7 +53,8 @@ def write_comparison(
 
     report.html holds all of it in one file; figures.json the figures; beside them moments.png,
     near.png, curves.png, cameras.png, sampling.png, floaters.mp4 (.gif where PyAV is missing), and
-    views/ with renderings and photographs.
+    views/ with renderings and photographs. Pictures are of trainings with seed 0 that have not
+    failed.
 
     Args:
         experiment: All of its trainings have ended.
@@ -70,16 +71,18 @@ def write_comparison(
     rows = compare_figures(experiment)
     on_progress(0.05, "rendering views")
     views = views_of(experiment)
-    film, _ = video_file(folder / FILM, FPS)
-    frames = film_frames(
-        experiment,
-        usual_path(experiment) if path is None else path,
-        lambda done, words: on_progress(0.2 + 0.7 * done, words),
-    )
-    try:
-        write_video(film, frames, FPS)
-    except OSError as error:
-        raise cannot_write(f"--output {folder}", error) from error
+    film = None
+    if any(experiment.failure(c, experiment.seeds[0]) is None for c in experiment.candidates):
+        film, _ = video_file(folder / FILM, FPS)
+        frames = film_frames(
+            experiment,
+            usual_path(experiment) if path is None else path,
+            lambda done, words: on_progress(0.2 + 0.7 * done, words),
+        )
+        try:
+            write_video(film, frames, FPS)
+        except OSError as error:
+            raise cannot_write(f"--output {folder}", error) from error
     on_progress(0.9, "drawing")
     plots = {name.removesuffix(".png"): plot for name, plot in overlap_plots(scene).items()}
     pictures = plots | {"curves": curves_picture(experiment)}

@@ -16,8 +16,8 @@ from warpnerf.scenes.cameras.camera import Camera
 FILM = "floaters.mp4"
 """Its file; see ``video_file``."""
 
-FPS = 24.0
-N_FRAMES = 48
+FPS = 20.0
+N_FRAMES = 40
 """From one camera."""
 
 LONGER_SIDE = 320

@@ -62,9 +62,7 @@ better, red significantly worse.</p>
 <h2>Views</h2>
 <p>Of the trainings with seed $seed. The bar uncovers one beside the other.</p>
 <div id="views"></div>
-<h2>A camera that backs away</h2>
-<figure>$film<figcaption>From where a training camera stood, backwards; colour above depth.
-</figcaption></figure>
+$film
 $moments
 $near
 <h2>Training</h2>
@@ -138,7 +136,7 @@ def comparison_page(
     rows: Sequence[Row],
     views: Views,
     pictures: Mapping[str, np.ndarray],
-    film: Path,
+    film: Path | None,
     seed: int,
 ) -> bytes:
     """Write the page.
@@ -150,7 +148,7 @@ def comparison_page(
         views: For the sliders.
         pictures: ``curves``, ``cameras``, ``sampling``, and ``moments`` and ``near`` where there
             are, [H, W, 3].
-        film: .mp4 or .gif.
+        film: .mp4 or .gif, where there is one.
         seed: Of the trainings that pictures are of.
 
     Returns:
@@ -253,12 +251,18 @@ def _uri(picture: np.ndarray, kind: str) -> str:
     return f"data:image/{kind.lower()};base64,{base64.b64encode(buffer.getvalue()).decode()}"
 
 
-def _moving(film: Path) -> str:
-    """A film as an element that plays it."""
+def _moving(film: Path | None) -> str:
+    """A film with its heading; nothing where there is none."""
+    if film is None:
+        return ""
     data = base64.b64encode(film.read_bytes()).decode()
+    plays = f'<video src="data:video/mp4;base64,{data}" controls loop muted playsinline></video>'
     if film.suffix == ".gif":
-        return f'<img src="data:image/gif;base64,{data}" alt="a camera that backs away">'
-    return f'<video src="data:video/mp4;base64,{data}" controls loop muted playsinline></video>'
+        plays = f'<img src="data:image/gif;base64,{data}" alt="a camera that backs away">'
+    return (
+        f"<h2>A camera that backs away</h2>\n<figure>{plays}<figcaption>From where a training "
+        "camera stood, backwards; colour above depth.</figcaption></figure>"
+    )
 
 
 def _script(value: Any) -> str:
