@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from tests.support.tiny_fields import tiny_field
 from tests.support.tiny_scenes import camera_at, look_at
@@ -58,3 +59,9 @@ def test_vertical_lines_through_balls_around_cameras_in_even_density() -> None:
     assert np.median(off) < 1e-3
     picture = near_picture(scene, {"a": plan, "b": plan})
     assert (picture == [214, 40, 40]).all(axis=2).any() and picture.shape[1] > 2 * 640
+    far = replace(
+        views[1], camera=replace(views[1].camera, c2w=look_at((600.0, 0.0, 0.0), (0.0, 0, 0))[:3])
+    )
+    wide = near_plan(field, replace(scene, views=[views[0], far]))
+    assert wide is not None and (~np.isnan(wide.depths)).sum() == 2
+    assert np.nanmax(wide.depths) == pytest.approx(sigma * 0.5, abs=0.6 * sigma * field.steps.step)

@@ -70,13 +70,14 @@ def near_plan(field: Field, scene: Scene) -> NearPlan | None:
             (middle[right] + cells - place[right])[:, None], middle[ahead] + cells - place[ahead]
         )
         rows, columns = np.nonzero(apart < radius)
-        if len(rows) == 0:  # balls smaller than a cell: the line through its middle
+        origins = np.repeat(place[None], max(1, len(rows)), axis=0)
+        if len(rows) == 0:  # a ball smaller than a cell: the line through the camera
             rows, columns = (np.array([k]) for k in np.unravel_index(apart.argmin(), apart.shape))
-            apart[rows, columns] = 0.0
-        half = np.sqrt(radius**2 - apart[rows, columns] ** 2)
-        origins = np.repeat(place[None], len(rows), axis=0)
-        origins[:, right] = middle[right] + cells[rows]
-        origins[:, ahead] = middle[ahead] + cells[columns]
+            half = np.array([radius])
+        else:
+            half = np.sqrt(radius**2 - apart[rows, columns] ** 2)
+            origins[:, right] = middle[right] + cells[rows]
+            origins[:, ahead] = middle[ahead] + cells[columns]
         up = 3 - right - ahead
         origins[:, up] -= half + near
         directions = np.repeat(np.eye(3)[None, up], len(rows), axis=0)
