@@ -53,7 +53,7 @@ def main() -> None:
     parser = options(__doc__)
     parser.add_argument("scene", help="a folder, or builtin:room")
     parser.add_argument("--steps", type=int, default=2000, help="of each training")
-    others = [name for name in STORAGE_KINDS if name != DENSE.name]
+    others = [name for name in STORAGE_KINDS if name not in (DENSE.name, "auto")]
     parser.add_argument("--field", choices=others, default="vm")
     parser.add_argument("--pairs", type=int, default=15)
     parser.add_argument("--threads", type=int, default=1)

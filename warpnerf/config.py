@@ -28,7 +28,7 @@ from warpnerf.model.sampler_kinds import (
     checked_sampler,
 )
 from warpnerf.model.spaces import SPACES, SpaceKind
-from warpnerf.model.storage_kinds import DENSE, StorageKind, storage_of
+from warpnerf.model.storage_kinds import AUTO_FIELD, DENSE, StorageKind, Vm, storage_of
 from warpnerf.optim_config import OPTIM_RATES, OPTIM_VARIATION, OptimConfig, SceneKind, model_rates
 
 Scaling = Literal["none", "quadratic", "clamped"]
@@ -292,12 +292,32 @@ class TrainConfig:
     """What is minimised; ``LossConfig()`` is the squared error alone."""
     field: StorageKind = DENSE
     """What the model's raw values are stored in: dense (at each node of the grid), vm (TensoRF's
-    planes and lines of vectors, and a matrix that decodes their products) or hash (Instant-NGP's
-    tables of entries, by level). A name stands for what it is by default."""
+    planes and lines of vectors, and a matrix that decodes their products), hash (Instant-NGP's
+    tables of entries, by level), or auto: vm for objects with alpha unless rates of a dense grid
+    are configured, else dense. A name stands for what it is by default."""
     sampler: SamplerKind = AUTO_SAMPLER
     """Where rays are sampled: march (regular steps), resampled (intervals drawn for each ray from a
     small grid of densities that is trained along), or auto: resampled where space is contracted and
     steps are not configured, else march. A name stands for the sampler with its defaults."""
+
+    def for_kind(self, kind: SceneKind) -> TrainConfig:
+        """The configuration with ``field`` decided for a kind of scene.
+
+        Args:
+            kind: object, bounded or unbounded.
+
+        Returns:
+            The same, or with what auto stands for.
+        """
+        if self.field != AUTO_FIELD:
+            return self
+        parts = (self.optim, OPTIM_RATES), (self.model, model_rates(self.model))
+        configured = any(
+            getattr(part, name) != getattr(type(part), name)
+            for part, names in parts
+            for name in names
+        )
+        return replace(self, field=Vm() if kind == "object" and not configured else DENSE)
 
     def losses_for(self, kind: SceneKind) -> LossConfig:
         """The loss weights: ``loss``, decided for a kind of scene.

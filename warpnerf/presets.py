@@ -86,7 +86,7 @@ from dataclasses import replace
 from warpnerf.config import GridConfig, LossConfig, MarchConfig, TrainConfig
 from warpnerf.model.models import PerSample
 from warpnerf.model.sampler_kinds import MARCHED, Resampled
-from warpnerf.model.storage_kinds import Hash, Vm
+from warpnerf.model.storage_kinds import AUTO_FIELD, Hash, Vm
 from warpnerf.optim_config import OptimConfig
 
 _FAST = TrainConfig()
@@ -124,6 +124,7 @@ PRESETS: dict[str, TrainConfig] = {
         _FAST,
         steps=200_000,
         time_limit=900.0,
+        field=AUTO_FIELD,
         grid=GridConfig(voxels=224**3),
         optim=OptimConfig(decay=0.03),
     ),

@@ -28,6 +28,7 @@ from warpnerf.model.storage_kinds import DENSE, STORAGE_KINDS, Vm
 from warpnerf.optim_config import OptimConfig
 from warpnerf.runtime.parallel import Workers
 from warpnerf.training.optim import OPTIMISERS
+from warpnerf.training.plan import resolve
 from warpnerf.training.state import TrainingState
 from warpnerf.training.trainer import Trainer
 
@@ -54,6 +55,18 @@ def test_it_learns(states: list[TrainingState]) -> None:
 
 def test_it_resumes_with_equal_bits(states: list[TrainingState], tmp_path: Path) -> None:
     require_resumes(states, CONFIG, tmp_path / "state")
+
+
+def test_auto_is_vm_for_objects_alone() -> None:
+    """And where rates of a dense grid are configured it is dense, whatever is shown."""
+    auto = replace(CONFIG, field="auto")
+    assert resolve(ball(), auto).config == replace(CONFIG, field=Vm())
+    assert resolve(replace(ball(), unbounded=True), auto).config.field == DENSE
+    rates = replace(auto, optim=replace(auto.optim, learning_rate_rgb=0.3))
+    assert resolve(ball(), rates).config.field == DENSE
+    begun = Trainer(ball(), auto).state()
+    assert isinstance(storage_of(begun), Factors)
+    assert Trainer(ball(), auto, begun).config.field == Vm()
 
 
 def test_files_hold_it(states: list[TrainingState], tmp_path: Path) -> None:

@@ -48,7 +48,7 @@ def test_it_has_a_name() -> None:
     assert STORAGE_KINDS["columns"] is Columns
     assert CONFIG.field == Columns(decay=1e-3)
     known = ", ".join(STORAGE_KINDS)
-    assert {"dense", "vm", "hash", "columns"} <= set(STORAGE_KINDS)
+    assert {"dense", "vm", "hash", "auto", "columns"} <= set(STORAGE_KINDS)
     with pytest.raises(InputError, match=f"field must be one of {known}, not 'rows'"):
         TrainConfig(field="rows")  # type: ignore[arg-type]
 

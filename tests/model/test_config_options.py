@@ -24,7 +24,7 @@ from warpnerf.presets import PRESETS
 
 SHIPPED = (
     (MODELS, {"rgb", "sh", "deferred", "per_sample"}),
-    (STORAGE_KINDS, {"dense", "vm", "hash"}),
+    (STORAGE_KINDS, {"dense", "vm", "hash", "auto"}),
     (SPACES, {"none", "linf", "l2", "ndc"}),
 )
 """Kinds of the package itself."""
@@ -210,7 +210,7 @@ def test_words_of_fields_that_may_be_several_things() -> None:
         (words(background="1 2"), "random or 3 numbers, not '1 2'."),
         (words(optim__decay="-1"), "optim.decay must be a finite number above 0, not -1.0."),
         (words(scaling="cubic"), "scaling must be one of none, quadratic, clamped, not 'cubic'."),
-        (words(field="rows"), "field must be one of dense, vm, hash, not 'rows'."),
+        (words(field="rows"), "field must be one of dense, vm, hash, auto, not 'rows'."),
         (words(model="nerf"), "--model must be one of rgb, sh, deferred, per_sample, not 'nerf'."),
         (words(model__degree="1"), "--model.degree is no option of the model deferred; it has "),
         (words(grid__contraction="l2", grid__planes="32"), "leave planes out"),

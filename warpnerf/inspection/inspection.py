@@ -293,7 +293,7 @@ def cost_of(scene: Scene, config: TrainConfig, threads: int) -> Cost:
         SECONDS_PER_RAY + plan.sampler.samples_of(finer * samples) * SECONDS_PER_SAMPLE
     )
     step += float((nodes / steps_an_update).mean()) * occupied * SECONDS_PER_NODE
-    step *= config.model.relative_time * config.field.relative_time
+    step *= config.model.relative_time * plan.config.field.relative_time
     seconds = min(config.steps * step / threads, config.time_limit or math.inf)
     return Cost(plan=plan, seconds=seconds, threads=threads)
 

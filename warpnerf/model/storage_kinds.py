@@ -304,9 +304,34 @@ class Hash(StorageKind):
         return f"a hash of {self.levels} levels with up to {self.table} entries of {self.features}"
 
 
-DENSE = Dense()
+@dataclass(frozen=True, kw_only=True)
+class AutoField(StorageKind):
+    """VM decomposition or dense voxel grid, as suits the scene: ``TrainConfig.for_kind``."""
 
-STORAGE_KINDS: dict[str, type[StorageKind]] = {kind.name: kind for kind in (Dense, Vm, Hash)}
+    name: ClassVar[str] = "auto"
+
+    @property
+    def rules(self) -> Mapping[str, str]:
+        """None: it has to be decided first."""
+        raise TypeError(_UNDECIDED)
+
+    def encoding(self, load: Load, model: Model) -> Any:
+        """None: it has to be decided first."""
+        raise TypeError(_UNDECIDED)
+
+    def training_bytes(self, model: Model, size: tuple[int, int, int]) -> int:
+        """None: it has to be decided first."""
+        raise TypeError(_UNDECIDED)
+
+
+_UNDECIDED = "a field that is auto stores nothing; see TrainConfig.for_kind"
+
+DENSE = Dense()
+AUTO_FIELD = AutoField()
+
+STORAGE_KINDS: dict[str, type[StorageKind]] = {
+    kind.name: kind for kind in (Dense, Vm, Hash, AutoField)
+}
 """By name."""
 
 

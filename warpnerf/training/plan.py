@@ -161,6 +161,7 @@ def resolve(
     """
     if observed is not None:
         scene = with_extent(scene, observed)
+    config = config.for_kind(scene.kind)
     space = resolve_space(scene, config)
     looks_first = not looked and needs_search(scene, config, space.kind)
     if looks_first and config.content_distance == "per-camera":  # they are not known yet

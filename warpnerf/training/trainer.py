@@ -96,6 +96,7 @@ class Trainer:
         """What it trains on, with the extent that a new training begins with."""
         if resume is not None:
             asked = config.config if isinstance(config, TrainingPlan) else config
+            asked = asked.for_kind(scene.kind)
             resume.require_same(self._given, asked)
             plan = resume.plan_of(scene, asked)
         elif isinstance(config, TrainingPlan):

@@ -143,12 +143,14 @@ def warm_up(
         for contraction in _contractions(config):
             sampler = config.sampler_in(SPACES[contraction])
             proposals = proposal_kernels(sampler, contraction, workers.device, learns=True)
-            for kernel in rendering_kernels(
-                model, contraction, workers.device, config.field, sampler
-            ):
-                words = _words(kernel, contraction) + of_model
-                wanted.setdefault(kernel.module, (words, kernel))
-            for scaling, losses in product(get_args(Scaling), _losses(config, contraction)):
+            decided = _decided(config, contraction)
+            for stored in dict.fromkeys(stored for stored, _ in decided):
+                for kernel in rendering_kernels(
+                    model, contraction, workers.device, stored, sampler
+                ):
+                    words = _words(kernel, contraction, stored) + of_model
+                    wanted.setdefault(kernel.module, (words, kernel))
+            for scaling, (stored, losses) in product(get_args(Scaling), decided):
                 for kernel in training_kernels(
                     model,
                     contraction,
@@ -156,10 +158,10 @@ def warm_up(
                     config.jacobian,
                     workers.device,
                     losses,
-                    config.field,
+                    stored,
                     sampler,
                 ):
-                    words = _words(kernel, contraction, scaling, losses) + of_model
+                    words = _words(kernel, contraction, stored, scaling, losses) + of_model
                     words += ", proposal" * (kernel in proposals)
                     wanted.setdefault(kernel.module, (words, kernel))
     done = []
@@ -185,11 +187,13 @@ def _contractions(config: TrainConfig) -> tuple[Contraction, ...]:
     return ("none", "linf", "ndc") if marches else ("none", "linf")
 
 
-def _losses(config: TrainConfig, contraction: Contraction) -> list[LossConfig]:
-    """Those of the kinds of scenes that there are in such a space."""
+def _decided(config: TrainConfig, contraction: Contraction) -> list[tuple[StorageKind, LossConfig]]:
+    """Field and losses of the kinds of scenes that there are in such a space."""
     bounded = SPACES[contraction].bounded
     kinds: list[SceneKind] = ["object", "bounded"] if bounded else ["unbounded"]
-    return list(dict.fromkeys(config.losses_for(kind) for kind in kinds))
+    return list(
+        dict.fromkeys((config.for_kind(kind).field, config.losses_for(kind)) for kind in kinds)
+    )
 
 
 def _options_of(model: Model) -> str:
@@ -205,6 +209,7 @@ def _options_of(model: Model) -> str:
 def _words(
     kernel: wp.Kernel,
     contraction: Contraction,
+    stored: StorageKind,
     scaling: Scaling | None = None,
     losses: LossConfig = PHOTOMETRIC_ONLY.config,
 ) -> str:
@@ -215,4 +220,5 @@ def _words(
     if not name.startswith("render"):
         return name + space if name == "mark occupied" else name
     kinds = "".join(f", {kind}" for kind in losses.kinds)
-    return name + space + (f", scaling {scaling}" if scaling else "") + kinds
+    of_field = "" if stored == DENSE else f", field {stored.name}"
+    return name + space + of_field + (f", scaling {scaling}" if scaling else "") + kinds
