@@ -44,6 +44,21 @@ def points_of(lattice: Lattice, nodes: np.ndarray) -> np.ndarray:
     return lattice.kind.expanded(lattice, c)
 
 
+def middles_of_runs(lattice: Lattice, length: int, runs: np.ndarray) -> np.ndarray:
+    """The points at the middle nodes of runs: nodes that follow each other, first along z.
+
+    Args:
+        lattice: Where nodes lie.
+        length: Nodes of a run; the last may have fewer, and its last node for the middle one.
+        runs: [n] which ones, from 0 on.
+
+    Returns:
+        [n, 3] as of ``points_of``.
+    """
+    middles = np.minimum(runs * length + length // 2, np.prod(lattice.size) - 1)
+    return points_of(lattice, np.stack(np.unravel_index(middles, lattice.size), axis=1))
+
+
 def cells_within(lattice: Lattice, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """Which cells of free space lie in a box of the scene with all corners.
 

@@ -22,7 +22,7 @@ from warpnerf_kernels.optim.total_variation import TV_BLOCK
 from warpnerf.config import Scaling
 from warpnerf.fields.gradients import Gradients
 from warpnerf.fields.lattice import Lattice
-from warpnerf.fields.nodes import points_of
+from warpnerf.fields.nodes import middles_of_runs
 from warpnerf.runtime.parallel import NODES, Workers
 from warpnerf.scenes.cameras.camera import Camera
 
@@ -104,16 +104,21 @@ def tv_weights(
     n_nodes = math.prod(lattice.size)
     strength = np.ones(-(-n_nodes // TV_BLOCK), np.float32)
     if scaling != "none":
-        some = np.unique(np.linspace(0, len(cameras) - 1, MAX_CAMERAS).astype(int))
-        cameras, distances = [cameras[i] for i in some], [distances[i] for i in some]
-        middles = np.minimum(np.arange(len(strength)) * TV_BLOCK + TV_BLOCK // 2, n_nodes - 1)
-        for begin in range(0, len(middles), AT_ONCE):
-            some_of = middles[begin : begin + AT_ONCE]
-            nodes = np.stack(np.unravel_index(some_of, lattice.size), axis=1)
-            strength[begin : begin + AT_ONCE] = root_mean_square_scale(
-                points_of(lattice, nodes), cameras, distances, near
+        cameras, distances = evenly_spread(cameras, distances)
+        for begin in range(0, len(strength), AT_ONCE):
+            runs = np.arange(begin, min(begin + AT_ONCE, len(strength)))
+            strength[runs] = root_mean_square_scale(
+                middles_of_runs(lattice, TV_BLOCK, runs), cameras, distances, near
             )
     return wp.array(strength, dtype=wp.float32, device=workers.device)
+
+
+def evenly_spread(
+    cameras: Sequence[Camera], distances: Sequence[float]
+) -> tuple[list[Camera], list[float]]:
+    """MAX_CAMERAS of some cameras, with their content distances; all where there are fewer."""
+    some = np.unique(np.linspace(0, len(cameras) - 1, MAX_CAMERAS).astype(int))
+    return [cameras[i] for i in some], [distances[i] for i in some]
 
 
 def root_mean_square_scale(
