@@ -363,6 +363,9 @@ class TrainConfig:
         if self.field.own_epsilon and alone:
             why = "has one of its own, and nothing else is trained; set field.epsilon, and"
             unused.append(("optim", self.optim, ("epsilon",), why))
+        if not self.field.owns_densities:
+            why = "has no density of its own at each node;"
+            unused.append(("optim", self.optim, ("near_decay",), why))
         if not self.field.smoothed:
             unused.append(("optim", self.optim, OPTIM_VARIATION, "has no total variation;"))
         elif self.optim.tv_density == self.optim.tv_rgb == 0.0 and not self.field.has_sparsity:

@@ -85,6 +85,8 @@ def idle_fields(tree: dict[str, Any]) -> set[str]:
     stored = STORAGE_KINDS.get(name) if isinstance(name, str) else None
     if stored is not None and stored.own_rates:
         idle |= {f"optim.{name}" for name in OPTIM_RATES}
+    if stored is not None and not stored.owns_densities:
+        idle.add("optim.near_decay")
     if stored is not None and not stored.smoothed:
         idle |= {f"optim.{name}" for name in OPTIM_VARIATION}
     defaults = {"tv_density": OptimConfig.tv_density, "tv_rgb": OptimConfig.tv_rgb}

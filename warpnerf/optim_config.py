@@ -71,6 +71,11 @@ class OptimConfig:
     """Share of the training after which there is no total variation."""
     tv_every: int = 8
     """Updates from one total-variation gradient to the next, which counts that many times."""
+    near_decay: float = 0.0
+    """Decay of raw densities near cameras: how far each update that moves one lowers it besides, in
+    learning rates, times 1 - S. S is the mean of min(1, (d / D)^2) over the pixels of training
+    cameras that see its node from a distance d (``fields.near_decay``). 0: none. Dense fields
+    only."""
     accumulate_at: Literal["auto"] | tuple[float, ...] = "auto"
     """Shares of the training. Before the first, an update of the grid follows each step; from each
     on, twice as many steps, whose rays are processed together and whose losses are accumulated.
@@ -86,6 +91,8 @@ class OptimConfig:
         require_at_least("optim.tv_density", self.tv_density, 0.0)
         require_at_least("optim.tv_rgb", self.tv_rgb, 0.0)
         require_whole("optim.tv_every", self.tv_every, 1)
+        if not 0 <= self.near_decay < 1:
+            raise InputError(f"optim.near_decay must lie in [0, 1), not {said(self.near_decay)}.")
         if not 0 <= self.tv_until <= 1:
             raise InputError(f"optim.tv_until must lie in [0, 1], not {said(self.tv_until)}.")
         if isinstance(self.accumulate_at, str):

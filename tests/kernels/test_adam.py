@@ -52,6 +52,7 @@ def step(
     flags: Any = None,
     betas: tuple[float, float] = (BETA1, BETA2),
     n_nodes: int | None = None,
+    decay: Any = (),
 ) -> tuple[Any, Any, Any]:
     """What is left of the gradient, and the new values and moments, all [n_nodes, n_floats]."""
     n_floats, adam = adj.shape[1], kernels.module("optim.adam")
@@ -70,6 +71,7 @@ def step(
         span,
         number,
         node(*RATES[:n_floats]),
+        kernels.array(decay),
         adam_struct(
             Update(number, 1.0, OptimConfig(beta1=betas[0], beta2=betas[1], epsilon=EPSILON))
         ),
@@ -194,6 +196,27 @@ def test_tiles_that_are_not_flagged_are_passed_over(n_floats: int, kernels: Kern
                 assert np.array_equal(new, exact)
             assert not found[0][flagged].any()
             assert np.array_equal(found[0][~flagged], adj[~flagged])
+
+
+@each_n_floats
+def test_a_decay_lowers_first_numbers_that_have_a_gradient(n_floats: int, kernels: Kernels) -> None:
+    """Each tile's by its own, in learning rates; all else is as it was without."""
+    rng = np.random.default_rng(7)
+    n, spans = 30, (1, TILE, 48)  # in tiles of four
+    adj, values = rng.normal(size=(2, n, n_floats)).astype(np.float32)
+    adj[rng.uniform(size=adj.shape) < 0.3] = 0.0
+    moments = encoded(rng.normal(size=(n, n_floats)), rng.uniform(size=(n, n_floats)))
+    decay = rng.uniform(0.1, 1.0, size=-(-n // TILE))
+    without = step(kernels, 3, adj, values, moments)
+    expected = without[1].astype(np.float64)
+    moves = adj[:, 0] != 0.0
+    expected[:, 0] -= RATES[0] * np.repeat(decay, TILE)[:n] * moves
+    for span in spans:
+        after, found, kept = step(kernels, 3, adj, values, moments, span, decay=decay)
+        np.testing.assert_allclose(found, expected, atol=1e-6)
+        assert np.array_equal(found[~moves], without[1][~moves]) and not moves.all()
+        assert np.array_equal(found[:, 1:], without[1][:, 1:])
+        assert np.array_equal(kept, without[2]) and not after.any()
 
 
 @pytest.mark.parametrize("other_size", [(9, 7, 12), (4, 3, 2)])

@@ -144,6 +144,7 @@ def updated(
         span,
         number,
         adam.Node(*adam.rates),
+        kernels.array([]),
         adam_struct(Update(number, 1.0, CONFIG)),
         gradient,
         *(array[:n_nodes] for array in arrays),

@@ -84,6 +84,7 @@ GIVEN: dict[str, tuple[str, Any]] = {
     "optim.tv_rgb": ("1e-8", 1e-8),
     "optim.tv_until": ("0.5", 0.5),
     "optim.tv_every": ("2", 2),
+    "optim.near_decay": ("0.1", 0.1),
     "optim.accumulate_at": ("none", ()),
     "loss.photometric": ("huber", "huber"),
     "loss.huber_delta": ("0.2", 0.2),

@@ -16,6 +16,7 @@ from warpnerf_kernels.optim import adam, total_variation
 
 from warpnerf.fields.gradients import Gradients, zero_entries, zero_head_weights
 from warpnerf.fields.lattice import Lattice, grid_struct
+from warpnerf.fields.near_decay import near_decay
 from warpnerf.fields.parameters import Parameter
 from warpnerf.fields.storage import (
     Regulariser,
@@ -183,3 +184,11 @@ class DenseGrid(Storage):
             until=training.optim.tv_until,
             workers=workers,
         )
+
+    def decays(self, training: TrainedOn, workers: Workers) -> dict[str, wp.array]:
+        """Near cameras, where that has a strength."""
+        strength = training.optim.near_decay
+        if strength == 0.0:
+            return {}
+        where = training.cameras, training.distances, training.near
+        return {"values": near_decay(self.lattice, *where, strength, workers)}

@@ -53,7 +53,7 @@ class Regulariser(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class TrainedOn:
-    """What a regulariser may know of a training."""
+    """What regularisation may know of a training."""
 
     model: Model
     """What the stored values become."""
@@ -290,6 +290,18 @@ class Storage(ABC):
             workers: Where to work.
         """
         return None
+
+    def decays(self, training: TrainedOn, workers: Workers) -> dict[str, wp.array]:
+        """How far updates lower raw densities besides; see ``fields.near_decay``.
+
+        Args:
+            training: What it may depend on.
+            workers: Where to work.
+
+        Returns:
+            By parameter: [n_tiles] in learning rates; of its entries' first number.
+        """
+        return {}
 
 
 SLAB = 1 << 22

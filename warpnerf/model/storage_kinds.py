@@ -62,6 +62,9 @@ class StorageKind(ABC):
     """Whether the nodes of the lattice say how fine it is."""
     smoothed: ClassVar[bool] = True
     """Whether total variation smooths it, so that what is configured of that does something."""
+    owns_densities: ClassVar[bool] = False
+    """Whether each node has a raw density of its own, so that ``OptimConfig.near_decay`` can lower
+    it."""
 
     @property
     def has_sparsity(self) -> bool:
@@ -105,6 +108,7 @@ class Dense(StorageKind):
     """Dense voxel grid: a value at each node, trilinear interpolation in between."""
 
     name: ClassVar[str] = "dense"
+    owns_densities: ClassVar[bool] = True
 
     @property
     def rules(self) -> Mapping[str, str]:

@@ -139,7 +139,8 @@ def extent_by_training(
             border=QUICK_BORDER if contracted else "auto",
         ),
         march=replace(config.march, growth=QUICK_GROWTH if contracted else "auto"),
-        optim=replace(config.optim, restart_at_growth=False),
+        # Without a decay: what is near is not known yet.
+        optim=replace(config.optim, restart_at_growth=False, near_decay=0.0),
         field=DENSE,
         sampler=MARCHED,
     )

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import ClassVar, Protocol, TypeVar
 
 import warp as wp
@@ -30,6 +31,8 @@ class Update:
     """On the learning rates."""
     config: OptimConfig
     """The rest."""
+    decays: Mapping[str, wp.array] = field(default_factory=dict)
+    """By parameter, as of ``Storage.decays``."""
 
 
 class Rule(Protocol):
@@ -119,11 +122,15 @@ class GridAdam:
     ) -> None:
         """Update nodes from their gradients, which are zeroed."""
         n_floats = len(parameter.learning_rates)
+        decay = update.decays.get(parameter.name)
+        if decay is None:
+            decay = wp.empty(0, dtype=wp.float32, device=workers.device)
         workers.launch(
             adam.adam_kernel(n_floats),
             *thread_spans(parameter.values, workers),
             update.number,
             vector(n_floats)(*(update.factor * parameter.learning_rates)),
+            decay,
             adam_struct(update, parameter.epsilon),
             gradients.entries(*parameter.gradient),
             parameter.values,
@@ -226,6 +233,7 @@ def adam_step(
     factor: float,
     config: OptimConfig,
     workers: Workers,
+    decays: Mapping[str, wp.array] = MappingProxyType({}),
 ) -> None:
     """Adam over all parameters of a model. Source: Kingma & Ba 2015, algorithm 1.
 
@@ -237,8 +245,9 @@ def adam_step(
         factor: On the learning rates.
         config: The rest.
         workers: Where to work.
+        decays: How far it lowers raw densities besides, from ``Storage.decays``.
     """
-    this = Update(update, factor, config)
+    this = Update(update, factor, config, decays)
     for parameter in parameters:
         state = states[parameter.name]
         OPTIMISERS[parameter.rule].step(parameter, state, gradients, this, workers)

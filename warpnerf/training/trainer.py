@@ -144,7 +144,8 @@ class Trainer:
         self._seen = 1.0
         if resume is not None:
             self._keep_to_what_is_seen()
-        self._pass, self.regulariser = self._training_pass(), self._regulariser()
+        self._pass = self._training_pass()
+        self._regularise_lattice()
 
     def run(
         self,
@@ -267,7 +268,8 @@ class Trainer:
         self._updates += 1
         rate = self.schedule.rate(fraction, self._grown, n_steps)
         how = self._updates - self._restarted, rate, self.config.optim
-        adam_step(self._of_field(), self.optimiser, self._pass.gradients, *how, self.workers)
+        of_field = self._of_field(), self.optimiser, self._pass.gradients
+        adam_step(*of_field, *how, self.workers, self._decays)
         if self._resampling is not None:
             self._resampling.step(self.optimiser, *how)
 
@@ -403,7 +405,7 @@ class Trainer:
             return
         config, box, nodes = self.config, self._tight_box(), self.plan.stages[grown].nodes
         # What holds the old arrays gives their memory back before more is requested.
-        del self._pass, self._resampling, self.regulariser
+        del self._pass, self._resampling, self.regulariser, self._decays
         before, shift = self.storage, (grown - self._grown) * config.grid.shift_at_growth
         storage = grown_storage(before, box, nodes, shift, self.workers)
         restarts = config.optim.restart_at_growth
@@ -421,10 +423,12 @@ class Trainer:
             self._restarted = self._updates
         del before, storage
         release_free_memory()
-        self._pass, self.regulariser = self._training_pass(), self._regulariser()
+        self._pass = self._training_pass()
+        self._regularise_lattice()
         self._look_for_free_space()
 
-    def _regulariser(self) -> Regulariser | None:
+    def _regularise_lattice(self) -> None:
+        """Find what regularises the nodes that there are."""
         training = TrainedOn(
             model=self.model,
             optim=self.config.optim,
@@ -434,7 +438,8 @@ class Trainer:
             near=self.config.march.near,
             scaling=self.config.scaling,
         )
-        return self.storage.regulariser(training, self.workers)
+        self.regulariser: Regulariser | None = self.storage.regulariser(training, self.workers)
+        self._decays = self.storage.decays(training, self.workers)
 
     def _tight_box(self) -> tuple[np.ndarray, np.ndarray]:
         """The box around what is occupied, where space is bounded; never larger than before."""

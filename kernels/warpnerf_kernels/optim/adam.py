@@ -13,7 +13,7 @@ from typing import Any
 
 import warp as wp
 
-from ..base.tiles import TILE, prefetch, tile_loop
+from ..base.tiles import TILE, prefetch, tile_loop, tile_of
 from ..base.types import gradient_type, real, vec3, vector
 from ..fields.interp import place_along, place_in
 
@@ -92,12 +92,13 @@ for (int c = 0; c < FLOATS * TILE && c < FLOATS * count; c += AT_ONCE) {
     if (is_zero(g)) continue;
     const number value = load(values.data);
     const bits old = as_bits(load(moments.data));
-    number rate;
+    number rate, fall;
     for (int n = 0; n < AT_ONCE; ++n) ((float*)&rate)[n] = learning_rate.c[(c + n) % FLOATS];
+    for (int n = 0; n < AT_ONCE; ++n) ((float*)&fall)[n] = (c + n) % FLOATS ? 0.0f : decay;
     const number m = adam.beta1 * mean_of(old) + (1.0f - adam.beta1) * g;
     const number v = adam.beta2 * square_of(old) + (1.0f - adam.beta2) * (g * g);
     const number root_v = root(adam.correction2 * v);
-    const number moved = value - rate * (adam.correction1 * m) / (root_v + adam.epsilon);
+    const number moved = value - rate * (adam.correction1 * m) / (root_v + adam.epsilon) - fall;
     const bits noise = (as_bits(g) + update * 0x9e3779b9u) * 0x9e3779b9u;  // 2^32 / golden ratio
     const bits joined = join(m, v, noise);
     store(values.data, g != 0.0f ? moved : value);
@@ -111,6 +112,7 @@ def update_nodes(
     count: int,  # up to TILE
     update: wp.uint32,
     learning_rate: Any,
+    decay: real,  # of the first number of each
     adam: Adam,
     gradient: Any,
     values: wp.array(dtype=Any),
@@ -132,6 +134,7 @@ def adam_kernel(n_floats: int) -> wp.Kernel:
     class Entries:
         update: wp.uint32
         learning_rate: Node
+        decay: wp.array(dtype=real)
         adam: Adam
         gradient: Gradient
         values: wp.array(dtype=Node)
@@ -142,14 +145,20 @@ def adam_kernel(n_floats: int) -> wp.Kernel:
         prefetch(on.gradient.values, node)
         prefetch(on.values, node)
         prefetch(on.moments, node)
+        if on.decay.shape[0] > 0:
+            prefetch(on.decay, tile_of(node))
 
     @wp.func
     def work(on: Entries, node: int, begin: int, end: int):
+        decay = real(0.0)
+        if on.decay.shape[0] > 0:
+            decay = on.learning_rate[0] * on.decay[tile_of(node)]
         update_nodes(
             begin,
             end - begin,
             on.update,
             on.learning_rate,
+            decay,
             on.adam,
             on.gradient,
             on.values,
@@ -166,6 +175,7 @@ def adam_kernel(n_floats: int) -> wp.Kernel:
         # choices
         update: wp.uint32,  # counts from 1
         learning_rate: Node,  # per channel
+        decay: wp.array(dtype=real),  # [n_tiles] of the first number, in learning rates; or [0]
         adam: Adam,
         # out
         gradient: Gradient,  # zeroed
@@ -178,6 +188,7 @@ def adam_kernel(n_floats: int) -> wp.Kernel:
         on = Entries()
         on.update = update
         on.learning_rate = learning_rate
+        on.decay = decay
         on.adam = adam
         on.gradient = gradient
         on.values = values
