@@ -65,7 +65,7 @@ MUTANTS = [
     of_host("paired: deviation of all there are", "reports/paired.py", "std(ddof=1)", "std()", SEEDS),
     of_host("paired: one side", "reports/paired.py", "0.5 + CONFIDENCE / 2.0", "CONFIDENCE", SEEDS),
     of_host("paired: terms of the other series", "reports/paired.py", "(k + 1) / (k + 2)", "k / (k + 1)", TABLES),
-    of_host("compare: against the first of all", "reports/comparison.py", "if len(scalings) > 1 else first", "if False else first",
+    of_host("compare: against the first of all", "reports/comparison.py", "if n_forms > 1 else first", "if False else first",
             FIRST),
     of_host("compare: better is more", "reports/comparison.py", "int(np.sign(difference.mean)) * figure.better",
             "int(np.sign(difference.mean))", WORDS),

@@ -235,11 +235,17 @@ def test_a_sentence_tells_better_from_worse_and_from_chance() -> None:
 
 
 def test_each_is_compared_with_the_first_scaling_of_its_own_kind() -> None:
-    keys = [("fast", field, scaling) for field in ("dense", "vm") for scaling in get_args(Scaling)]
+    keys = [
+        ("fast", field, scaling, decay)
+        for field in ("dense", "vm")
+        for scaling in get_args(Scaling)
+        for decay in (None, "decay-0.1")
+    ]
     found = candidates_of(dict.fromkeys(keys, CONFIG))
     against = {candidate.name: candidate.against for candidate in found}
     assert against["fast-vm-clamped"] == "fast-vm-none" and against["fast-vm-none"] is None
-    alone = candidates_of({("fast", None, "none"): CONFIG, ("quality", None, "none"): CONFIG})
+    assert against["fast-vm-none-decay-0.1"] == "fast-vm-none"
+    alone = candidates_of({(name, None, "none", None): CONFIG for name in ("fast", "quality")})
     assert [candidate.against for candidate in alone] == [None, "fast-none"]
 
 
@@ -300,6 +306,8 @@ def test_too_few_test_views_are_refused(room: Scene) -> None:
     [
         ({"scalings": ("none", "clampd")}, {}, "--scalings: 'clampd' is none of .* clamped"),
         ({"scalings": ("none", "none")}, {}, "--scalings: none is given twice"),
+        ({"near_decays": ("0.1", ".1")}, {}, "--near-decays: .1 is given twice"),
+        ({"near_decays": ("2",)}, {}, "near_decay must lie in"),
         ({"fields": ("cube",)}, {}, "--fields: 'cube' is none of dense, vm, hash"),
         ({"presets": ()}, {}, "--presets has no value"),
         ({"seeds": 0}, {}, "--seeds must be a whole number of at least 1"),

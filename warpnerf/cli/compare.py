@@ -36,6 +36,9 @@ class CompareOptions:
     """Folder for the runs and the report; the same again to continue."""
     scalings: tuple[str, ...] = ("none", "quadratic", "clamped")
     """Scalings of gradients by distance; the others are compared with the first."""
+    near_decays: tuple[str, ...] = ()
+    """Strengths of the decay of densities near cameras (optim.near_decay), such as 0 and 0.1; by
+    default that of the preset."""
     fields: tuple[str, ...] = ()
     """Fields: dense, vm, hash; by default that of the preset."""
     presets: tuple[str, ...] = ("fast",)
@@ -58,6 +61,7 @@ USUAL = Usual(
     (
         "output",
         "scalings",
+        "near_decays",
         "fields",
         "presets",
         "seeds",
@@ -74,7 +78,12 @@ USUAL = Usual(
     )
 )
 
-LISTS = {"scaling": "--scalings", "field": "--fields", "seed": "--seeds"}
+LISTS = {
+    "scaling": "--scalings",
+    "optim.near_decay": "--near-decays",
+    "field": "--fields",
+    "seed": "--seeds",
+}
 """Fields of a configuration that are compared, and the option that lists them."""
 
 MAX_SEEDS = 1000
@@ -98,8 +107,8 @@ def compare_command(options: CompareOptions, given: Annotated[Given, USUAL] = NO
     configs = _configs(options, given)
     if len(configs) < 2:
         raise InputError(
-            "compare needs two configurations or more; name several by --scalings, --fields or "
-            "--presets."
+            "compare needs two configurations or more; name several by --scalings, --near-decays, "
+            "--fields or --presets."
         )
     for config in configs.values():
         require_machine(config)
@@ -136,8 +145,8 @@ def compare_command(options: CompareOptions, given: Annotated[Given, USUAL] = NO
 
 def _configs(
     options: CompareOptions, given: Given
-) -> dict[tuple[str, str | None, Scaling], TrainConfig]:
-    """Configurations by preset, field and scaling.
+) -> dict[tuple[str, str | None, Scaling, str | None], TrainConfig]:
+    """Configurations by preset, field, scaling and decay.
 
     Raises:
         InputError: A name is none or stands twice, or an option does not fit.
@@ -147,13 +156,20 @@ def _configs(
     if options.fields:
         _require_names("--fields", options.fields, list(STORAGE_KINDS))
     stored: Sequence[str | None] = options.fields or (None,)
+    decays: Sequence[str | None] = options.near_decays or (None,)
     found: dict[Any, TrainConfig] = {}
-    for preset, field, scaling in product(options.presets, stored, options.scalings):
+    for preset, field, scaling, decay in product(options.presets, stored, options.scalings, decays):
         of_this = {**given, "scaling": (scaling,)}
         if field is not None:
             of_this["field"] = (field,)
+        if decay is not None:
+            of_this["optim.near_decay"] = (decay,)
         config = configured(PRESETS[preset], of_this, options.model_options, options.loss)
-        found[preset, field, scaling] = begun_with(config, given)
+        own = config.optim.near_decay == PRESETS[preset].optim.near_decay
+        key = preset, field, scaling, None if own else f"decay-{config.optim.near_decay:g}"
+        if key in found:
+            raise InputError(f"--near-decays: {decay} is given twice; leave one of them out.")
+        found[key] = begun_with(config, given)
     return found
 
 

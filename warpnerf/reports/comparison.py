@@ -114,21 +114,21 @@ class Row:
 
 
 def candidates_of(
-    configs: Mapping[tuple[str, str | None, Scaling], Any],
+    configs: Mapping[tuple[str, str | None, Scaling, str | None], Any],
 ) -> list[Candidate]:
-    """Configurations by preset, field and scaling, each compared with one of them.
+    """Configurations by preset, field, scaling and decay, each compared with one of them.
 
-    That is the one with the first scaling, of the same preset and field; of a single scaling, the
-    first of all.
+    That is the one with the first scaling and decay, of the same preset and field; of a single
+    scaling and decay, the first of all.
 
     Args:
-        configs: In the order in which they are to stand; a field of None is the preset's own.
+        configs: In the order in which they are to stand; None is the preset's own.
     """
     names = {key: "-".join(part for part in key if part is not None) for key in configs}
-    first, scalings = next(iter(configs)), list(dict.fromkeys(key[2] for key in configs))
+    first, n_forms = next(iter(configs)), len({key[2:] for key in configs})
     found = []
     for key, config in configs.items():
-        against = (key[0], key[1], scalings[0]) if len(scalings) > 1 else first
+        against = (*key[:2], *first[2:]) if n_forms > 1 else first
         other = None if against == key else names[against]
         found.append(Candidate(name=names[key], config=config, against=other))
     return found
