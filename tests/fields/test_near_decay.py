@@ -54,7 +54,7 @@ def share_of(
 def test_each_tile_has_that_of_its_middle_node(near: float, away: float, device: str) -> None:
     """With a focal length of each axis; also in the coordinates of a country."""
     cameras = [
-        replace(c, fx=c.fx * (1 + 0.2 * n), cx=3.0)
+        replace(c, fx=c.fx * (1 + 0.2 * n), cx=3.0, cy=2.0)
         for n, c in enumerate(tiny_scene(ring(5), fy=7.0).cameras)
     ]
     distances = [1.0, 2.0, 3.0, 4.0, 5.0]

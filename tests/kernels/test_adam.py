@@ -66,7 +66,7 @@ def step(
         wp.array(moments, dtype=moments_type, device=kernels.device),
     )
     kernels.workers.launch(
-        adam.adam_kernel(n_floats),
+        adam.adam_kernel(n_floats, decays=len(decay) > 0),
         -(-(n_nodes or len(values)) // span),
         span,
         number,

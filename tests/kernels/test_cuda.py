@@ -15,7 +15,7 @@ from warpnerf.model.spaces import part_of
 from warpnerf.model.storage_kinds import Vm
 from warpnerf.rendering.structs import variant_of
 
-SHARED = ["sampling.occupancy", "space.camera", "space.reprojection"]
+SHARED = ["optim.near_decay", "sampling.occupancy", "space.camera", "space.reprojection"]
 """Modules of the kernels that all models share."""
 
 
@@ -55,7 +55,8 @@ def test_every_kernel_compiles_for_cuda(
     ]
     if name == "float32":  # it packs what is in float32
         adam = precision.load(name, "optim.adam")
-        kernels += [adam.adam_kernel(n), adam.resample_moments_kernel(n), adam.adam_weights]
+        kernels += [adam.adam_kernel(n, decays=decays) for decays in (False, True)]
+        kernels += [adam.resample_moments_kernel(n), adam.adam_weights]
     for contraction in contractions:
         variant = variant_of(model, name, contraction, "clamped", "density", packed=False)  # type: ignore[arg-type]
         kernels += [

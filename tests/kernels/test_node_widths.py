@@ -114,7 +114,7 @@ def adam(request: pytest.FixtureRequest, kernels32: Kernels) -> SimpleNamespace:
     n_floats = request.param
     return SimpleNamespace(
         n_floats=n_floats,
-        kernel=module.adam_kernel(n_floats),
+        kernel=module.adam_kernel(n_floats, decays=False),
         Moments=module.moments_type(n_floats),
         Node=kernels32.types.vector(n_floats),
         rates=np.random.default_rng(0).uniform(0.02, 0.3, size=n_floats),

@@ -107,13 +107,14 @@ def test_a_short_training_takes_over_what_it_has_a_use_for(
 
     def prepare_trainer(scene: wn.Scene, config: wn.TrainConfig, **options: Any) -> None:
         assert config.grid.grow_at == () and config.grid.contraction == "linf"
+        assert config.optim.near_decay == 0.0  # what is near is not known yet
         raise Begun
 
     monkeypatch.setattr(coarse, "Trainer", prepare_trainer)
     config = tiny_config(
         coarse_steps=60,
         grid=wn.GridConfig(voxels=4000, planes=16, contraction="ndc", shift_at_growth=1.0),
-        optim=wn.OptimConfig(restart_at_growth=True),
+        optim=wn.OptimConfig(restart_at_growth=True, near_decay=0.1),
     )
     with pytest.raises(Begun):
         coarse.extent_by_training(facing(), resolve(facing(), config))
@@ -130,7 +131,7 @@ def test_what_an_older_version_wrote_is_read_without_it() -> None:
     assert read(tree) == config
     config = wn.TrainConfig(field=wn.Hash())
     tree = json.loads(json.dumps(config_to_json(config)))
-    tree["optim"] |= {"tv_density": 1e-6, "tv_until": 0.5}
+    tree["optim"] |= {"tv_density": 1e-6, "tv_until": 0.5, "near_decay": 0.1}
     assert read(tree) == config
     config = wn.PRESETS["dvgo-llff"]
     assert read(json.loads(json.dumps(config_to_json(config)))) == config

@@ -363,7 +363,7 @@ MUTANTS = [
            PD16),
     Mutant("wide: a column's nodes, along y", "fields/dense.py",
            "stride_y = FLOATS * (size_t)grid", "stride_y = 4 * (size_t)grid", PD16),
-    Mutant("wide: Adam's rates", "optim/adam.py", "(c + n) % FLOATS", "(c + n) % 4", ADAM),
+    Mutant("wide: Adam's rates", "optim/adam.py", "learning_rate.c[(c + n) % FLOATS]", "learning_rate.c[(c + n) % 4]", ADAM),
     Mutant("wide: Adam stops after sixteen", "optim/adam.py",
            "c < FLOATS * TILE && c < FLOATS * count", "c < 4 * TILE && c < FLOATS * count", ADAM),
     Mutant("wide: Adam beyond the last node", "optim/adam.py",

@@ -35,6 +35,12 @@ ROOT_OF_STEPS = (
 )
 SCALES = "training/test_smoothing.py::test_the_scales_of_the_rays_at_points"
 SMOOTHED = "training/test_smoothing.py::test_a_training_smooths_less_what_is_near"
+NEAR_DECAY = "fields/test_near_decay.py"
+TILE_DECAY = f"{NEAR_DECAY}::test_each_tile_has_that_of_its_middle_node"
+FAR_DECAY = f"{NEAR_DECAY}::test_places_at_infinity_have_none"
+BENT_DECAY = f"{NEAR_DECAY}::test_a_lens_that_bends_sees_all_along_its_rays"
+DECAYED = f"{NEAR_DECAY}::test_an_update_lowers_the_densities_that_it_moves"
+SHORT_USES = "model/test_idle_options.py::test_a_short_training_takes_over_what_it_has_a_use_for"
 FACE = "training/test_optim.py::test_total_variation_counts_the_face_between_two_nodes"
 ADAM_WEIGHTS = (
     "training/test_optim.py::test_weights_are_updated_by_the_sum_of_the_workers_gradients"
@@ -71,6 +77,7 @@ TRAINER, EXTENT, SMOOTHING = (
     "training/extent.py",
     "fields/total_variation.py",
 )
+NEAR = "fields/near_decay.py"
 PLANNED, GROWN = "training/plan.py", "training/growth.py"
 OPTIM, STATE, COARSE = (f"training/{name}.py" for name in ("optim", "state", "coarse"))
 SPACE_PLAN = "scenes/extent/space_plan.py"
@@ -226,7 +233,20 @@ MUTANTS = [
     of_host("near is not minded", SMOOTHING, "sampled = square >= near * near", "sampled = square >= 0.0", SCALES),
     of_host("all around", SMOOTHING, "    if camera.fisheye:\n        return -1.0\n", "    return -1.0\n", SCALES),
     of_host("a fisheye's corner", SMOOTHING, "    if camera.fisheye:\n        return -1.0\n", "", SCALES),
-    of_host("of the run's first node", SMOOTHING, "* TV_BLOCK + TV_BLOCK // 2", "* TV_BLOCK", SMOOTHED),
+    of_host("of the run's first node", "fields/nodes.py", "runs * length + length // 2", "runs * length", SMOOTHED),
+    of_host("of the tile's first node", "fields/nodes.py", "runs * length + length // 2", "runs * length", TILE_DECAY),
+    of_host("a picture upside down", NEAR, "*-up, *-back", "*up, *-back", TILE_DECAY),
+    of_host("pixels of one axis", NEAR, "camera.fx * camera.fy", "camera.fx * camera.fx", TILE_DECAY),
+    of_host("cameras where the origin is", NEAR, "places = np.clip(np.nan_to_num(points - middle,",
+            "places = np.clip(np.nan_to_num(points,", TILE_DECAY),
+    of_host("margins of the box everywhere", NEAR, "voxel_edges(lattice, points), nan",
+            "np.full(len(points), lattice.voxel_size.mean()), nan", FAR_DECAY),
+    of_host("a picture as if nothing bent it", NEAR, "on_plane = shown[:, :2] / shown[:, 2:]",
+            "on_plane = (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]", BENT_DECAY),
+    of_host("a decay of one learning rate", "fields/dense.py", "where, strength, workers", "where, 1.0, workers", DECAYED),
+    of_host("a decay that no update has", TRAINER, "self.workers, self._decays)", "self.workers)", DECAYED),
+    of_host("a decay that is always on", "fields/dense.py", "if strength == 0.0:", "if False:", DECAYED),
+    of_host("a decay in the short training", COARSE, ", near_decay=0.0)", ")", SHORT_USES),
     # optim.py
     of_host("edges for faces", SMOOTHING, "** (2.0 / 3.0)", "** (1.0 / 3.0)", FACE),
     of_host("each update's own", SMOOTHING, "factor = face * self.every * ", "factor = face * ", FACE),

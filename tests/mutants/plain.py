@@ -5,7 +5,7 @@ from mutant import Mutant
 INTERP = "kernels/test_interpolation.py"
 LOST = "kernels/test_render.py::test_rays_that_are_not_finite_see_the_background"
 VARIATION = "kernels/test_total_variation.py"
-ADAM = "kernels/test_adam.py"
+ADAM, NEAR_DECAY = "kernels/test_adam.py", "fields/test_near_decay.py"
 TILES = "kernels/test_tiles.py"
 OCCUPANCY = "kernels/test_free_space.py"
 CAMERA = "kernels/test_camera_rays.py"
@@ -285,7 +285,30 @@ MUTANTS = [
            "k + wp.static(TILE) < size[2]", "k + wp.static(TILE) <= size[2]", VARIATION),
     Mutant("tile: across a row's end", "optim/total_variation.py",
            "k + wp.static(TILE) < size[2]", "k < size[2]", VARIATION),
+    # near_decay.py
+    Mutant("decay near cameras: none there, most far away", "optim/near_decay.py",
+           "(real(1.0) - scaled / rays)", "(scaled / rays)", NEAR_DECAY),
+    Mutant("decay near cameras: not clamped", "optim/near_decay.py",
+           "camera.pixels / wp.max(square, unit)", "camera.pixels / unit", NEAR_DECAY),
+    Mutant("decay near cameras: by the distance", "optim/near_decay.py",
+           "wp.max(square, unit)", "wp.sqrt(square * wp.max(square, unit))", NEAR_DECAY),
+    Mutant("decay near cameras: pixels count alike", "optim/near_decay.py",
+           "rays += camera.pixels / square", "rays += real(100.0) / square", NEAR_DECAY),
+    Mutant("decay near cameras: before rays begin", "optim/near_decay.py",
+           "square >= near * near and ", "", NEAR_DECAY),
+    Mutant("decay near cameras: frusta do not grow", "optim/near_decay.py",
+           "sees(camera, away, margins[n])", "sees(camera, away, real(0.0))", NEAR_DECAY),
+    Mutant("decay near cameras: seen from behind", "optim/near_decay.py",
+           "return depth > -margin and right", "return right", NEAR_DECAY),
+    Mutant("decay near cameras: a picture's upper edge alone", "optim/near_decay.py",
+           " and place[1] < camera.high[1] * depth + margin", "", NEAR_DECAY),
+    Mutant("decay near cameras: a fisheye sees all around", "optim/near_decay.py",
+           "return depth + margin > camera.cosine * wp.length(away)", "return True", NEAR_DECAY),
     # adam.py
+    Mutant("Adam: a decay raises", "optim/adam.py", "+ adam.epsilon) - fall;", "+ adam.epsilon) + fall;", ADAM),
+    Mutant("Adam: all numbers decay", "optim/adam.py", "(c + n) % FLOATS ? 0.0f : decay", "decay", ADAM),
+    Mutant("Adam: a decay without the rate", "optim/adam.py", "on.learning_rate[0] * on.decay[", "on.decay[", ADAM),
+    Mutant("Adam: one decay for all", "optim/adam.py", "on.decay[tile_of(node)]", "on.decay[0]", ADAM),
     Mutant("Adam: betas swapped", "optim/adam.py",
            "adam.beta1 * mean_of(old)", "adam.beta2 * mean_of(old)", ADAM),
     Mutant("Adam: bias correction swapped", "optim/adam.py",

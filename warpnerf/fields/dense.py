@@ -99,7 +99,7 @@ class DenseGrid(Storage):
         n_floats = model.n_floats
         return [
             total_variation.total_variation_backward_kernel(n_floats),
-            adam.adam_kernel(n_floats),
+            adam.adam_kernel(n_floats, decays=False),
             adam.resample_moments_kernel(n_floats),
             dense_bound.find_highest_kernel(n_floats),
             dense.resample_kernel(n_floats),

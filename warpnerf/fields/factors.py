@@ -153,7 +153,7 @@ class Factors(Decoded):
             factors.node_densities_kernel(kind.width),
             *(factors.resample_kernel(dtype) for dtype in (vector(kind.width), real)),
             adam.resample_moments_along_kernel(kind.width),
-            adam.adam_kernel(kind.width),
+            adam.adam_kernel(kind.width, decays=False),
             plane_terms_kernel(kind.width),
             line_terms,
         ]

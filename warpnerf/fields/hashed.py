@@ -217,7 +217,7 @@ class Hashed(Decoded):
         return [
             *super().kernels(kind, model),
             cls.densities_kernel(kind),
-            adam.adam_kernel(kind.features),
+            adam.adam_kernel(kind.features, decays=False),
         ]
 
     def parameters(self, model: Model, optim: OptimConfig) -> tuple[Parameter, ...]:

@@ -123,14 +123,12 @@ class GridAdam:
         """Update nodes from their gradients, which are zeroed."""
         n_floats = len(parameter.learning_rates)
         decay = update.decays.get(parameter.name)
-        if decay is None:
-            decay = wp.empty(0, dtype=wp.float32, device=workers.device)
         workers.launch(
-            adam.adam_kernel(n_floats),
+            adam.adam_kernel(n_floats, decays=decay is not None),
             *thread_spans(parameter.values, workers),
             update.number,
             vector(n_floats)(*(update.factor * parameter.learning_rates)),
-            decay,
+            wp.empty(0, dtype=wp.float32, device=workers.device) if decay is None else decay,
             adam_struct(update, parameter.epsilon),
             gradients.entries(*parameter.gradient),
             parameter.values,

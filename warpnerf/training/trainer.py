@@ -395,6 +395,7 @@ class Trainer:
             self.plan.losses,
             self.config.field,
             self.plan.sampler,
+            self.config.optim.near_decay > 0.0,
         ):
             self.workers.load(kernel)
 

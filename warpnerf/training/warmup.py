@@ -11,7 +11,7 @@ from typing import get_args
 import warp as wp
 from warpnerf_kernels.fields import dense_bound
 from warpnerf_kernels.launch import assembly
-from warpnerf_kernels.optim import adam
+from warpnerf_kernels.optim import adam, near_decay
 from warpnerf_kernels.sampling import coverage, occupancy
 from warpnerf_kernels.space import camera
 
@@ -51,6 +51,7 @@ def training_kernels(
     losses: LossConfig,
     stored: StorageKind = DENSE,
     sampler: SamplerKind = MARCHED,
+    decays: bool = False,
 ) -> list[wp.Kernel]:
     """The kernels of a training from its first step to its last; at least one for each module.
 
@@ -60,10 +61,12 @@ def training_kernels(
     variant = variant_of(
         model, "float32", contraction, scaling, jacobian, packed, losses, stored, sampler
     )
+    decaying = [adam.adam_kernel(model.n_floats, decays=True), near_decay.find_near_decay]
     return [
         camera.sample_pixels,
         assembly.render_train_kernel(variant),
         *class_of(stored).kernels(stored, model),
+        *(decaying if decays else []),
         adam.adam_weights,
         dense_bound.join_highest,
         occupancy.mark_occupied_kernel(
@@ -160,6 +163,7 @@ def warm_up(
                     losses,
                     stored,
                     sampler,
+                    config.optim.near_decay > 0.0,
                 ):
                     words = _words(kernel, contraction, stored, scaling, losses) + of_model
                     words += ", proposal" * (kernel in proposals)

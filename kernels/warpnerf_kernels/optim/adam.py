@@ -126,8 +126,8 @@ def update_nodes(
 
 
 @cache
-def adam_kernel(n_floats: int) -> wp.Kernel:
-    """Adam over a field whose nodes hold so many floats."""
+def adam_kernel(n_floats: int, decays: bool) -> wp.Kernel:
+    """Adam over a field whose nodes hold so many floats, and the first of which decays or not."""
     Node, Moments, Gradient = vector(n_floats), moments_type(n_floats), gradient_type(n_floats)
 
     @wp.struct
@@ -145,13 +145,13 @@ def adam_kernel(n_floats: int) -> wp.Kernel:
         prefetch(on.gradient.values, node)
         prefetch(on.values, node)
         prefetch(on.moments, node)
-        if on.decay.shape[0] > 0:
+        if wp.static(decays):
             prefetch(on.decay, tile_of(node))
 
     @wp.func
     def work(on: Entries, node: int, begin: int, end: int):
         decay = real(0.0)
-        if on.decay.shape[0] > 0:
+        if wp.static(decays):
             decay = on.learning_rate[0] * on.decay[tile_of(node)]
         update_nodes(
             begin,
