@@ -150,7 +150,7 @@ EVERYTHING_SET = TrainConfig(
     model=PerSample(features=9, frequencies=2, width=16, hidden_layers=1, threshold=1e-3 / 3.0),
     grid=GridConfig(voxels=1000, grow_at=(0.1, 0.2, 1.0 / 3.0)),
     march=MarchConfig(far=1e9 / 3.0, jitter=False),
-    optim=OptimConfig(epsilon=1e-300),
+    optim=OptimConfig(epsilon=1e-300, near_decay=0.1 / 3.0),
 )
 
 
