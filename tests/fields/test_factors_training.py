@@ -201,7 +201,8 @@ def test_regularisers_are_slopes_of_their_sums(states: list[TrainingState]) -> N
     trainer = Trainer(ball(), replace(CONFIG, field=field, optim=optim))
     storage = replace(storage, kind=field)
     trainer.storage = storage
-    regulariser = trainer._regulariser()
+    trainer._regularise_lattice()
+    regulariser = trainer.regulariser
     assert regulariser is not None
     gradients = storage.gradients(trainer.model, workers)
     planes = np.where(rng.uniform(size=storage.planes.shape)[:, None] < 0.5, 1.0, 0.0)
