@@ -293,8 +293,8 @@ class TrainConfig:
     field: StorageKind = DENSE
     """What the model's raw values are stored in: dense (at each node of the grid), vm (TensoRF's
     planes and lines of vectors, and a matrix that decodes their products), hash (Instant-NGP's
-    tables of entries, by level), or auto: vm for objects with alpha unless rates of a dense grid
-    are configured, else dense. A name stands for what it is by default."""
+    tables of entries, by level), or auto: vm for objects with alpha unless rates or a decay of a
+    dense grid are configured, else dense. A name stands for what it is by default."""
     sampler: SamplerKind = AUTO_SAMPLER
     """Where rays are sampled: march (regular steps), resampled (intervals drawn for each ray from a
     small grid of densities that is trained along), or auto: resampled where space is contracted and
@@ -311,7 +311,7 @@ class TrainConfig:
         """
         if self.field != AUTO_FIELD:
             return self
-        parts = (self.optim, OPTIM_RATES), (self.model, model_rates(self.model))
+        parts = (self.optim, (*OPTIM_RATES, "near_decay")), (self.model, model_rates(self.model))
         configured = any(
             getattr(part, name) != getattr(type(part), name)
             for part, names in parts

@@ -64,6 +64,8 @@ def test_auto_is_vm_for_objects_alone() -> None:
     assert resolve(replace(ball(), unbounded=True), auto).config.field == DENSE
     rates = replace(auto, optim=replace(auto.optim, learning_rate_rgb=0.3))
     assert resolve(ball(), rates).config.field == DENSE
+    decay = replace(auto, optim=replace(auto.optim, near_decay=0.1))
+    assert resolve(ball(), decay).config.field == DENSE
     begun = Trainer(ball(), auto).state()
     assert isinstance(storage_of(begun), Factors)
     assert Trainer(ball(), auto, begun).config.field == Vm()

@@ -313,6 +313,7 @@ class AutoField(StorageKind):
     """VM decomposition or dense voxel grid, as suits the scene: ``TrainConfig.for_kind``."""
 
     name: ClassVar[str] = "auto"
+    owns_densities: ClassVar[bool] = True
 
     @property
     def rules(self) -> Mapping[str, str]:
