@@ -26,6 +26,7 @@ from warpnerf.fields.nodes import points_of, values_at
 from warpnerf.fields.occupancy import FreeCells
 from warpnerf.model.storage_kinds import DENSE, STORAGE_KINDS, Vm
 from warpnerf.optim_config import OptimConfig
+from warpnerf.runs.run import Run
 from warpnerf.runtime.parallel import Workers
 from warpnerf.training.optim import OPTIMISERS
 from warpnerf.training.plan import resolve
@@ -57,8 +58,8 @@ def test_it_resumes_with_equal_bits(states: list[TrainingState], tmp_path: Path)
     require_resumes(states, CONFIG, tmp_path / "state")
 
 
-def test_auto_is_vm_for_objects_alone() -> None:
-    """And where rates of a dense grid are configured it is dense, whatever is shown."""
+def test_auto_is_vm_for_objects_alone(tmp_path: Path) -> None:
+    """And its run resumes; with rates of a dense grid it is dense, whatever is shown."""
     auto = replace(CONFIG, field="auto")
     assert resolve(ball(), auto).config == replace(CONFIG, field=Vm())
     assert resolve(replace(ball(), unbounded=True), auto).config.field == DENSE
@@ -69,6 +70,10 @@ def test_auto_is_vm_for_objects_alone() -> None:
     begun = Trainer(ball(), auto).state()
     assert isinstance(storage_of(begun), Factors)
     assert Trainer(ball(), auto, begun).config.field == Vm()
+    run = Run(tmp_path / "run")
+    run.create(ball(), "ball", 1, ball().content_distance, auto)
+    run.save_checkpoint(begun)
+    assert run.load_state()[0].config.field == Vm()
 
 
 def test_files_hold_it(states: list[TrainingState], tmp_path: Path) -> None:
