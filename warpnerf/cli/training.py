@@ -184,7 +184,7 @@ def describe(scene: Scene, trainer: Trainer) -> None:
         print(f"  note: {note}")
     plan = trainer.plan
     print(f"  content distance {plan.content_distance:.4g} scene units, {_scaling(plan)}")
-    print(f"  rays are {plan.sampler.past}")
+    print(f"  the field is {plan.config.field.name}, rays are {plan.sampler.past}")
     space = trainer.lattice.space  # of an object that is resumed, tighter than the plan's
     print(f"  box {in_words(space, space.kind.words)}")
     if trainer.steps_done == 0:

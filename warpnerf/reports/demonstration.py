@@ -322,7 +322,7 @@ def _panels(rendering: Rendering, far: float) -> list[Image.Image]:
 def _no_better(why: str | None, headings: Sequence[str]) -> str:
     """A sentence on figures that are no better with the scaling."""
     rest = "with these seeds and steps" if why is None else f"as {why}"
-    return f"{', '.join(headings)}: no better, {rest}."
+    return f"{'; '.join(headings)}: no better, {rest}."
 
 
 def _said(name: str) -> str:
