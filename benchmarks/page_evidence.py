@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from page_parts import Records, below, place, table, text
 
+from warpnerf.reports.paired import CONFIDENCE
+
 COLUMNS = {
     "psnr": ("PSNR [dB]", 2),
     "training_psnr": ("of training views", 2),
@@ -32,7 +34,7 @@ def evidence(records: Records) -> str:
             f"""Photographs reduced {record["downscale"]} times, {record["steps"]} steps,
             {record["seeds"]} seeds; both sides of a pair draw the same rays. `rgb` is trained
             without other losses, `fast` is the preset. First without the scaling, then by how much
-            that changes with it, and its 95 % interval over the seeds
+            that changes with it, and its {CONFIDENCE:.0%} interval over the seeds
             ([formulas](metrics.md)). PSNR changes by {min(gains):+.2f} to {max(gains):+.2f} dB.
             """,
             records.source("evidence"),

@@ -2,9 +2,10 @@
 
     python benchmarks/write_docs.py
 
-Each function under "Sections", here, in page_quality.py and in page_jobs.py, writes one section.
-Its words hold whatever was measured, what follows from figures is in docs/decisions; its figures
-are read from the records, none is written by hand. After a new record, run it again.
+Each function under "Sections", here and in page_quality.py, page_jobs.py and page_evidence.py,
+writes one section. Its words hold whatever was measured, what follows from figures is in
+docs/decisions; its figures are read from the records, none is written by hand. After a new record,
+run it again.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from measuring import RESULTS, ROOT, named, show
+from page_evidence import evidence
 from page_jobs import jobs
 from page_parts import Records, below, medians, middle, of, place, table, text, values
 from page_quality import calibration, extents, resampling, scaling
@@ -294,6 +296,7 @@ def served(records: Records) -> str:
 
 SECTIONS: dict[str, Callable[[Records], str]] = {
     "What the scaling changes": scaling,
+    "Pairs without and with the scaling": evidence,
     "What the scaling costs": cost,
     "Throughput": throughput,
     "Late in a training": late,
