@@ -58,7 +58,7 @@ def test_the_table_says_of_each_row_whether_it_is_better_or_why_not(tmp_path: Pa
     assert lines["seconds of training"][-2:] == ["2", "2"]
     said = str(made)
     assert "depth error there: no better, as light that ends in front, on test rays, makes" in said
-    assert "\nSSIM, PSNR of views pulled back, " in said and ": no better, with these seeds" in said
+    assert "\nSSIM; PSNR of views pulled back" in said and ": no better, with these seeds" in said
 
 
 def test_the_first_row_of_the_picture_is_the_truth(monkeypatch: pytest.MonkeyPatch) -> None:
