@@ -101,6 +101,7 @@ def test_a_scene_with_it(tmp_path: Path) -> None:
     write_transforms(tmp_path, 8)
     every = load_scene(tmp_path, split=3)
     assert [name[-7:] for name in names_of(every)["test"]] == ["000.png", "003.png", "006.png"]
+    assert len(names_of(every)["train"]) == 5
     assert any(note.startswith("withheld for testing: 3 of 8") for note in every.notes)
     whole = load_scene(tmp_path, split="all")
     assert names_of(whole)["test"] == [] and len(whole.splits["train"]) == 8
