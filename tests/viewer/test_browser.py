@@ -69,6 +69,7 @@ def eventually(holds: Callable[[], bool], seconds: float = 120.0) -> None:
 
 def opened(chromium: Any, session: Session) -> Any:
     page = chromium.new_page(viewport={"width": WIDTH, "height": HEIGHT})
+    page.set_default_timeout(120_000)  # ms; other tests take the cores
     page.goto(session.address)
     eventually(lambda: at_rest(session))
     page.get_by_text("warpnerf: run 0").wait_for()
