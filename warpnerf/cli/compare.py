@@ -40,7 +40,7 @@ class CompareOptions:
     """Strengths of the decay of densities near cameras (optim.near_decay), such as 0 and 0.1; by
     default that of the preset."""
     fields: tuple[str, ...] = ()
-    """Fields: dense, vm, hash; by default that of the preset."""
+    """Fields: dense, vm, hash, auto; by default that of the preset."""
     presets: tuple[str, ...] = ("fast",)
     """Presets to begin with, as of train."""
     seeds: int = 3

@@ -81,9 +81,8 @@ class Experiment:
         """Name all; nothing is read or written yet."""
         self.folder, self.capture = folder, capture
         self.candidates, self.seeds = tuple(candidates), tuple(range(n_seeds))
-        self._visibility = SurfaceVisibility(
-            capture.scene
-        )  # of cameras and depths, which no training changes
+        # Of cameras and depths, which no training changes.
+        self._visibility = SurfaceVisibility(capture.scene)
 
     @property
     def trials(self) -> list[tuple[Candidate, int]]:

@@ -49,7 +49,6 @@ from warpnerf.runs.tensor_file import DamagedFileError
 from warpnerf.scenes.files import read_json
 from warpnerf.scenes.scene import Scene
 from warpnerf.scenes.split import Split
-from warpnerf.training.plan import TrainingPlan
 from warpnerf.training.state import MAY_GROW, Progress, TrainingState, differences
 from warpnerf.writing import write_atomically
 
@@ -224,9 +223,7 @@ class Run:
                 f"--output {self.folder} --overwrite."
             )
         path, state, notes = _first_whole(self.checkpoints, load_checkpoint)
-        if isinstance(state.plan, TrainingPlan):  # older ones had nothing to decide
-            config = config.for_kind(state.plan.kind)
-        for name, here, there in differences(config, state.config):
+        for name, here, there in differences(state.decided(config), state.config):
             if name in MAY_GROW:
                 continue  # it was saved before they were raised
             raise InputError(

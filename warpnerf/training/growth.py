@@ -12,11 +12,12 @@ from warpnerf.config import TrainConfig
 from warpnerf.fields.lattice import Lattice
 from warpnerf.fields.occupancy import FreeCells
 from warpnerf.fields.parameters import Parameter
-from warpnerf.fields.storage import Storage, require_memory
+from warpnerf.fields.storage import Storage, TrainedOn, require_memory
 from warpnerf.fields.storages import class_of
 from warpnerf.model.interface import Model
 from warpnerf.runtime.parallel import Workers
 from warpnerf.scenes.extent.space import grid_size
+from warpnerf.scenes.scene import Scene
 from warpnerf.training.optim import OPTIMISERS
 from warpnerf.training.plan import TrainingPlan, bytes_of_rays
 
@@ -26,6 +27,25 @@ def require_room(plan: TrainingPlan, device: wp.Device) -> None:
     config = plan.config
     of_rays = bytes_of_rays(config, plan.schedule, plan.sampler)
     require_memory(config.field, _model(config), plan.stages[-1].size, device, of_rays)
+
+
+def trained_on(scene: Scene, plan: TrainingPlan) -> TrainedOn:
+    """What the regularisation of each grid may know of a training.
+
+    Args:
+        scene: Its training cameras are those of the plan.
+        plan: Of the training.
+    """
+    config = plan.config
+    return TrainedOn(
+        model=_model(config),
+        optim=config.optim,
+        voxels=config.grid.voxels,
+        cameras=scene.training_cameras,
+        distances=plan.content_distances,
+        near=config.march.near,
+        scaling=config.scaling,
+    )
 
 
 def first_storage(plan: TrainingPlan, device: wp.Device) -> Storage:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from types import MappingProxyType
 from typing import ClassVar, Protocol, TypeVar
 
@@ -33,6 +34,12 @@ class Update:
     """The rest."""
     decays: Mapping[str, wp.array] = field(default_factory=dict)
     """By parameter, as of ``Storage.decays``."""
+
+
+@cache
+def no_decay(device: wp.Device) -> wp.array:
+    """In place of decays, for a kernel that reads none."""
+    return wp.empty(0, dtype=wp.float32, device=device)
 
 
 class Rule(Protocol):
@@ -128,7 +135,7 @@ class GridAdam:
             *thread_spans(parameter.values, workers),
             update.number,
             vector(n_floats)(*(update.factor * parameter.learning_rates)),
-            wp.empty(0, dtype=wp.float32, device=workers.device) if decay is None else decay,
+            no_decay(workers.device) if decay is None else decay,
             adam_struct(update, parameter.epsilon),
             gradients.entries(*parameter.gradient),
             parameter.values,

@@ -117,6 +117,11 @@ class TrainingState:
         }
         return replace(self, field=self.field.copied_to(device), optimiser=optimiser)
 
+    def decided(self, config: TrainConfig) -> TrainConfig:
+        """A configuration to resume with, with what auto stands for in this training."""
+        plan = self.plan  # when older ones were made, nothing was auto
+        return config if isinstance(plan, OlderPlan) else config.for_kind(plan.kind)
+
     def plan_of(self, scene: Scene, config: TrainConfig) -> TrainingPlan:
         """The training plan to resume by: the one that it began with.
 
@@ -130,7 +135,7 @@ class TrainingState:
         plan = self.plan
         if isinstance(plan, OlderPlan):
             plan = plan.completed(scene, self.field.lattice.space)
-        return replace(plan, config=config)
+        return replace(plan, config=self.decided(config))
 
     def require_same(self, scene: Scene, config: TrainConfig) -> None:
         """Raise InputError unless this scene and configuration would continue as begun.
@@ -158,7 +163,7 @@ class TrainingState:
         Raises:
             InputError: A field that decides the result differs.
         """
-        require_same_config(self.config, config)
+        require_same_config(self.config, self.decided(config))
 
     def require_longer(self, config: TrainConfig) -> None:
         """Raise InputError unless a schedule leaves something to train.

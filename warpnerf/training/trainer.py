@@ -14,7 +14,7 @@ from warpnerf.config import TrainConfig
 from warpnerf.fields.lattice import Lattice
 from warpnerf.fields.occupancy import FreeCells
 from warpnerf.fields.parameters import Parameter, first_weights, head_parameters
-from warpnerf.fields.storage import Regulariser, TrainedOn
+from warpnerf.fields.storage import Regulariser
 from warpnerf.model.interface import Model
 from warpnerf.model.storage_kinds import parts_of
 from warpnerf.rendering.field import Field
@@ -34,6 +34,7 @@ from warpnerf.training.growth import (
     grown_storage,
     occupied_box,
     require_room,
+    trained_on,
 )
 from warpnerf.training.optim import adam_step, first_states
 from warpnerf.training.peers import ALONE, Peers, Signals
@@ -46,7 +47,7 @@ from warpnerf.training.state import (
     require_finite,
     scene_digest,
 )
-from warpnerf.training.warmup import training_kernels
+from warpnerf.training.warmup import kernels_of
 
 REPORT_EVERY = 25
 """Steps between two reports, which come after an update."""
@@ -96,7 +97,6 @@ class Trainer:
         """What it trains on, with the extent that a new training begins with."""
         if resume is not None:
             asked = config.config if isinstance(config, TrainingPlan) else config
-            asked = asked.for_kind(scene.kind)
             resume.require_same(self._given, asked)
             plan = resume.plan_of(scene, asked)
         elif isinstance(config, TrainingPlan):
@@ -386,17 +386,7 @@ class Trainer:
 
     def _load_kernels(self) -> None:
         """Compile what is not yet in the cache."""
-        for kernel in training_kernels(
-            self.model,
-            self.lattice.contraction,
-            self.config.scaling,
-            self.config.jacobian,
-            self.workers.device,
-            self.plan.losses,
-            self.config.field,
-            self.plan.sampler,
-            self.config.optim.near_decay > 0.0,
-        ):
+        for kernel in kernels_of(self.plan, self.lattice.contraction, self.workers.device):
             self.workers.load(kernel)
 
     def _grow(self, fraction: float) -> None:
@@ -430,15 +420,7 @@ class Trainer:
 
     def _regularise_lattice(self) -> None:
         """Find what regularises the nodes that there are."""
-        training = TrainedOn(
-            model=self.model,
-            optim=self.config.optim,
-            voxels=self.config.grid.voxels,
-            cameras=self.scene.training_cameras,
-            distances=self.plan.content_distances,
-            near=self.config.march.near,
-            scaling=self.config.scaling,
-        )
+        training = trained_on(self.scene, self.plan)
         self.regulariser: Regulariser | None = self.storage.regulariser(training, self.workers)
         self._decays = self.storage.decays(training, self.workers)
 

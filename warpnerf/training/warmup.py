@@ -28,6 +28,7 @@ from warpnerf.rendering.proposal import proposing_kernels
 from warpnerf.rendering.structs import variant_of
 from warpnerf.runtime import kernel_cache
 from warpnerf.runtime.parallel import Workers
+from warpnerf.training.plan import TrainingPlan
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,6 +77,23 @@ def training_kernels(
         coverage.cover_blocks,
         *proposal_kernels(sampler, contraction, device, learns=True),
     ]
+
+
+def kernels_of(plan: TrainingPlan, contraction: Contraction, device: wp.Device) -> list[wp.Kernel]:
+    """The kernels of a training, by its plan, on the grid that it has."""
+    config = plan.config
+    assert isinstance(config.model, Model)
+    return training_kernels(
+        config.model,
+        contraction,
+        config.scaling,
+        config.jacobian,
+        device,
+        plan.losses,
+        config.field,
+        plan.sampler,
+        config.optim.near_decay > 0.0,
+    )
 
 
 def rendering_kernels(
