@@ -37,6 +37,7 @@ import host_scenes
 import host_training
 import losses
 import ndc
+import optimisers
 import packed
 import plain
 import resampled
@@ -51,6 +52,7 @@ TIME_LIMIT = 300.0
 
 MUTANTS = (
     *plain.MUTANTS,
+    *optimisers.MUTANTS,
     *packed.MUTANTS,
     *scatter.MUTANTS,
     *schedule.MUTANTS,

@@ -37,7 +37,7 @@ class Update:
 
 
 @cache
-def no_decay(device: wp.Device) -> wp.array:
+def _no_decay(device: str) -> wp.array:
     """In place of decays, for a kernel that reads none."""
     return wp.empty(0, dtype=wp.float32, device=device)
 
@@ -135,7 +135,7 @@ class GridAdam:
             *thread_spans(parameter.values, workers),
             update.number,
             vector(n_floats)(*(update.factor * parameter.learning_rates)),
-            no_decay(workers.device) if decay is None else decay,
+            _no_decay(str(workers.device)) if decay is None else decay,
             adam_struct(update, parameter.epsilon),
             gradients.entries(*parameter.gradient),
             parameter.values,
