@@ -21,6 +21,7 @@ BEHIND = "scenes/test_extent.py::test_what_is_behind_the_scene_is_what_is_asked_
 ALL_DRAWN = "scenes/test_extent.py::test_in_folded_space_all_pixels_are_drawn"
 BETWEEN = "scenes/test_points.py::test_by_default_they_lie_between_each_camera_s_and_the_scene_s"
 FEWER = "scenes/test_overlap.py::test_where_many_look_around_and_see_the_same_gradients_are_scaled_less_far"
+AUTO = "fields/test_factors_training.py::test_auto_is_vm_for_objects_alone"
 GROWTH = "training/test_trainer.py::test_growth_lets_the_optimiser_begin_anew"
 SHIFT = "training/test_trainer.py::test_growth_takes_its_shift_from_densities"
 GROWS = "training/test_trainer.py::test_the_grid_of_an_object_grows_earlier_into_a_tighter_box"
@@ -131,11 +132,10 @@ MUTANTS = [
     of_host("contracted space is left out", TRAINER, " and self.lattice.kind.bounded:", ":", ALL_DRAWN),
     of_host("total variation as of one step", TRAINER, "self._updates, fraction, n_steps)",
             "self._updates, fraction, 1)", VARIATION),
-    of_host("total variation of the grid that is", TRAINER, "voxels=self.config.grid.voxels,",
-            "voxels=math.prod(self.lattice.size),", VARIATION),
-    of_host("smooths the near as the far", TRAINER, "scaling=self.config.scaling,\n        )",
-            "scaling=\"none\",\n        )", SMOOTHED),
-    of_host("smoothing minds no near plane", TRAINER, "near=self.config.march.near,", "near=0.0,",
+    of_host("total variation of the grid that is", GROWN, "voxels=config.grid.voxels,",
+            "voxels=math.prod(plan.stages[0].size),", VARIATION),
+    of_host("smooths the near as the far", GROWN, "scaling=config.scaling,", "scaling=\"none\",", SMOOTHED),
+    of_host("smoothing minds no near plane", GROWN, "near=config.march.near,", "near=0.0,",
             SMOOTHED),
     of_host("total variation to the end", SMOOTHING, " or fraction >= self.until", "", TV_ENDS),
     of_host("total variation at every update", SMOOTHING, "update % self.every != 0 or ", "",
@@ -244,6 +244,10 @@ MUTANTS = [
     of_host("a picture as if nothing bent it", NEAR, "on_plane = shown[:, :2] / shown[:, 2:]",
             "on_plane = (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]", BENT_DECAY),
     of_host("a decay of one learning rate", "fields/dense.py", "where, strength, workers", "where, 1.0, workers", DECAYED),
+    of_host("auto: undecided where a training is resumed", "training/state.py",
+            "config if isinstance(plan, OlderPlan) else config.for_kind(plan.kind)", "config", AUTO),
+    of_host("auto: vm for all", "config.py", "Vm() if kind == \"object\" and not configured else DENSE", "Vm()", AUTO),
+    of_host("auto: whatever is configured", "config.py", "kind == \"object\" and not configured", "kind == \"object\"", AUTO),
     of_host("a decay that no update has", TRAINER, "self.workers, self._decays)", "self.workers)", DECAYED),
     of_host("a decay that is always on", "fields/dense.py", "if strength == 0.0:", "if False:", DECAYED),
     of_host("a decay in the short training", COARSE, ", near_decay=0.0)", ")", SHORT_USES),
