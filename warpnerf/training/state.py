@@ -118,7 +118,14 @@ class TrainingState:
         return replace(self, field=self.field.copied_to(device), optimiser=optimiser)
 
     def decided(self, config: TrainConfig) -> TrainConfig:
-        """A configuration to resume with, with what auto stands for in this training."""
+        """A configuration to resume with, with what auto stands for in this training.
+
+        Args:
+            config: How to resume.
+
+        Returns:
+            The same, or with the field that the training began with.
+        """
         plan = self.plan  # when older ones were made, nothing was auto
         return config if isinstance(plan, OlderPlan) else config.for_kind(plan.kind)
 
