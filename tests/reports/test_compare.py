@@ -294,6 +294,28 @@ def test_more_seeds_and_configurations_are_accepted_and_leftovers_swept(
         experiment(folder, room).begin()
 
 
+def test_options_that_came_after_an_experiment_began_have_their_defaults(
+    room: Scene, tmp_path: Path
+) -> None:
+    experiment(tmp_path, room).begin()
+    path = tmp_path / "experiment.json"
+    record = json.loads(path.read_text())
+    for tree in record["configurations"].values():
+        del tree["optim"]["near_decay"]
+    path.write_text(json.dumps(record))
+    experiment(tmp_path, room).begin()
+    for wrong in (
+        {"optim": {"near_decay": "x"}},
+        {"optim": {"near_decay": -1.0}},
+        None,
+        {"steps": 3},
+    ):
+        record["configurations"]["plain"] = wrong
+        path.write_text(json.dumps(record))
+        with pytest.raises(InputError, match="holds another comparison"):
+            experiment(tmp_path, room).begin()
+
+
 def test_too_few_test_views_are_refused(room: Scene) -> None:
     for n, words in ((0, "no test views"), (1, "one test view")):
         fewer = replace(room, splits={**room.splits, "test": room.splits["test"][:n]})

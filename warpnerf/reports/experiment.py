@@ -15,11 +15,12 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from warpnerf.checks import InputError, cannot_write
 from warpnerf.config import TrainConfig
-from warpnerf.config_json import config_to_json
+from warpnerf.config_json import config_from_json, config_to_json, decode
 from warpnerf.evaluation.sight import SurfaceVisibility
 from warpnerf.rendering.field import Field, Rendering
 from warpnerf.runs.files import is_leftover, sweep
@@ -98,7 +99,7 @@ class Experiment:
         path = self.folder / RECORD
         require_free(self.folder)
         wanted = json.loads(json.dumps(self._record()))
-        found = read_json(path, dict[str, Any]) if path.exists() else {}
+        found = read_json(path, dict[str, Any], _of_today) if path.exists() else {}
         begun = _begun(wanted, found)
         if found and any(found.get(name) != begun[name] for name in begun):
             wrong = f"holds another comparison: its {_difference(found, begun)}; name a new folder."
@@ -294,6 +295,21 @@ def require_free(folder: Path) -> None:
         raise cannot_write(f"--output {folder}", error) from error
     if names and RECORD not in names:
         raise InputError(f"--output {folder} holds other files ({names[0]}); name a new folder.")
+
+
+def _of_today(record: Any) -> Any:
+    """A record of an earlier version: options that came after it have their defaults."""
+    configurations = record.get("configurations") if isinstance(record, dict) else None
+    if not isinstance(configurations, dict):
+        return record
+    read = dict(configurations)
+    for name, tree in configurations.items():
+        try:
+            config = msgspec.convert(config_from_json(tree), TrainConfig, dec_hook=decode)
+        except (msgspec.ValidationError, TypeError, AttributeError):
+            continue  # it is another's, which is said where they are compared
+        read[name] = json.loads(json.dumps(config_to_json(config)))
+    return record | {"configurations": read}
 
 
 def _begun(wanted: dict[str, Any], found: dict[str, Any]) -> dict[str, Any]:
