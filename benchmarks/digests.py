@@ -73,8 +73,9 @@ def main() -> None:
     arguments = parser.parse_args()
     for name in arguments.scenes:
         scene = wn.load_scene(name)
-        for called, config in configurations(name, arguments.only):
-            grid = replace(config.grid, voxels=min(config.grid.voxels, arguments.voxels))
+        for called, undecided in configurations(name, arguments.only):
+            config = undecided.for_kind(scene.kind)
+            grid = replace(config.grid, voxels=min(config.grid.n_nodes, arguments.voxels))
             for threads in arguments.threads:
                 short = replace(
                     config, steps=arguments.steps, time_limit=None, threads=threads, grid=grid

@@ -45,6 +45,10 @@ GROW_AT: dict[SceneKind, tuple[float, ...]] = {
 """What ``GridConfig.grow_at`` is by default. Around an object most of the first box is empty, and a
 growth leaves that out; elsewhere coarse grids do more in the same time."""
 
+OBJECT_FIELD = Vm(density=8, appearance=24, sparsity=1e-4)
+"""What ``TrainConfig.field`` is around an object where it is auto: TensoRF's VM-96, and its L1
+loss."""
+
 MAX_VOXELS = 2**31
 """Nodes are counted in 32 bits."""
 
@@ -85,9 +89,10 @@ def _checked_box(box: object) -> tuple[float, ...]:
 class GridConfig:
     """The voxel grid: resolution, bounding box, contraction of unbounded space, growth."""
 
-    voxels: int = 160**3
+    voxels: int | Literal["auto"] = 160**3
     """Nodes of the final grid, in all. It grows from step 200 on: a shorter training keeps the grid
-    that it begins with, of 1/16 as many after four growths."""
+    that it begins with, of 1/16 as many after four growths. auto: as suits what the field is stored
+    in (``StorageKind.auto_voxels``)."""
     grow_at: Literal["auto"] | tuple[float, ...] = "auto"
     """Shares of the training at which the number of nodes doubles. auto: as suits the kind of
     scene (``GROW_AT``)."""
@@ -112,12 +117,13 @@ class GridConfig:
 
     def __post_init__(self) -> None:
         """Refuse what makes no grid."""
-        if hasattr(self.voxels, "__index__") and self.voxels >= MAX_VOXELS:
+        if hasattr(self.voxels, "__index__") and int(self.voxels) >= MAX_VOXELS:
             raise InputError(
                 "grid.voxels must be below 2^31 (1290 x 1290 x 1290), which kernels can count; use "
                 "fewer --voxels."
             )
-        require_whole("grid.voxels", self.voxels, 8)
+        if self.voxels != "auto":
+            require_whole("grid.voxels", self.voxels, 8)
         require_one_of("grid.contraction", self.contraction, ("auto", *SPACES))
         require_whole("grid.planes", self.planes, 2)
         if not 0 < self.alpha_init < 1:
@@ -179,7 +185,13 @@ class GridConfig:
         Returns:
             Nodes in all; 8 at least.
         """
-        return max(8, self.voxels >> len(self.grows_at(kind)) - grown)
+        return max(8, self.n_nodes >> len(self.grows_at(kind)) - grown)
+
+    @property
+    def n_nodes(self) -> int:
+        """Nodes of the final grid: ``voxels``, once ``TrainConfig.for_kind`` has decided auto."""
+        assert not isinstance(self.voxels, str)
+        return self.voxels
 
 
 @checked("march")
@@ -301,7 +313,7 @@ class TrainConfig:
     steps are not configured, else march. A name stands for the sampler with its defaults."""
 
     def for_kind(self, kind: SceneKind) -> TrainConfig:
-        """The configuration with ``field`` decided for a kind of scene.
+        """The configuration with ``field`` and ``grid.voxels`` decided for a kind of scene.
 
         Args:
             kind: object, bounded or unbounded.
@@ -309,15 +321,22 @@ class TrainConfig:
         Returns:
             The same, or with what auto stands for.
         """
+        field = self._field_for(kind)
+        grid = self.grid
+        if grid.voxels == "auto":
+            grid = replace(grid, voxels=field.auto_voxels)
+        return replace(self, field=field, grid=grid)
+
+    def _field_for(self, kind: SceneKind) -> StorageKind:
         if self.field != AUTO_FIELD:
-            return self
+            return self.field
         parts = (self.optim, (*OPTIM_RATES, "near_decay")), (self.model, model_rates(self.model))
         configured = any(
             getattr(part, name) != getattr(type(part), name)
             for part, names in parts
             for name in names
         )
-        return replace(self, field=Vm() if kind == "object" and not configured else DENSE)
+        return OBJECT_FIELD if kind == "object" and not configured else DENSE
 
     def losses_for(self, kind: SceneKind) -> LossConfig:
         """The loss weights: ``loss``, decided for a kind of scene.

@@ -125,7 +125,7 @@ PRESETS: dict[str, TrainConfig] = {
         steps=200_000,
         time_limit=900.0,
         field=AUTO_FIELD,
-        grid=GridConfig(voxels=224**3),
+        grid=GridConfig(voxels="auto"),
         optim=OptimConfig(decay=0.03),
     ),
     "dvgo": replace(_DVGO, alpha_min=1e-3),

@@ -92,7 +92,8 @@ def test_value(tmp_path: Path, options: list[str], says: str) -> None:
 def test_value_of_another_type(tmp_path: Path, options: list[str]) -> None:
     outcome = train(make_scene(tmp_path), *options, folder=tmp_path)
     assert outcome.code == 2
-    assert f"{options[0]} must be a whole number, not '{options[1]}'" in outcome.err
+    kind = {"--steps": "", "--voxels": "auto or "}[options[0]] + "a whole number"
+    assert f"{options[0]} must be {kind}, not '{options[1]}'" in outcome.err
     assert not outcome.run.exists()
 
 

@@ -19,6 +19,7 @@ from tests.support.field_trainings import (
 from tests.support.tiny_trainings import ball
 from warpnerf.checks import InputError
 from warpnerf.cli.configured import configured
+from warpnerf.config import OBJECT_FIELD
 from warpnerf.fields.dense import DenseGrid
 from warpnerf.fields.factors import AXES, Factors
 from warpnerf.fields.lattice import Lattice
@@ -61,19 +62,22 @@ def test_it_resumes_with_equal_bits(states: list[TrainingState], tmp_path: Path)
 def test_auto_is_vm_for_objects_alone(tmp_path: Path) -> None:
     """And its run resumes; with rates of a dense grid it is dense, whatever is shown."""
     auto = replace(CONFIG, field="auto")
-    assert resolve(ball(), auto).config == replace(CONFIG, field=Vm())
+    assert resolve(ball(), auto).config == replace(CONFIG, field=OBJECT_FIELD)
     assert resolve(replace(ball(), unbounded=True), auto).config.field == DENSE
     rates = replace(auto, optim=replace(auto.optim, learning_rate_rgb=0.3))
     assert resolve(ball(), rates).config.field == DENSE
     decay = replace(auto, optim=replace(auto.optim, near_decay=0.1))
     assert resolve(ball(), decay).config.field == DENSE
+    finest = replace(auto, grid=replace(auto.grid, voxels="auto"))
+    for unbounded, voxels in ((False, 300**3), (True, 224**3)):
+        assert resolve(replace(ball(), unbounded=unbounded), finest).config.grid.voxels == voxels
     begun = Trainer(ball(), auto).state()
     assert isinstance(storage_of(begun), Factors)
-    assert Trainer(ball(), auto, begun).config.field == Vm()
+    assert Trainer(ball(), auto, begun).config.field == OBJECT_FIELD
     run = Run(tmp_path / "run")
     run.create(ball(), "ball", 1, ball().content_distance, auto)
     run.save_checkpoint(begun)
-    assert run.load_state()[0].config.field == Vm()
+    assert run.load_state()[0].config.field == OBJECT_FIELD
 
 
 def test_files_hold_it(states: list[TrainingState], tmp_path: Path) -> None:

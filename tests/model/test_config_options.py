@@ -202,7 +202,7 @@ def test_words_of_fields_that_may_be_several_things() -> None:
 @pytest.mark.parametrize(
     ("given", "says"),
     [
-        (words(grid__voxels="many"), "--voxels must be a whole number, not 'many'."),
+        (words(grid__voxels="many"), "--voxels must be auto or a whole number, not 'many'."),
         (words(optim__decay="slow"), "--optim.decay must be a number, not 'slow'."),
         (words(march__jitter="maybe"), "--march.jitter must be true or false, not 'maybe'."),
         (words(time_limit="long"), "--time-limit must be a number or none, not 'long'."),

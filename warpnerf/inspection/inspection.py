@@ -87,7 +87,7 @@ class Inspection:
     def widths(self) -> np.ndarray:
         """Voxel width in pixels at each of ``scene.observations``, [n]."""
         assert self.scene.observations is not None
-        voxels = next(iter(self.costs.values())).plan.config.grid.voxels
+        voxels = next(iter(self.costs.values())).plan.config.grid.n_nodes
         return self.space.voxel_widths(self.scene.observations, voxels)
 
     @property
@@ -282,10 +282,11 @@ def cost_of(scene: Scene, config: TrainConfig, threads: int) -> Cost:
     Raises:
         InputError: The configuration cannot be resolved for the scene.
     """
-    plan, voxels = resolve(scene, config), config.grid.voxels
+    plan = resolve(scene, config)
+    voxels = plan.config.grid.n_nodes
     in_ndc = plan.space.frustum is not None
     samples, occupied = SAMPLES_IN_NDC if in_ndc else SAMPLES_AND_OCCUPIED[plan.kind]
-    finer = (voxels / PRESETS["fast"].grid.voxels) ** (1.0 / 3.0) / config.march.step_voxels
+    finer = (voxels / PRESETS["fast"].grid.n_nodes) ** (1.0 / 3.0) / config.march.step_voxels
     share = (np.arange(1000) + 0.5)[:, None] / 1000  # of the training, evenly
     nodes = voxels * 0.5 ** (share < plan.schedule.grow_at).sum(axis=1)
     steps_an_update = 2.0 ** (share >= plan.schedule.accumulate_at).sum(axis=1)

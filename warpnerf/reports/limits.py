@@ -57,7 +57,7 @@ def voxel_pixels(trainer: Trainer) -> float | None:
     # As planned, with what cameras were found to see, which a scene that is read again does not
     # tell. A tighter box, and numbers of nodes that are whole, make voxels smaller or larger.
     edge = lattice.space.voxel_edge(math.prod(lattice.size))
-    return plan.voxel_pixels.median * edge / plan.space.voxel_edge(plan.config.grid.voxels)
+    return plan.voxel_pixels.median * edge / plan.space.voxel_edge(plan.config.grid.n_nodes)
 
 
 def what_limits(

@@ -130,7 +130,7 @@ def extent_by_training(
         scaling="clamped",  # so that trainings with and without have one extent
         grid=replace(
             config.grid,
-            voxels=min(VOXELS, config.grid.voxels),
+            voxels=min(VOXELS, config.grid.n_nodes),
             contraction="linf" if space.has_frustum else space.name,
             planes=GridConfig.planes,
             grow_at=(),

@@ -40,7 +40,7 @@ def trained_on(scene: Scene, plan: TrainingPlan) -> TrainedOn:
     return TrainedOn(
         model=_model(config),
         optim=config.optim,
-        voxels=config.grid.voxels,
+        voxels=config.grid.n_nodes,
         cameras=scene.training_cameras,
         distances=plan.content_distances,
         near=config.march.near,

@@ -196,7 +196,7 @@ def planned(
         reach: ``TrainingPlan.reach``.
         looks_first: ``TrainingPlan.looks_first``.
     """
-    kind, voxels = scene.kind, config.grid.voxels
+    kind, voxels = scene.kind, config.grid.n_nodes
     schedule = Schedule.of(config, kind)
     behind = config.background
     if behind == "auto":

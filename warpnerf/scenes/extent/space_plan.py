@@ -67,7 +67,7 @@ def resolve_space(scene: Scene, config: TrainConfig) -> Space:
     grid.require_planes_used(contraction)
     _require_contraction(kind, config)
     if kind.has_frustum:
-        frustum, (low, high) = fit_frustum(scene, grid.planes, grid.voxels)
+        frustum, (low, high) = fit_frustum(scene, grid.planes, grid.n_nodes)
         return Space(box_min=low, box_max=high, contraction=contraction, frustum=frustum)
     low, high = scene.box_min, scene.box_max
     if not isinstance(grid.box, str):
@@ -81,7 +81,7 @@ def resolve_space(scene: Scene, config: TrainConfig) -> Space:
         space = replace(space, border=UNSEEN_BORDER if border is None else border)
     else:
         chosen = grid.box == "auto"
-        space = plan_space(space, scene.observations, grid.voxels, border, box=chosen)
+        space = plan_space(space, scene.observations, grid.n_nodes, border, box=chosen)
     content = np.stack([scene.box_min, scene.box_max])
     if np.array_equal(content, [space.box_min, space.box_max]):
         return space
