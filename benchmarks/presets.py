@@ -4,11 +4,12 @@
         --candidate fast --candidate "quality grid.voxels=4000000 model.specular=12"
 
 A candidate is a preset, and fields of its TrainConfig that are something else, by their path and as
-JSON. Scenes are as for training.py. Trainings of a scene and a seed take turns of a fraction of a
-second, each for as long on a clock of its own; so a machine that is slow for a while is slow for
-all. Where the extent is looked for first, that is off the clock. Prints PSNR on the test views,
-that of the middle quarter of their pictures, SSIM, where depths are known their error in scene
-units, and of a sample of training views PSNR, the mean and half of the range over the seeds; writes
+JSON without spaces, such as field={"name":"vm","density":8,"appearance":24}. Scenes are as for
+training.py. Trainings of a scene and a seed take turns of a fraction of a second, each for as long
+on a clock of its own; so a machine that is slow for a while is slow for all. Where the extent is
+looked for first, that is off the clock. Prints PSNR on the test views, that of the middle quarter
+of their pictures, SSIM, where depths are known their error in scene units, and of a sample of
+training views PSNR, the mean and half of the range over the seeds; writes
 benchmarks/results/presets_<device>.json.
 """
 
@@ -30,6 +31,7 @@ from warpnerf.checks import InputError
 from warpnerf.config import TrainConfig
 from warpnerf.config_json import config_to_json
 from warpnerf.evaluation.metrics import psnr
+from warpnerf.model import storage_kinds
 from warpnerf.model.models import model_of
 from warpnerf.presets import DEFAULT_PRESETS, PRESETS
 from warpnerf.runtime.parallel import Workers
@@ -199,6 +201,8 @@ def _changed(config: Any, path: Sequence[str], value: Any) -> Any:
         value = _changed(getattr(config, name), path[1:], value)
     elif name == "model":
         value = model_of(value)
+    elif isinstance(value, dict):  # a field, with options that go together only
+        value = storage_kinds.from_json(value)
     return replace(config, **{name: value})
 
 
