@@ -45,7 +45,7 @@ GROW_AT: dict[SceneKind, tuple[float, ...]] = {
 """What ``GridConfig.grow_at`` is by default. Around an object most of the first box is empty, and a
 growth leaves that out; elsewhere coarse grids do more in the same time."""
 
-OBJECT_FIELD = Vm(density=8, appearance=24, sparsity=1e-4)
+OBJECT_FIELD = Vm(density=8, appearance=24, learning_rate=0.05, sparsity=1e-4)
 """What ``TrainConfig.field`` is around an object where it is auto: TensoRF's VM-96, and its L1
 loss."""
 
