@@ -134,8 +134,9 @@ class PhotoConsistency:
                 continue
             near = neighbours(poses, i)
             inverse = np.tile(_inverse_depths(poses, i, near)[:, None], len(middles))
-            for shown, means in ((near, found), (self._strangers(i, near), by_chance)):
-                match = self._correlations(poses, i, near, shown, middles, inverse)
+            shown = near, self._strangers(i, near)
+            matches = self._correlations(poses, i, near, shown, middles, inverse)
+            for match, means in zip(matches, (found, by_chance), strict=True):
                 means.append(float(np.maximum(match.max(axis=0), 0.0).mean()))
         return Agreement(found=np.array(found), by_chance=np.array(by_chance))
 
@@ -158,7 +159,7 @@ class PhotoConsistency:
             near = neighbours(poses, i, FAR_APART)
             sweep = np.tile(_inverse_depths(poses, i, near)[:, None], len(middles))
             inverse = np.concatenate([sweep, 1.0 / away[None]])
-            match = self._correlations(poses, i, near, near, middles, inverse)
+            (match,) = self._correlations(poses, i, near, [near], middles, inverse)
             seen = match[-1] > -1.0
             if seen.sum() >= FEWEST_POINTS:
                 own.append(float(match[-1, seen].mean()))
@@ -190,7 +191,7 @@ class PhotoConsistency:
         poses: np.ndarray,
         i: int,
         near: Sequence[int],
-        shown: Sequence[int],
+        shown: Sequence[Sequence[int]],
         middles: np.ndarray,
         inverse: np.ndarray,
     ) -> np.ndarray:
@@ -200,12 +201,13 @@ class PhotoConsistency:
             poses: [n, 3, 4] of the chosen views.
             i: The reference.
             near: Its neighbours.
-            shown: Whose photographs these show: their own, or strangers'.
+            shown: Whose photographs these show, one after the other: their own, or strangers'.
             middles: [m, 2] of its patches, pixels.
             inverse: [k, m] of 1 / distance from its centre.
 
         Returns:
-            [k, m] mean over the neighbours that see the patch there, -1 where none does.
+            [len(shown), k, m] mean over the neighbours that see the patch there, -1 where none
+            does.
         """
         picture = self._picture(i)
         pixels = middles[:, None] + PATCH
@@ -213,17 +215,19 @@ class PhotoConsistency:
         rays = np.ones((*pixels.shape[:2], 3))
         rays[..., :2] = (pixels - picture.centre) / picture.focal
         rays *= np.array([1.0, -1.0, -1.0]) / np.linalg.norm(rays, axis=-1, keepdims=True)
-        total, seen = np.zeros(inverse.shape), np.zeros(inverse.shape)
-        for j, other in zip(near, shown, strict=True):
+        total, seen = np.zeros((2, len(shown), *inverse.shape))
+        for j, *others in zip(near, *shown, strict=True):
             turn = poses[i][:, :3].T @ poses[j][:, :3]
             shift = (poses[i][:, 3] - poses[j][:, 3]) @ poses[j][:, :3]
             there, front = _project(
                 self._picture(j), rays @ turn + inverse[:, :, None, None] * shift
             )
-            match = _correlation(patch, _bilinear(self._picture(other).gray, there))
-            known = front.all(axis=-1) & np.isfinite(match)
-            total += np.where(known, match, 0.0)
-            seen += known
+            before = front.all(axis=-1)
+            for n, other in enumerate(others):
+                match = _correlation(patch, _bilinear(self._picture(other).gray, there))
+                known = before & np.isfinite(match)
+                total[n] += np.where(known, match, 0.0)
+                seen[n] += known
         return np.where(seen > 0, total / np.maximum(seen, 1), -1.0)
 
     def _strangers(self, i: int, near: Sequence[int]) -> list[int]:
