@@ -16,6 +16,7 @@ from tests.scenes.test_points import write_ply
 from tests.support.tiny_scenes import DATA, camera_at, look_at, needs_capture, picture, ring
 from warpnerf.scenes.builtin.room import first_hit, photograph
 from warpnerf.scenes.cameras.camera import Camera
+from warpnerf.scenes.extent import photo_consistency
 from warpnerf.scenes.extent.conventions import check_against_photographs
 from warpnerf.scenes.extent.photo_consistency import FEWEST, PhotoConsistency, neighbours
 from warpnerf.scenes.extent.points import Points
@@ -75,6 +76,12 @@ def wall() -> list[View]:
     return photographed(along_a_wall(24))
 
 
+@pytest.fixture
+def few_references(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half as many photographs are looked at, where many cases ask the same of one scene."""
+    monkeypatch.setattr(photo_consistency, "REFERENCES", 6)
+
+
 def misread(views: list[View], as_written: Callable[[np.ndarray], np.ndarray]) -> list[View]:
     """Views whose poses [4, 4] stand otherwise in their file."""
     return [
@@ -106,6 +113,7 @@ def test_poses_that_fit_stay(room: list[View], wall: list[View]) -> None:
         assert all(a is b for a, b in zip(found, views, strict=True))
 
 
+@pytest.mark.usefixtures("few_references")
 @pytest.mark.parametrize("name", WRITTEN)
 def test_poses_in_other_axes_are_read_as_the_photographs_show(name: str, room: list[View]) -> None:
     found, _, said = held(misread(room, WRITTEN[name]))
@@ -133,6 +141,7 @@ def test_points_tell_axes_where_photographs_are_too_small() -> None:
     np.testing.assert_allclose(found[1].camera.c2w, ring(8)[1][:3], atol=1e-12)
 
 
+@pytest.mark.usefixtures("few_references")
 @pytest.mark.parametrize(
     ("written", "read"),
     [
