@@ -1,8 +1,10 @@
 """Where the kernels under test run, where compiled code is kept, that Ctrl-C is heard, and what
 stands for COLMAP."""
 
+import gc
 import os
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 # Before torch is imported: between tests' small tensors, threads of OpenMP would mostly spin.
@@ -13,9 +15,10 @@ import pytest
 import warp as wp
 
 from tests.support import cli_process
-from tests.support.compiling import compile_as_tests_do
+from tests.support.compiling import compile_as_tests_do, not_optimising
 from tests.support.fake_colmap import Colmap, photographs
 from tests.support.kernel_runner import Kernels
+from warpnerf.scenes.formats import assemble
 from warpnerf.sfm import pose as sfm_pose
 
 wp.config.log_level = wp.LOG_ERROR  # as the command has it
@@ -35,6 +38,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--device", default="cpu", help="as Warp names it: cpu, cuda:0")
 
 
+def pytest_collection_finish() -> None:
+    gc.freeze()  # what is imported stays: to look through it time and again takes long
+
+
 def pytest_sessionfinish() -> None:
     cli_process.close_server()
 
@@ -49,6 +56,22 @@ def on_cpu(device: str) -> None:
     """For what holds on the CPU only: CUDA adds gradients up in no fixed order."""
     if device != "cpu":
         pytest.skip("the CPU's promise: CUDA adds gradients up in no fixed order")
+
+
+@pytest.fixture(scope="module")
+def unoptimised() -> Iterator[None]:
+    """For a module that launches kernels a few times each: most of its time would be compiling."""
+    with not_optimising():
+        yield
+
+
+@pytest.fixture(scope="module")
+def poses_as_given() -> Iterator[None]:
+    """For a module that loads photographs often, but asks nothing of them: nor do scenes ask them
+    which axes their poses have, which takes a second each time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(assemble, "check_against_photographs", lambda v, t, p, o: (list(v), p, []))
+        yield
 
 
 @pytest.fixture(scope="session")

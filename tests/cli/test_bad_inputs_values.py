@@ -24,6 +24,7 @@ from tests.support.cli_process import (
     make_scene,
     train,
 )
+from tests.support.small_model import SQUARED
 from tests.support.tiny_scenes import camera_at, picture, ring
 from warpnerf.checks import InputError
 from warpnerf.runtime.memory import usable_memory
@@ -170,7 +171,8 @@ def test_box(box: tuple[np.ndarray, np.ndarray]) -> None:
     ],
 )
 def test_clip_distances_that_leave_no_sample(march: dict[str, float], message: str) -> None:
-    config = wn.TrainConfig(steps=1, threads=1, grid=wn.GridConfig(voxels=512))
+    config = wn.TrainConfig(model="rgb", steps=1, threads=1, grid=wn.GridConfig(voxels=512))
+    config = replace(config, loss=SQUARED)
     wn.train(scene_by_hand(), replace(config, march=wn.MarchConfig(near=4.0, far=4.1)))
     wn.train(scene_by_hand(), replace(config, march=wn.MarchConfig(far=2.5)))
     with pytest.raises(InputError, match=message):

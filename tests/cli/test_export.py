@@ -23,6 +23,8 @@ from warpnerf.exporting.visibility import visibility as computed_visibility
 from warpnerf.runs.run import Run
 from warpnerf.scenes.formats.load import load_scene
 
+pytestmark = pytest.mark.usefixtures("poses_as_given")
+
 
 @pytest.fixture(scope="module")
 def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:

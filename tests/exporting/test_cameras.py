@@ -17,6 +17,8 @@ from warpnerf.exporting.export import export
 from warpnerf.scenes.formats.load import load_scene
 from warpnerf.scenes.scene import Scene, View
 
+pytestmark = pytest.mark.usefixtures("poses_as_given")
+
 
 def ball_scene(masked: bool = False, **lens: float) -> Scene:
     """Noise, photographed by the cameras around the ball; the last one has another lens."""

@@ -4,14 +4,11 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.support.compiling import launch_unoptimised
-
 jax = pytest.importorskip("jax")
 
 
 @pytest.fixture(autouse=True)
-def _float64_and_unoptimised(monkeypatch: pytest.MonkeyPatch, on_cpu: None) -> Iterator[None]:
-    launch_unoptimised(monkeypatch)
+def _float64_and_unoptimised(unoptimised: None, on_cpu: None) -> Iterator[None]:
     before = jax.config.jax_enable_x64
     jax.config.update("jax_enable_x64", True)
     yield

@@ -2,9 +2,7 @@
 
 import pytest
 
-from tests.support.compiling import launch_unoptimised
 
-
-@pytest.fixture(autouse=True)
-def _unoptimised(monkeypatch: pytest.MonkeyPatch) -> None:
-    launch_unoptimised(monkeypatch)
+@pytest.fixture(scope="module", autouse=True)
+def _unoptimised(unoptimised: None) -> None:
+    pass

@@ -26,6 +26,8 @@ from warpnerf.runs.checkpoint import load_checkpoint, load_field, save_checkpoin
 from warpnerf.runs.tensor_file import DamagedFileError, digest_of
 from warpnerf.writing import write_atomically
 
+pytestmark = pytest.mark.usefixtures("unoptimised")
+
 
 @pytest.fixture
 def file(tmp_path: Path) -> Path:

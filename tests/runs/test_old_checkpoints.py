@@ -227,7 +227,7 @@ def test_a_training_without_a_plan_goes_on_as_it_would_have(
 ) -> None:
     path, config = (
         tmp_path / "begun",
-        tiny_config(content_distance=content_distance, sampler=MARCHED),
+        tiny_config(model="rgb", content_distance=content_distance, sampler=MARCHED),
     )
     whole = stopped_at(STEPS, tmp_path / "whole", config, scene())
     for step in (3, GROWING[0] + 2):

@@ -144,7 +144,7 @@ def test_workers_wait_for_each_other(threads: int, on_cpu: None) -> None:
     """More of them than cores, again and again: none continues before all have come."""
     workers, cache = Workers("cpu", threads), LaunchCache()
     expected = threads * (threads + 1) // 2 * np.arange(1, 51)
-    for _ in range(20):
+    for _ in range(8):
         numbers = wp.zeros(threads, dtype=wp.int32, device="cpu")
         sums = wp.zeros((threads, 50), dtype=wp.int32, device="cpu")
         workers.launch_owned(

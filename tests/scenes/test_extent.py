@@ -18,6 +18,8 @@ from warpnerf.training import extent
 from warpnerf.training import trainer as training
 from warpnerf.training.trainer import Trainer
 
+pytestmark = pytest.mark.usefixtures("unoptimised")
+
 BOX = np.array([-1.0, -0.7, -0.5]), np.array([1.4, 0.8, 0.6])
 CONFIG = TrainConfig(
     steps=100,

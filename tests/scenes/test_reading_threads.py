@@ -22,6 +22,8 @@ from warpnerf.scenes.formats import assemble
 from warpnerf.scenes.images import photographs as posed
 from warpnerf.sfm import photographs as unposed
 
+pytestmark = pytest.mark.usefixtures("poses_as_given")
+
 
 @pytest.fixture
 def pools(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:

@@ -10,7 +10,6 @@ from functools import cache, wraps
 from pathlib import Path
 from typing import Any
 
-import pytest
 import warp as wp
 
 from warpnerf.runtime.parallel import Workers
@@ -38,6 +37,20 @@ def one_at_a_time(name: str) -> Iterator[None]:
         yield
 
 
+_optimises = True
+
+
+@contextmanager
+def not_optimising() -> Iterator[None]:
+    """Meanwhile no kernel is optimised on the CPU: for what launches many a few times each."""
+    global _optimises
+    before, _optimises = _optimises, False
+    try:
+        yield
+    finally:
+        _optimises = before
+
+
 @cache
 def unoptimised(kernel: wp.Kernel) -> wp.Kernel:
     """The same kernel in a module of its own that is not optimised: compiled in a fifth of the
@@ -48,32 +61,34 @@ def unoptimised(kernel: wp.Kernel) -> wp.Kernel:
     return wp.Kernel(kernel.func, key=kernel.key, module=module, options=kernel.options)
 
 
-def launch_unoptimised(patch: pytest.MonkeyPatch) -> None:
-    """Have all kernels launched as ``unoptimised`` ones on the CPU, while a test runs."""
-    launch = Workers._launch
-
-    @wraps(launch)
-    def quickly(workers: Workers, kernel: wp.Kernel, *given: Any) -> None:
-        launch(workers, kernel if workers.device.is_cuda else unoptimised(kernel), *given)
-
-    patch.setattr(Workers, "_launch", quickly)
+def compiled(workers: Workers, kernel: wp.Kernel) -> wp.Kernel:
+    """What is loaded and launched in place of a kernel."""
+    if workers.device.is_cuda or kernel.module.options.get(OPTION) == 0:
+        return kernel
+    if _optimises and not kernel.func.__module__.startswith(FLOAT64):
+        return kernel
+    return unoptimised(kernel)
 
 
 def compile_as_tests_do() -> None:
     """From now on in this process.
 
     Kernels in float64 are for checking what is computed, and are launched a few times: they are not
-    optimised. Those that train are as users have them.
+    optimised. Those that train are as users have them, but in ``not_optimising``.
     """
-    load = Workers.load
+    load, launch = Workers.load, Workers._launch
 
     @wraps(load)
-    def quickly(workers: Workers, kernel: wp.Kernel) -> None:
+    def load_quickly(workers: Workers, kernel: wp.Kernel) -> None:
+        kernel = compiled(workers, kernel)
         if kernel in workers._loaded:
             return
-        if kernel.func.__module__.startswith(FLOAT64) and not workers.device.is_cuda:
-            kernel.module.options[OPTION] = 0
         with one_at_a_time(kernel.module.name):
             load(workers, kernel)
 
-    Workers.load = quickly  # type: ignore[method-assign]
+    @wraps(launch)
+    def launch_quickly(workers: Workers, kernel: wp.Kernel, *given: Any) -> None:
+        launch(workers, compiled(workers, kernel), *given)
+
+    Workers.load = load_quickly  # type: ignore[method-assign]
+    Workers._launch = launch_quickly  # type: ignore[method-assign]

@@ -32,6 +32,8 @@ from warpnerf.training import trainer as training
 from warpnerf.training.optim import adam_step
 from warpnerf.training.trainer import Trainer
 
+pytestmark = pytest.mark.usefixtures("unoptimised")
+
 N_RAYS = 90
 DISTANCES = np.array([2.0, 3.1, 4.3, 5.2, 6.4, 9.0])
 """Of six cameras, the last for testing. Some are nearer than what is sampled, some farther."""

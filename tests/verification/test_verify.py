@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.support.compiling import launch_unoptimised
 from tests.support.small_model import SMALL
 from warpnerf.checks import InputError
 from warpnerf.runtime.parallel import Workers
@@ -25,7 +24,6 @@ from warpnerf.verification.verify import Result, report, verify
 
 def test_each_is_begun_ended_and_passes_here(monkeypatch: pytest.MonkeyPatch, device: str) -> None:
     """Of a few; tests/cli/test_machine.py has all of them, by the command."""
-    launch_unoptimised(monkeypatch)
     every = checks._checks
     few = "differences, plain", "gather"
     monkeypatch.setattr(
@@ -163,7 +161,6 @@ def test_each_can_fail(
     device: str,
     on_cpu: None,
 ) -> None:
-    launch_unoptimised(monkeypatch)
     monkeypatch.setattr(checks, "VIEW_DEPENDENT", (SMALL,))
     if tuple(words) not in passed:
         assert failing(device, *words) == set()
@@ -198,7 +195,6 @@ def test_a_check_that_cannot_run_fails_and_says_why(
     def broken(*given: Any) -> Any:
         raise RuntimeError("does not compile\nat all")
 
-    launch_unoptimised(monkeypatch)
     monkeypatch.setattr(checks, "VIEW_DEPENDENT", (SMALL,))
     monkeypatch.setattr(checks, "STORED", ())
     monkeypatch.setattr(ProblemKernels, "see", broken)
