@@ -29,10 +29,15 @@ def looking(seed: int, away: float, aside: float = 0.15) -> Any:
     return np.stack([right, np.cross(back, right), back, eye], axis=1)
 
 
-def covered(kernels: Kernels, view: Any, occupied: Any, block: int, before: int = 3) -> Any:
+def covered(kernels: Kernels, view: Any, occupied: Any, block: int) -> Any:
     """[rows, columns] bool, as the kernel finds it, between other views' blocks."""
-    size = tuple(occupied.shape)
-    distance = wp.array(chessboard(occupied).ravel(), dtype=wp.uint8, device=kernels.device)
+    return covered_by(kernels, view, chessboard(occupied), block)
+
+
+def covered_by(kernels: Kernels, view: Any, distances: Any, block: int, before: int = 3) -> Any:
+    """The same of the distances of cells to occupied ones."""
+    size = tuple(distances.shape)
+    distance = wp.array(distances.ravel(), dtype=wp.uint8, device=kernels.device)
     shape = (-(-HEIGHT // block), -(-WIDTH // block))
     n = shape[0] * shape[1]
     out = wp.full(before + n + 2, 7, dtype=wp.uint8, device=kernels.device)
@@ -76,8 +81,11 @@ def of_blocks(pixels: Any, block: int) -> Any:
     return padded.reshape(rows, block, columns, block).any((1, 3))
 
 
-@pytest.mark.parametrize("lens", [LENSES[0], LENSES[2], LENSES[6]], ids=str)
-@pytest.mark.parametrize("block", [4, 7])
+@pytest.mark.parametrize(
+    ("lens", "block"),
+    [(LENSES[0], 4), (LENSES[0], 7), (LENSES[2], 4), (LENSES[6], 7)],
+    ids=str,
+)
 def test_no_block_is_left_out_whose_rays_meet_something(
     lens: dict[str, float], block: int, kernels64: Kernels
 ) -> None:
@@ -131,9 +139,10 @@ def test_it_ends_however_far_the_camera_is(packed: Kernels, away: float) -> None
     """Through a long lens: at such t a thousandth of a cell is less than float32 tells apart."""
     occupied = np.zeros((80, 80, 80), bool)
     occupied[40, 40, 40] = occupied[30, 45, 38] = True
+    distances = chessboard(occupied)
     lens = {"focal": packed.types.vec2(0.4 * FX * away, 0.4 * FY * away)}
     for seed in range(20):
-        found = covered(
-            packed, view(packed, looking(seed, away, 0.05 / away), {}, **lens), occupied, 4
+        found = covered_by(
+            packed, view(packed, looking(seed, away, 0.05 / away), {}, **lens), distances, 4
         )
         assert found.any()

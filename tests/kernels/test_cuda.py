@@ -75,7 +75,10 @@ def test_every_kernel_compiles_for_cuda(
         assert ".entry" in compiled(module, tmp_path / str(number))
 
 
-@pytest.mark.parametrize(("model", "contraction"), [(Rgb(), "ndc"), (SMALL, "linf")])
+@pytest.mark.parametrize(
+    ("model", "contraction"),
+    [(SMALL, "linf"), pytest.param(Rgb(), "ndc", marks=pytest.mark.slow)],
+)
 def test_a_training_compiles_for_cuda(model: Model, contraction: Any, tmp_path: Path) -> None:
     """The launch that has all parts of a model and its space in it, and their adjoints."""
     variant = variant_of(model, "float32", contraction, "clamped", "density", packed=False)

@@ -67,16 +67,30 @@ def test_packs_against_the_plain_form(name: str, contraction: str) -> None:
     require_same(packed, plain, contraction)
 
 
-@pytest.mark.parametrize("features", [2, 8])
-@pytest.mark.parametrize("name", ["deferred", "per_sample"])
+@pytest.mark.parametrize(
+    ("name", "features"),
+    [
+        ("deferred", 2),
+        ("per_sample", 8),
+        pytest.param("deferred", 8, marks=pytest.mark.slow),
+        pytest.param("per_sample", 2, marks=pytest.mark.slow),
+    ],
+)
 def test_other_entries(name: str, features: int) -> None:
     """And a number of inputs of the decoder that fills no vectors."""
     kind = replace(SMALL, features=features, levels=5)
     require_same(*(gradient(MODELS[name], kind, is_plain=p) for p in (False, True)))
 
 
-@pytest.mark.parametrize(("hidden", "features"), [(16, 4), (48, 2)])
-@pytest.mark.parametrize("name", ["deferred", "many"])
+@pytest.mark.parametrize(
+    ("name", "hidden", "features"),
+    [
+        ("deferred", 16, 4),
+        ("many", 48, 2),
+        pytest.param("deferred", 48, 2, marks=pytest.mark.slow),
+        pytest.param("many", 16, 4, marks=pytest.mark.slow),
+    ],
+)
 def test_a_hidden_layer(name: str, hidden: int, features: int) -> None:
     kind = replace(SMALL, features=features, hidden=hidden)
     packed, plain = (gradient(MODELS[name], kind, is_plain=p) for p in (False, True))

@@ -5,7 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.kernels.test_render import VARIANTS, Path, each_path, early, jittered, masked, rng_of
+from tests.kernels.test_render import (
+    OTHERS,
+    PACKED,
+    USUAL,
+    Path,
+    each_path,
+    early,
+    jittered,
+    masked,
+    rng_of,
+    variant,
+)
 from tests.support.expected import assert_close, oracle_gradient, oracle_train
 from tests.support.kernel_runner import Kernels
 from tests.support.problems import N_SEEDS, Problem, in_float32, make_problem, unbounded
@@ -20,6 +31,15 @@ def rounding(p: Problem, scaling: str = "none") -> float:
     if p.contraction == "ndc":
         return 3e-5 if scaling == "quadratic" else 1e-5
     return 1e-5 if p.steps.growth == 0.0 else 5e-5
+
+
+each_variant = pytest.mark.parametrize(
+    ("contraction", "scaling", "jacobian"),
+    [
+        variant(v, *(() if v[1] == "none" or v in PACKED else [pytest.mark.slow]))
+        for v in (*USUAL, *OTHERS)
+    ],
+)
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +67,7 @@ def test_adjoint_against_autograd(make: Path, packed: Kernels) -> None:
         assert_close(packed.backward(p), oracle_gradient(p), rounding(p))
 
 
-@pytest.mark.parametrize(("contraction", "scaling", "jacobian"), VARIANTS)
+@each_variant
 def test_scaling_against_the_papers_operation(
     scaling: str, jacobian: str, contraction: str, packed: Kernels
 ) -> None:
@@ -61,7 +81,7 @@ def test_scaling_against_the_papers_operation(
         assert_close(packed.backward(p, scaling, jacobian), expected, rounding(p, scaling))
 
 
-@pytest.mark.parametrize(("contraction", "scaling", "jacobian"), VARIANTS)
+@each_variant
 def test_training_launch_against_autograd(
     scaling: str, jacobian: str, contraction: str, packed: Kernels
 ) -> None:

@@ -114,6 +114,12 @@ def variant(constants: tuple[str, str, str], *marks: Any) -> Any:
     return pytest.param(*constants, marks=marks, id="-".join(constants))
 
 
+PACKED = {
+    ("linf", "quadratic", "density"),
+    ("ndc", "clamped", "none"),
+    ("none", "quadratic", "none"),
+}
+"""Of these, and of those without a scaling, the vector form is always compiled, too."""
 VARIANTS = [*map(variant, USUAL), *(variant(other, pytest.mark.slow) for other in OTHERS)]
 
 
@@ -158,11 +164,11 @@ def test_adjoint_against_central_differences(make: Path, kernels64: Kernels) -> 
                 + (p.adj_depth * out.depth).sum()
             )
 
-        directions = rng_of(seed).normal(size=(8, *p.raw.shape))
+        directions = rng_of(seed).normal(size=(4, *p.raw.shape))
         expected = directional_differences(loss, p.raw, directions, h=2e-5)
         # An early stop makes the image jump where a ray just reaches the threshold.
-        smooth = ~np.array(moved).reshape(8, -1).any(axis=1)
-        assert smooth.sum() >= 6
+        smooth = ~np.array(moved).reshape(4, -1).any(axis=1)
+        assert smooth.sum() >= 3
         gradient = np.tensordot(directions, kernels64.backward(p), axes=4)
         assert_close(gradient[smooth], expected[smooth], 1e-7)
 
@@ -250,7 +256,13 @@ def test_fused_launch_equals_forward_and_backward(
 
 @pytest.mark.parametrize(
     ("contraction", "scaling", "jacobian"),
-    [v for v in VARIANTS if v.values[0] != "l2" and v.values[1] != "none"],
+    [
+        variant(("none", "clamped", "none")),
+        variant(("linf", "quadratic", "density")),
+        variant(("none", "quadratic", "none"), pytest.mark.slow),
+        variant(("linf", "clamped", "none"), pytest.mark.slow),
+        variant(("ndc", "clamped", "none"), pytest.mark.slow),
+    ],
 )
 def test_forward_is_the_same_bits_for_every_scaling(
     contraction: str, scaling: str, jacobian: str, kernels32: Kernels

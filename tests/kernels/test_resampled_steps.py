@@ -80,9 +80,12 @@ def problem(contraction: str, seed: int) -> Problem:
 
 
 each_space = pytest.mark.parametrize("contraction", ["none", "linf"])
+harder_space = pytest.mark.parametrize(
+    "contraction", ["linf", pytest.param("none", marks=pytest.mark.slow)]
+)
 
 
-@each_space
+@harder_space
 def test_intervals_that_are_alike_are_steps_at_given_distances(
     contraction: str, device: str, kernels64: Kernels
 ) -> None:
@@ -102,7 +105,7 @@ def test_intervals_that_are_alike_are_steps_at_given_distances(
         assert_close(gradients[1], gradients[0], 1e-12)
 
 
-@each_space
+@harder_space
 @pytest.mark.parametrize("threads", [1, 3])
 def test_the_vector_form_equals_the_plain_one(
     contraction: str, threads: int, device: str, on_cpu: None

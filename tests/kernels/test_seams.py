@@ -50,6 +50,8 @@ MODELS: dict[str, Model] = {
     "loss on samples": SmoothRgb(),
     "sampler": AtDistances(edges=EDGES),
 }
+SUMMED = {"loss", "loss with sums"}
+"""Those of two losses."""
 each_seam = pytest.mark.parametrize("model", MODELS.values(), ids=MODELS.keys())
 
 
@@ -58,8 +60,13 @@ def problem(model: Model, seed: int) -> Problem:
     return early(masked(p, seed)) if seed % 2 else p
 
 
+def unscaled(kernels: Kernels, p: Problem) -> tuple[Any, Any]:
+    """Without a scaling, by the kernel that has one: it is 1 where all is far away."""
+    return kernels.train(replace(p, content_distance=np.array([1e-200])), "clamped")
+
+
 def loss_of(kernels: Kernels, p: Problem) -> float:
-    return float(kernels.train(p)[0].mean())
+    return float(unscaled(kernels, p)[0].mean())
 
 
 @each_seam
@@ -74,7 +81,7 @@ def require_gradients_of_differences(
     """In random directions; of colours only, where weights count as constants."""
     h = 2e-5
     for seed, p in enumerate(problems):
-        gradient = kernels64.train(p)[1]
+        gradient = unscaled(kernels64, p)[1]
         rng = np.random.default_rng(seed)
         found, expected = [], []
         for _ in range(12):
@@ -93,7 +100,13 @@ def require_gradients_of_differences(
         assert_close(found, expected, 1e-7)
 
 
-@each_seam
+@pytest.mark.parametrize(
+    "model",
+    [
+        pytest.param(m, id=name, marks=pytest.mark.slow if name in SUMMED else ())
+        for name, m in MODELS.items()
+    ],
+)
 def test_gradient_on_the_cpu(model: Model, kernels64: Kernels) -> None:
     """In float32, by the form and the workers that training takes, against float64."""
     require_gradients_in_float32([problem(model, seed) for seed in range(4)], kernels64)
@@ -116,7 +129,7 @@ def test_losses_add_up(kernels64: Kernels) -> None:
     p = problem(MODELS["two losses"], 0)
     plain = replace(p, model=model_of("rgb"))
     alone = [replace(p, model=MODELS[name]) for name in ("loss", "loss with sums")]
-    errors = [kernels64.train(q)[0] for q in (plain, *alone, p)]
+    errors = [unscaled(kernels64, q)[0] for q in (plain, *alone, p)]
     extra = [error - errors[0] for error in errors[1:]]
     assert all((e > 0.0).sum() > 5 for e in extra)
     assert_close(extra[2], extra[0] + extra[1], 1e-12)
@@ -127,7 +140,8 @@ def test_values_of_the_losses(kernels64: Kernels) -> None:
     for name, by_hand in (("loss", near_two), ("loss with sums", apart)):
         p = problem(MODELS[name], 0)
         p = replace(p, offsets=np.array([0.5]))
-        found = kernels64.train(p)[0] - kernels64.train(replace(p, model=model_of("rgb")))[0]
+        plain = replace(p, model=model_of("rgb"))
+        found = unscaled(kernels64, p)[0] - unscaled(kernels64, plain)[0]
         assert_close(found, [by_hand(*weights_of(kernels64, p, n)) for n in range(12)], 1e-9)
 
 
@@ -140,7 +154,7 @@ def test_value_of_the_loss_on_samples(kernels64: Kernels) -> None:
         target = torch.tensor(p.target)[:, None].expand_as(seen.colors)
         of_samples = smooth_l1_loss(seen.colors, target, reduction="none", beta=0.3).sum(dim=2)
         expected = 0.5 * (seen.weights * of_samples).sum(dim=1)
-        (found, gradient), (without, other) = kernels64.train(p), kernels64.train(plain)
+        (found, gradient), (without, other) = unscaled(kernels64, p), unscaled(kernels64, plain)
         assert expected.max() > 0.01
         assert_close(found - without, expected, 1e-9)
         assert np.array_equal(gradient[..., 0], other[..., 0])
@@ -173,9 +187,9 @@ def test_losses_in_a_frustum_are_those_of_distances_in_the_scene(kernels64: Kern
         dt = torch.where(seen.kept, (later - sooner) / (2.0 * h), 0.0).numpy()
         t = torch.where(seen.kept, seen.t, 0.0).numpy()
         expected = [apart(*ray) for ray in zip(seen.weights.numpy(), t, dt, strict=True)]
-        found = kernels64.train(p)[0] - kernels64.train(plain)[0]
+        found = unscaled(kernels64, p)[0] - unscaled(kernels64, plain)[0]
         assert_close(found, expected, 1e-6)
-        exact, rounded = kernels64.train(in_float32(p)), packs.train(in_float32(p))
+        exact, rounded = unscaled(kernels64, in_float32(p)), packs.train(in_float32(p))
         assert_close(rounded[0], exact[0], 5e-5)
         assert_close(rounded[1], exact[1], 5e-5)
         direction = np.random.default_rng(seed).normal(size=p.raw.shape)
@@ -186,7 +200,7 @@ def test_losses_in_a_frustum_are_those_of_distances_in_the_scene(kernels64: Kern
                 direction[None],
                 h=2e-5,
             )
-            assert_close([np.vdot(direction, kernels64.train(p)[1])], by, 1e-7)
+            assert_close([np.vdot(direction, unscaled(kernels64, p)[1])], by, 1e-7)
 
 
 def weights_of(kernels: Kernels, p: Problem, ray: int) -> tuple[Any, Any, float]:
@@ -224,7 +238,7 @@ def test_given_distances_of_equal_steps_are_those_of_the_march(kernels64: Kernel
         listed = replace(p, model=AtDistances(edges=edges))
         plain = replace(p, steps=replace(p.steps, far=edges[-1]))
         assert_close(kernels64.forward(listed).rgb, kernels64.forward(plain).rgb, 1e-12)
-        assert_close(kernels64.train(listed)[1], kernels64.train(plain)[1], 1e-11)
+        assert_close(unscaled(kernels64, listed)[1], unscaled(kernels64, plain)[1], 1e-11)
 
 
 def flat_scene() -> Scene:
@@ -314,7 +328,7 @@ def test_gradients_in_another_space(kernels64: Kernels) -> None:
     require_gradients_of_differences(problems, kernels64)
     require_gradients_in_float32(problems, kernels64)
     for p, other in zip(problems, linf, strict=True):
-        assert np.abs(kernels64.train(p)[1] - kernels64.train(other)[1]).max() > 1e-4
+        assert np.abs(unscaled(kernels64, p)[1] - unscaled(kernels64, other)[1]).max() > 1e-4
 
 
 def test_training_in_another_space(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

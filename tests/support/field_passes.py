@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import pytest
 from warpnerf_kernels.base.tiles import TILE
 
 from tests.support.expected import assert_close
@@ -25,8 +26,11 @@ MODELS: dict[str, Model] = {
     "per_sample": PerSample(width=16),
     "many": PerSample(width=16, features=27, residual=False),
 }
-CASES = [*((name, "none") for name in MODELS), ("deferred", "linf")]
-"""Models, and the space that each is read in."""
+CASES = [
+    *(("rgb", "none"), ("deferred", "none"), ("many", "none"), ("deferred", "linf")),
+    *(pytest.param(name, "none", marks=pytest.mark.slow) for name in ("sh", "per_sample")),
+]
+"""Models, and the space that each is read in; of heads alike in what they read, one always runs."""
 
 Gradient = dict[str, np.ndarray]
 
