@@ -115,9 +115,10 @@ def variant(constants: tuple[str, str, str], *marks: Any) -> Any:
 
 
 PACKED = {
+    ("none", "quadratic", "none"),
+    ("none", "clamped", "none"),
     ("linf", "quadratic", "density"),
     ("ndc", "clamped", "none"),
-    ("none", "quadratic", "none"),
 }
 """Of these, and of those without a scaling, the vector form is always compiled, too."""
 VARIANTS = [*map(variant, USUAL), *(variant(other, pytest.mark.slow) for other in OTHERS)]
