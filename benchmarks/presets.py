@@ -201,7 +201,7 @@ def _changed(config: Any, path: Sequence[str], value: Any) -> Any:
         value = _changed(getattr(config, name), path[1:], value)
     elif name == "model":
         value = model_of(value)
-    elif isinstance(value, dict):  # a field, with options that go together only
+    elif name == "field" and isinstance(value, dict):  # with options that go together only
         value = storage_kinds.from_json(value)
     return replace(config, **{name: value})
 

@@ -91,8 +91,8 @@ class GridConfig:
 
     voxels: int | Literal["auto"] = 160**3
     """Nodes of the final grid, in all. It grows from step 200 on: a shorter training keeps the grid
-    that it begins with, of 1/16 as many after four growths. auto: as suits what the field is stored
-    in (``StorageKind.auto_voxels``)."""
+    that it begins with, of 1/16 as many after four growths. auto: 224^3, and 300^3 where the field
+    is vm."""
     grow_at: Literal["auto"] | tuple[float, ...] = "auto"
     """Shares of the training at which the number of nodes doubles. auto: as suits the kind of
     scene (``GROW_AT``)."""
@@ -121,6 +121,10 @@ class GridConfig:
             raise InputError(
                 "grid.voxels must be below 2^31 (1290 x 1290 x 1290), which kernels can count; use "
                 "fewer --voxels."
+            )
+        if isinstance(self.voxels, str) and self.voxels != "auto":
+            raise InputError(
+                f"grid.voxels must be auto or a whole number, not {said(self.voxels)}."
             )
         if self.voxels != "auto":
             require_whole("grid.voxels", self.voxels, 8)
@@ -189,8 +193,13 @@ class GridConfig:
 
     @property
     def n_nodes(self) -> int:
-        """Nodes of the final grid: ``voxels``, once ``TrainConfig.for_kind`` has decided auto."""
-        assert not isinstance(self.voxels, str)
+        """Nodes of the final grid: ``voxels``, where it is a number.
+
+        Raises:
+            TypeError: It is auto, which ``TrainConfig.for_kind`` decides.
+        """
+        if isinstance(self.voxels, str):
+            raise TypeError("grid.voxels is auto, so no number yet; see TrainConfig.for_kind")
         return self.voxels
 
 
@@ -305,8 +314,9 @@ class TrainConfig:
     field: StorageKind = DENSE
     """What the model's raw values are stored in: dense (at each node of the grid), vm (TensoRF's
     planes and lines of vectors, and a matrix that decodes their products), hash (Instant-NGP's
-    tables of entries, by level), or auto: vm for objects with alpha unless rates or a decay of a
-    dense grid are configured, else dense. A name stands for what it is by default."""
+    tables of entries, by level), or auto: vm with more components (``OBJECT_FIELD``) for objects
+    with alpha, unless rates or a decay of a dense grid are configured, else dense. A name stands
+    for what it is by default."""
     sampler: SamplerKind = AUTO_SAMPLER
     """Where rays are sampled: march (regular steps), resampled (intervals drawn for each ray from a
     small grid of densities that is trained along), or auto: resampled where space is contracted and

@@ -63,6 +63,9 @@ OPTIONS: dict[str, type] = {
 }
 """What --set takes, and how each is read; fields of ``TrainConfig`` and ``GridConfig``."""
 
+WORDS = {"content_distance": ("auto", "per-camera"), "voxels": ("auto",)}
+"""What some of them may be instead."""
+
 
 class WarpnerfMethod:
     """A training, or what one has left, behind the interface ``nerfbaselines.Method``.
@@ -219,8 +222,7 @@ def configured(overrides: dict[str, Any], background: np.ndarray | None) -> Trai
             raise InputError(f"--set {name}: there is no such option; use {', '.join(OPTIONS)}.")
         kind = OPTIONS[name]
         try:
-            words = ("auto", "per-camera") if name == "content_distance" else ()
-            given[name] = value if value in words else kind(value)
+            given[name] = value if value in WORDS.get(name, ()) else kind(value)
         except ValueError:
             raise InputError(f"--set {name} must be {kind.__name__}, not {value!r}.") from None
     preset = given.pop("preset", "fast")

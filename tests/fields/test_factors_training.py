@@ -80,6 +80,25 @@ def test_auto_is_vm_for_objects_alone(tmp_path: Path) -> None:
     assert run.load_state()[0].config.field == OBJECT_FIELD
 
 
+def test_auto_stays_what_it_was_when_a_training_began(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever it is in the version that resumes it."""
+    auto = replace(CONFIG, field="auto", grid=replace(CONFIG.grid, voxels="auto"))
+    monkeypatch.setattr("warpnerf.config.OBJECT_FIELD", Vm(sparsity=1e-4))
+    monkeypatch.setattr(Vm, "auto_voxels", 4096)
+    begun = Trainer(ball(), auto).state()
+    run = Run(tmp_path / "run")
+    run.create(ball(), "ball", 1, ball().content_distance, auto)
+    run.save_checkpoint(begun)
+    monkeypatch.undo()
+    assert run.load_state()[0].config == begun.config
+    assert Trainer(ball(), auto, begun).config == begun.config
+    other = replace(auto, optim=replace(auto.optim, learning_rate_rgb=0.3))
+    with pytest.raises(InputError, match=r"rgb is 0\.3, but the training to be resumed has"):
+        Trainer(ball(), other, begun)
+
+
 def test_files_hold_it(states: list[TrainingState], tmp_path: Path) -> None:
     require_files_hold(states[1], CONFIG, tmp_path / "field.safetensors")
 

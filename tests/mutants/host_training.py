@@ -21,6 +21,10 @@ BEHIND = "scenes/test_extent.py::test_what_is_behind_the_scene_is_what_is_asked_
 ALL_DRAWN = "scenes/test_extent.py::test_in_folded_space_all_pixels_are_drawn"
 BETWEEN = "scenes/test_points.py::test_by_default_they_lie_between_each_camera_s_and_the_scene_s"
 FEWER = "scenes/test_overlap.py::test_where_many_look_around_and_see_the_same_gradients_are_scaled_less_far"
+AUTO_KEPT = "fields/test_factors_training.py::test_auto_stays_what_it_was_when_a_training_began"
+CAME_AFTER = (
+    "reports/test_compare.py::test_options_that_came_after_an_experiment_began_have_their_defaults"
+)
 AUTO = "fields/test_factors_training.py::test_auto_is_vm_for_objects_alone"
 GROWTH = "training/test_trainer.py::test_growth_lets_the_optimiser_begin_anew"
 SHIFT = "training/test_trainer.py::test_growth_takes_its_shift_from_densities"
@@ -245,7 +249,12 @@ MUTANTS = [
             "on_plane = (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]", BENT_DECAY),
     of_host("a decay of one learning rate", "fields/dense.py", "where, strength, workers", "where, 1.0, workers", DECAYED),
     of_host("auto: undecided where a training is resumed", "training/state.py",
-            "config if isinstance(plan, OlderPlan) else config.for_kind(plan.kind)", "config", AUTO),
+            "decided, begun = config.for_kind(plan.kind), plan.config", "decided, begun = config, plan.config", AUTO),
+    of_host("auto: what it is today where a training is resumed", "training/state.py", "if config.field == AUTO_FIELD and type",
+            "if False and type", AUTO_KEPT),
+    of_host("auto: voxels of today where a training is resumed", "training/state.py", "if config.grid.voxels == \"auto\":", "if False:",
+            AUTO_KEPT),
+    of_host("options of another version dropped", "reports/experiment.py", "if _has_all(today, tree):", "if True:", CAME_AFTER),
     of_host("auto: vm for all", "config.py", "OBJECT_FIELD if kind == \"object\" and not configured else DENSE", "OBJECT_FIELD", AUTO),
     of_host("auto: whatever is configured", "config.py", "kind == \"object\" and not configured", "kind == \"object\"", AUTO),
     of_host("auto: as many voxels whatever it is stored in", "config.py", "voxels=field.auto_voxels", "voxels=self.field.auto_voxels", AUTO),

@@ -300,6 +300,7 @@ def test_options_that_came_after_an_experiment_began_have_their_defaults(
     experiment(tmp_path, room).begin()
     path = tmp_path / "experiment.json"
     record = json.loads(path.read_text())
+    of_another_version = record["configurations"]["plain"] | {"of_a_later_version": 1}
     for tree in record["configurations"].values():
         del tree["optim"]["near_decay"]
     path.write_text(json.dumps(record))
@@ -309,6 +310,7 @@ def test_options_that_came_after_an_experiment_began_have_their_defaults(
         {"optim": {"near_decay": -1.0}},
         None,
         {"steps": 3},
+        of_another_version,
     ):
         record["configurations"]["plain"] = wrong
         path.write_text(json.dumps(record))

@@ -61,8 +61,8 @@ class StorageKind(ABC):
     as_fine_as_nodes: ClassVar[bool] = True
     """Whether the nodes of the lattice say how fine it is."""
     auto_voxels: ClassVar[int] = 224**3
-    """What ``GridConfig.voxels`` stands for where it is auto: as many as a quarter of an hour on
-    two cores trains."""
+    """What ``GridConfig.voxels`` is where it is auto: for a dense grid as many as a quarter of an
+    hour on two cores can train."""
     smoothed: ClassVar[bool] = True
     """Whether total variation smooths it, so that what is configured of that does something."""
     owns_densities: ClassVar[bool] = False

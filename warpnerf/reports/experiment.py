@@ -127,7 +127,8 @@ class Experiment:
             "views": scene_digest(self.capture.scene, ("train", "test")),
             "seeds": len(self.seeds),
             "configurations": {
-                candidate.name: config_to_json(candidate.config) for candidate in self.candidates
+                candidate.name: config_to_json(candidate.config.for_kind(self.capture.scene.kind))
+                for candidate in self.candidates
             },
         }
 
@@ -308,8 +309,17 @@ def _of_today(record: Any) -> Any:
             config = msgspec.convert(config_from_json(tree), TrainConfig, dec_hook=decode)
         except (msgspec.ValidationError, TypeError, AttributeError):
             continue  # it is another's, which is said where they are compared
-        read[name] = json.loads(json.dumps(config_to_json(config)))
+        today = json.loads(json.dumps(config_to_json(config)))
+        if _has_all(today, tree):
+            read[name] = today
     return record | {"configurations": read}
+
+
+def _has_all(tree: Any, other: Any) -> bool:
+    """Whether a tree has all keys of another."""
+    if not (isinstance(tree, dict) and isinstance(other, dict)):
+        return True
+    return all(name in tree and _has_all(tree[name], other[name]) for name in other)
 
 
 def _begun(wanted: dict[str, Any], found: dict[str, Any]) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from warpnerf.checks import InputError
 from warpnerf.config import TrainConfig
 from warpnerf.model.interface import Model
 from warpnerf.model.sampler_kinds import SamplerKind
-from warpnerf.model.storage_kinds import StorageKind
+from warpnerf.model.storage_kinds import AUTO_FIELD, StorageKind
 from warpnerf.rendering.field import Field
 from warpnerf.scenes.cameras.focus import find_focus
 from warpnerf.scenes.scene import Scene
@@ -124,10 +124,17 @@ class TrainingState:
             config: How to resume.
 
         Returns:
-            The same, or with the field that the training began with.
+            The same, or with the field and voxels that the training began with.
         """
-        plan = self.plan  # when older ones were made, nothing was auto
-        return config if isinstance(plan, OlderPlan) else config.for_kind(plan.kind)
+        plan = self.plan
+        if isinstance(plan, OlderPlan):  # when these were made, nothing was auto
+            return config
+        decided, begun = config.for_kind(plan.kind), plan.config
+        if config.field == AUTO_FIELD and type(decided.field) is type(begun.field):
+            decided = replace(decided, field=begun.field)  # another version's had other options
+        if config.grid.voxels == "auto":
+            decided = replace(decided, grid=replace(decided.grid, voxels=begun.grid.voxels))
+        return decided
 
     def plan_of(self, scene: Scene, config: TrainConfig) -> TrainingPlan:
         """The training plan to resume by: the one that it began with.
