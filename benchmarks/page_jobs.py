@@ -6,9 +6,19 @@ import numpy as np
 from measuring import show
 from page_parts import Records, below, place, table, text
 
+EXCHANGES = {
+    "shared": "add through shared memory",
+    "tiles": "exchange by gloo",
+    "dense": "exchange by gloo, the whole gradient",
+}
+"""How, by the name in a record."""
+
 
 def jobs(records: Records) -> str:
     record, cut = records["processes"], records["blocks"]
+    how = record["exchange"]
+    named = how == "shared" or "--exchange" in record["machine"]["command"]
+    today = "" if named else f", today with `--exchange {how}`"
     late = record["blocks"][-len(record["blocks"]) // 3 :]
     threads, processes, exchange, sent = (
         float(np.median([block[name] for block in late]))
@@ -29,8 +39,8 @@ def jobs(records: Records) -> str:
             processes of one thread have {show(record["speed"], 2)} of the speed of one process of
             two threads. In the last third of the training an update takes {threads:.0f} ms in
             threads and {processes:.0f} ms in processes, {exchange:.0f} ms of that for {sent:.0f} MB
-            that they exchange.""",
-            records.source("processes"),
+            that they {EXCHANGES[how]}.""",
+            records.source("processes", today),
         ),
         text(
             f"""`{cut["scene"]}` in {cut["count"]} blocks of {cut["voxels"]:,} voxels and

@@ -224,6 +224,7 @@ MUTANTS = [
     of_host("all processes draw the same rays", RAYS, "self._n_rays + begin)", "self._n_rays)", PROCESSES),
     of_host("a flag stands for its tile alone", "torch/processes.py",
             "    holds[1:] |= touched[:-1]\n", "", PROCESSES),
+    of_host("a share of the rows stays as it is", "torch/processes.py", "dim=1)[self.rank]", "dim=1)[0]", PROCESSES),
     of_host("each process's mean is over its own rays", TRAINER,
             "self._seen * (batch.count / self._sampler.count(n_steps))", "self._seen", PROCESSES),
     of_host("an older reach is the distance", PLANNED, "one, distances, self.reach)", "one, distances, one)", WITHOUT_PLAN),

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from datetime import timedelta
+from mmap import mmap
 from typing import Any, NamedTuple, TypeVar
 
 import torch
@@ -16,6 +17,7 @@ from warpnerf_kernels.base.tiles import TILE
 from warpnerf.checks import InputError
 from warpnerf.fields.gradients import Gradients
 from warpnerf.fields.parameters import Parameter
+from warpnerf.runtime.shared_memory import opened, share
 from warpnerf.training.peers import PeerLostError, Peers, Signals
 
 PATIENCE = timedelta(seconds=45)
@@ -31,7 +33,10 @@ T = TypeVar("T")
 
 
 class Processes(Peers):
-    """The processes of this training, by gloo between CPUs and by NCCL between CUDA devices."""
+    """The processes of this training, by gloo between CPUs and by NCCL between CUDA devices.
+
+    Where all can reach the same memory, on the CPU, gradients go through that.
+    """
 
     def __init__(self) -> None:
         """Meet the others, which torchrun's variables name.
@@ -113,7 +118,8 @@ class Processes(Peers):
     def add(self, accumulated: Sequence[tuple[Gradients, Parameter]]) -> None:
         """Sums of touched tiles and of weights; the order of summands depends on ranks alone.
 
-        First all flags, then all sums: each message waits for the slowest process.
+        First all flags, then all sums: each message waits for the slowest process. So no process
+        writes a message before all have read the sums of the update before.
         """
         device = accumulated[0][0].arrays["weights"].device
         if device.is_cuda:
@@ -153,24 +159,63 @@ class Processes(Peers):
         pieces = [(len(t.chosen), t.tiles.shape[1]) for t in tiled]
         sizes = [n * width for n, width in pieces] + [len(t.rest) for t in tiled]
         sizes += [row.shape[1] for row in rows]
-        if self._room is None or len(self._room) < sum(sizes):
-            like = rows[0] if rows else tiled[0].rest
-            self._room = like.new_empty(sum(sizes) * 5 // 4)
-        message = self._room[: sum(sizes)]
-        parts = message.split(sizes)
-        n = len(tiled)
+        room = self._room_for(sum(sizes), rows[0] if rows else tiled[0].rest)
+        own, n = room[self.rank if len(room) > 1 else 0], len(tiled)
+        parts = own.split(sizes)
         for t, piece, part, rest in zip(tiled, pieces, parts, parts[n:], strict=False):
             torch.index_select(t.tiles, 0, t.chosen, out=part.view(piece))
             rest.copy_(t.rest)
         for row, part in zip(rows, parts[2 * n :], strict=True):
             torch.sum(row, dim=0, out=part)
-        self._reduce(message, dist.ReduceOp.SUM)
+        self._sum(room)
+        parts = room[0].split(sizes)
         for t, piece, part, rest in zip(tiled, pieces, parts, parts[n:], strict=False):
             t.tiles.index_copy_(0, t.chosen, part.view(piece))
             t.rest.copy_(rest)
         for row, part in zip(rows, parts[2 * n :], strict=True):
             row.zero_()
             row[0] = part
+
+    def _room_for(self, size: int, like: torch.Tensor) -> torch.Tensor:
+        """[n, size] for messages, of which all have the same size: a row for each process where
+        they share memory, else one."""
+        if self._room is None or self._room.shape[1] < size:
+            self._room, enough = None, size * 5 // 4
+            shared = None if like.is_cuda else self._shared(4 * self.count * enough)
+            if shared is None:
+                self._room = like.new_empty((1, enough))
+            else:
+                self._room = torch.frombuffer(shared, dtype=like.dtype).view(self.count, enough)
+        return self._room[:, :size]
+
+    def _shared(self, n_bytes: int) -> mmap | None:
+        """Memory that all processes have; None, in all of them, where one cannot reach it."""
+        first = self.rank == 0
+        with share(n_bytes) if first else nullcontext((None, None)) as (memory, place):
+            places = [place]
+            with _lost():
+                dist.broadcast_object_list(places, group=self._training)
+            if not first:
+                memory = opened(places[0], n_bytes)
+            all_have = torch.tensor([memory is not None], dtype=torch.uint8)
+            self._reduce(all_have, dist.ReduceOp.MIN)
+        return memory if all_have else None
+
+    def _sum(self, room: torch.Tensor) -> None:
+        """The sum of all messages, into the first row; of rows, each process sums a share."""
+        if len(room) == 1:
+            self._reduce(room[0], dist.ReduceOp.SUM)
+            return
+        self._meet()
+        first, *others = room.tensor_split(self.count, dim=1)[self.rank]
+        for other in others:
+            first += other
+        self._meet()
+
+    def _meet(self) -> None:
+        """Wait until all are here; what each has written before, all can read."""
+        with _lost():
+            dist.barrier(self._training)
 
     def _reduce(self, tensor: torch.Tensor, operation: Any) -> None:
         with _lost():
