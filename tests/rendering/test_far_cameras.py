@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.support.solid_fields import ball_field, camera_at
-from warpnerf.config import Contraction
+from warpnerf.grid_config import Contraction
 from warpnerf.rendering.field import Field, Rendering
 from warpnerf.rendering.rays import camera_rays
 from warpnerf.scenes.cameras.camera import Camera

@@ -18,7 +18,8 @@ from safetensors.numpy import load_file, save_file
 from tests.support.tiny_fields import assert_same_state, tiny_field, tiny_state
 from tests.support.tiny_scenes import camera_at, ring
 from warpnerf.checks import InputError
-from warpnerf.config import Contraction, GridConfig, MarchConfig, TrainConfig
+from warpnerf.config import GridConfig, MarchConfig, TrainConfig
+from warpnerf.grid_config import Contraction
 from warpnerf.model.interface import Model, n_weights
 from warpnerf.model.models import Deferred, PerSample, Rgb, SphericalHarmonics
 from warpnerf.optim_config import OptimConfig

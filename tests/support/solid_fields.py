@@ -9,11 +9,11 @@ import numpy as np
 import warp as wp
 from warpnerf_kernels.base.types import vector
 
-from warpnerf.config import Contraction
 from warpnerf.fields.dense import DenseGrid
 from warpnerf.fields.lattice import Lattice
 from warpnerf.fields.nodes import points_of
 from warpnerf.fields.occupancy import FreeCells
+from warpnerf.grid_config import Contraction
 from warpnerf.model.models import Rgb
 from warpnerf.rendering.field import Field
 from warpnerf.rendering.steps import Steps

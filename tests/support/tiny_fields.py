@@ -9,11 +9,12 @@ import warp as wp
 from warpnerf_kernels.base.types import vector
 
 from tests.support.tiny_scenes import ring, tiny_scene
-from warpnerf.config import Contraction, TrainConfig
+from warpnerf.config import TrainConfig
 from warpnerf.fields.dense import DenseGrid
 from warpnerf.fields.lattice import Lattice
 from warpnerf.fields.occupancy import FreeCells
 from warpnerf.fields.parameters import head_parameters
+from warpnerf.grid_config import Contraction
 from warpnerf.model.interface import Model, n_weights
 from warpnerf.model.models import Rgb
 from warpnerf.rendering.field import Field

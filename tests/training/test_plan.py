@@ -26,8 +26,7 @@ from tests.support.tiny_trainings import (
     without_seconds,
 )
 from tests.support.tiny_trainings import early_growth as early_growth
-from warpnerf import config as configuration
-from warpnerf import optim_config
+from warpnerf import grid_config, optim_config
 from warpnerf.checks import InputError
 from warpnerf.cli.inspect import InspectOptions, inspect_command
 from warpnerf.fields import storage
@@ -111,7 +110,7 @@ def test_it_says_what_is_trained() -> None:
     assert (plan.kind, plan.config.time_limit, plan.looks_first) == ("object", 60.0, False)
     assert plan.background == (1.0, 1.0, 1.0) and not plan.random_background
     assert plan.losses == replace(config.loss, opacity=0.0)
-    assert plan.schedule.grow_at == configuration.GROW_AT["object"]
+    assert plan.schedule.grow_at == grid_config.GROW_AT["object"]
     assert plan.schedule.accumulate_at == optim_config.ACCUMULATE_AT["object"]
     assert plan.schedule.decay == config.optim.decay
     assert [stage.begins for stage in plan.stages] == [0.0, *plan.schedule.grow_at]
@@ -177,7 +176,7 @@ def test_a_resumed_training_goes_by_the_plan_that_it_began_with(
     config = tiny_config(grid=own, optim=wn.OptimConfig(), background="auto")
     whole = stopped_at(STEPS, tmp_path / "whole", config, ball())
     begun = stopped_at(6, tmp_path / "begun", config, ball())
-    monkeypatch.setitem(configuration.GROW_AT, "object", (0.9,))
+    monkeypatch.setitem(grid_config.GROW_AT, "object", (0.9,))
     monkeypatch.setitem(optim_config.ACCUMULATE_AT, "object", ())
     monkeypatch.setitem(planning._COLOURS, "white", (0.5, 0.5, 0.5))
     assert isinstance(whole.plan, TrainingPlan)

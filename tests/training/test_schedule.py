@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from warpnerf.config import GROW_AT, GridConfig, TrainConfig
+from warpnerf.config import GridConfig, TrainConfig
+from warpnerf.grid_config import GROW_AT
 from warpnerf.optim_config import ACCUMULATE_AT, OptimConfig
 from warpnerf.training.schedule import Schedule
 

@@ -25,10 +25,11 @@ from warpnerf_kernels.fields import dense, dense_bound
 from warpnerf_kernels.launch.probe import probe
 
 from warpnerf.checks import InputError
-from warpnerf.config import MAX_VOXELS, Scaling
+from warpnerf.config import Scaling
 from warpnerf.fields.gradients import Gradients
 from warpnerf.fields.lattice import Lattice, grid_struct
 from warpnerf.fields.parameters import Parameter
+from warpnerf.grid_config import MAX_VOXELS
 from warpnerf.model.interface import Model, loader
 from warpnerf.model.storage_kinds import StorageKind
 from warpnerf.optim_config import OptimConfig

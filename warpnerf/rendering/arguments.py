@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from warpnerf.checks import InputError, require_at_least, require_positive, said
-from warpnerf.config import MAX_VOXELS
+from warpnerf.grid_config import MAX_VOXELS
 from warpnerf.model.interface import Model, loader
 from warpnerf.model.models import model_of
 from warpnerf.rendering.steps import MOST_LINEAR, Steps

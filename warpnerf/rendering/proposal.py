@@ -16,12 +16,12 @@ import warp as wp
 from warpnerf_kernels.base.types import real, vec2
 from warpnerf_kernels.launch import propose
 
-from warpnerf.config import Contraction
 from warpnerf.fields.dense import DenseGrid
 from warpnerf.fields.gradients import Gradients
 from warpnerf.fields.lattice import Lattice
 from warpnerf.fields.occupancy import FreeCells
 from warpnerf.fields.parameters import Parameter
+from warpnerf.grid_config import Contraction
 from warpnerf.model.interface import Load, loader
 from warpnerf.model.sampler_kinds import Resampled
 from warpnerf.model.spaces import part_of

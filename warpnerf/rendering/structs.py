@@ -9,9 +9,10 @@ from typing import Any
 import warp as wp
 from warpnerf_kernels.volume import gradscale
 
-from warpnerf.config import Contraction, Jacobian, LossConfig, Scaling
+from warpnerf.config import Jacobian, LossConfig, Scaling
 from warpnerf.fields.occupancy import FreeCells
 from warpnerf.fields.storage import Storage
+from warpnerf.grid_config import Contraction
 from warpnerf.model.interface import Model, loader
 from warpnerf.model.sampler_kinds import CLIPPED, MARCHED, SamplerKind
 from warpnerf.model.spaces import part_of

@@ -17,12 +17,13 @@ import warp as wp
 
 from warpnerf.checked import checked_arguments
 from warpnerf.checks import InputError, require_one_of
-from warpnerf.config import GROW_AT, Contraction, TrainConfig
+from warpnerf.config import TrainConfig
 from warpnerf.config_json import config_to_json
 from warpnerf.fields.lattice import Lattice
 from warpnerf.fields.occupancy import FreeCells
 from warpnerf.fields.parameters import head_parameters
 from warpnerf.fields.storages import class_of
+from warpnerf.grid_config import GROW_AT, Contraction
 from warpnerf.model.interface import Model, n_weights
 from warpnerf.model.models import FORMER_NAMES, MODELS, Rgb
 from warpnerf.model.registry import to_json

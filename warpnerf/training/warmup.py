@@ -15,8 +15,9 @@ from warpnerf_kernels.optim import adam, near_decay
 from warpnerf_kernels.sampling import coverage, occupancy
 from warpnerf_kernels.space import camera
 
-from warpnerf.config import Contraction, Jacobian, LossConfig, Scaling, TrainConfig
+from warpnerf.config import Jacobian, LossConfig, Scaling, TrainConfig
 from warpnerf.fields.storages import class_of
+from warpnerf.grid_config import Contraction
 from warpnerf.model.interface import Model
 from warpnerf.model.sampler_kinds import MARCHED, ProposedDensity, SamplerKind
 from warpnerf.model.spaces import SPACES

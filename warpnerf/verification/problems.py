@@ -7,10 +7,11 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 import warp as wp
 
-from warpnerf.config import Contraction, LossConfig
+from warpnerf.config import LossConfig
 from warpnerf.fields.decoded import Decoded
 from warpnerf.fields.lattice import Lattice
 from warpnerf.fields.storages import class_of
+from warpnerf.grid_config import Contraction
 from warpnerf.model.interface import Model, n_weights
 from warpnerf.model.models import Rgb
 from warpnerf.model.storage_kinds import DENSE, StorageKind

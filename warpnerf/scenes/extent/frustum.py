@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from warpnerf.checks import InputError
-from warpnerf.config import Contraction, TrainConfig
+from warpnerf.config import TrainConfig
+from warpnerf.grid_config import Contraction
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.cameras.undistort import directions
 from warpnerf.scenes.scene import Scene

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warpnerf.config import Contraction
+from warpnerf.grid_config import Contraction
 from warpnerf.model.spaces import SPACES, SpaceKind
 from warpnerf.scenes.cameras.observations import Observations
 from warpnerf.scenes.extent.frustum import Frustum
