@@ -16,9 +16,6 @@ EXCHANGES = {
 
 def jobs(records: Records) -> str:
     record, cut = records["processes"], records["blocks"]
-    how = record["exchange"]
-    named = how == "shared" or "--exchange" in record["machine"]["command"]
-    today = "" if named else f", today with `--exchange {how}`"
     late = record["blocks"][-len(record["blocks"]) // 3 :]
     threads, processes, exchange, sent = (
         float(np.median([block[name] for block in late]))
@@ -39,8 +36,8 @@ def jobs(records: Records) -> str:
             processes of one thread have {show(record["speed"], 2)} of the speed of one process of
             two threads. In the last third of the training an update takes {threads:.0f} ms in
             threads and {processes:.0f} ms in processes, {exchange:.0f} ms of that for {sent:.0f} MB
-            that they {EXCHANGES[how]}.""",
-            records.source("processes", today),
+            that they {EXCHANGES[record["exchange"]]}.""",
+            records.source("processes"),
         ),
         text(
             f"""`{cut["scene"]}` in {cut["count"]} blocks of {cut["voxels"]:,} voxels and

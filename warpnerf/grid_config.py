@@ -94,17 +94,12 @@ class GridConfig:
 
     def __post_init__(self) -> None:
         """Refuse what makes no grid."""
-        if hasattr(self.voxels, "__index__") and int(self.voxels) >= MAX_VOXELS:
-            raise InputError(
-                "grid.voxels must be below 2^31 (1290 x 1290 x 1290), which kernels can count; use "
-                "fewer --voxels."
-            )
-        if isinstance(self.voxels, str) and self.voxels != "auto":
+        if not isinstance(self.voxels, str):
+            self._require_countable(self.voxels)
+        elif self.voxels != "auto":
             raise InputError(
                 f"grid.voxels must be auto or a whole number, not {said(self.voxels)}."
             )
-        if self.voxels != "auto":
-            require_whole("grid.voxels", self.voxels, 8)
         require_one_of("grid.contraction", self.contraction, ("auto", *SPACES))
         require_whole("grid.planes", self.planes, 2)
         if not 0 < self.alpha_init < 1:
@@ -131,6 +126,14 @@ class GridConfig:
             )
         if self.contraction != "auto":
             self.require_planes_used(self.contraction)
+
+    def _require_countable(self, voxels: int) -> None:
+        if hasattr(voxels, "__index__") and voxels >= MAX_VOXELS:
+            raise InputError(
+                "grid.voxels must be below 2^31 (1290 x 1290 x 1290), which kernels can count; use "
+                "fewer --voxels."
+            )
+        require_whole("grid.voxels", voxels, 8)
 
     def require_planes_used(self, contraction: Contraction) -> None:
         """Raise InputError where ``planes``, of NDC depth, is given, but does nothing.

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.kernels.test_seams import loss_of, problem, unscaled
+from tests.kernels.test_seams import loss_and_gradient, loss_of, problem
 from tests.support.expected import assert_close
 from tests.support.kernel_runner import Kernels
 from warpnerf.model.interface import Model
@@ -123,7 +123,7 @@ def test_gradients_of_own_parts(name: str, kernels64: Kernels) -> None:
     h = 2e-5
     for seed in range(4):
         p = problem(model, seed)
-        gradient = unscaled(kernels64, p)[1]
+        gradient = loss_and_gradient(kernels64, p)[1]
         rng = np.random.default_rng(seed)
         found, expected = [], []
         for _ in range(8):

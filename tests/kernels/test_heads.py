@@ -24,7 +24,7 @@ from tests.support.model_problems import (
     oracle_train_both,
     problem_of,
 )
-from tests.support.problems import Problem, unbounded
+from tests.support.problems import Problem, unbounded, unscaled
 from warpnerf.model.interface import Model
 
 CASES = [
@@ -63,11 +63,6 @@ def assert_layers_close(model: Model, value: Any, expected: Any, tolerance: floa
     for layer in layers_of(model, rest):
         layer[...] = 0.0
     assert not rest.any()
-
-
-def unscaled(p: Problem) -> Problem:
-    """The same with a content distance that every sample lies beyond: clamped is none."""
-    return replace(p, content_distance=np.array([1e-200]))
 
 
 @each_case

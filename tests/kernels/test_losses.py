@@ -13,7 +13,7 @@ from tests.support.expected import assert_close
 from tests.support.kernel_runner import Kernels
 from tests.support.loss_problems import LOSSES, oracle_minimised, problem_with
 from tests.support.model_problems import FEATURES, SH, Stale, name_of, problem_of
-from tests.support.problems import N_SEEDS, in_float32
+from tests.support.problems import N_SEEDS, in_float32, unscaled
 from tests.support.small_model import SMALL
 from tests.support.tiny_scenes import ring, tiny_scene
 from tests.support.tiny_trainings import ball
@@ -29,9 +29,6 @@ from warpnerf.training import trainer
 from warpnerf.training.train import train
 from warpnerf.training.trainer import Trainer
 
-FAR = np.array([1e-200])
-"""A content distance with which the scaling is 1 everywhere, so that no kernel without it is
-compiled."""
 each_loss = pytest.mark.parametrize("name", LOSSES)
 
 
@@ -40,8 +37,7 @@ def test_values_and_gradients_against_autograd(name: str, kernels64: Kernels) ->
     for seed in range(N_SEEDS):
         p = problem_with(LOSSES[name], seed)
         if seed < 6:
-            far = replace(p, content_distance=FAR)
-            require_the_same(kernels64.both_train(far, "clamped"), oracle_minimised(p))
+            require_the_same(kernels64.both_train(unscaled(p), "clamped"), oracle_minimised(p))
         found = kernels64.both_train(p, "clamped")
         require_the_same(found, oracle_minimised(p, "clamped"))
         plain = kernels64.train(replace(p, objective=PHOTOMETRIC_ONLY), "clamped")
@@ -59,7 +55,7 @@ def test_distortion_where_colours_are_right(kernels64: Kernels) -> None:
     for seed in range(4):
         p = problem_with(LOSSES["distortion"], seed)
         p = replace(p, target=kernels64.forward(replace(p, objective=PHOTOMETRIC_ONLY)).rgb)
-        p = replace(p, content_distance=FAR)
+        p = unscaled(p)
         assert_close(kernels64.train(p, "clamped")[1], oracle_minimised(p)[1], 1e-7)
 
 
@@ -68,7 +64,7 @@ def test_gradients_against_central_differences(name: str, kernels64: Kernels) ->
     """Of the others weights are constants, which differences do not know."""
     h, found, expected = 2e-5, [], []
     for seed in range(N_SEEDS):
-        p = replace(problem_with(LOSSES[name], seed), content_distance=FAR)
+        p = unscaled(problem_with(LOSSES[name], seed))
         direction = np.random.default_rng(seed).normal(size=p.raw.shape)
         at = {
             k: kernels64.train(replace(p, raw=p.raw + k * h * direction), "clamped")[0].mean()
@@ -118,9 +114,7 @@ def test_losses_with_a_models_own(kernels64: Kernels, on_cpu: None) -> None:
     own = WithLosses(near_two=0.3, together=2.0)
     p = in_float32(problem_with(LOSSES["distortion"], 2, own, n_rays=37))
     gradients = [
-        kernels64.train(
-            replace(p, model=model, objective=objective, content_distance=FAR), "clamped"
-        )[1]
+        kernels64.train(unscaled(replace(p, model=model, objective=objective)), "clamped")[1]
         for model, objective in (
             (own, p.objective),
             (own, PHOTOMETRIC_ONLY),
@@ -184,7 +178,7 @@ def test_the_scaling_multiplies_each_once(form: str, device: str) -> None:
         assert np.array_equal(quarter[0], whole[0])
         assert_close(quarter[1], 0.25 * whole[1], 1e-12 if form == "float64" else 1e-6)
         at_camera = replace(at_one_distance(p, near=0.0), offsets=np.array([0.0]))
-        far = replace(at_camera, content_distance=FAR)
+        far = unscaled(at_camera)
         far = replace(far, steps=replace(far.steps, near=1e-6))
         assert np.abs(kernels.train(far, "clamped")[1]).max() > 1e-3
         assert not kernels.train(at_camera, "clamped")[1].any()
@@ -209,7 +203,7 @@ def test_a_ray_that_meets_hardly_anything_has_a_slope_that_ends(kernels64: Kerne
     for shift in (-9.0, -12.0):
         p = replace(problem_with(LOSSES["opacity"], 0), density_shift=shift)
         assert kernels64.forward(replace(p, objective=PHOTOMETRIC_ONLY)).opacity.max() < 0.01
-        loss, gradient = kernels64.train(replace(p, content_distance=FAR), "clamped")
+        loss, gradient = kernels64.train(unscaled(p), "clamped")
         expected = oracle_minimised(p)
         assert_close(loss, expected[0], 1e-9)
         assert_close(gradient, expected[1], 1e-7)

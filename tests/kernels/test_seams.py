@@ -24,7 +24,15 @@ from tests.support import probe_kernels
 from tests.support.expected import assert_close, directional_differences, oracle
 from tests.support.kernel_runner import Kernels
 from tests.support.model_problems import problem_of
-from tests.support.problems import N_SEEDS, Problem, in_float32, in_frustum, make_problem, unbounded
+from tests.support.problems import (
+    N_SEEDS,
+    Problem,
+    in_float32,
+    in_frustum,
+    make_problem,
+    unbounded,
+    unscaled,
+)
 from tests.support.small_model import SQUARED
 from tests.support.tiny_scenes import ring, tiny_scene
 from warpnerf.checks import InputError
@@ -61,13 +69,13 @@ def problem(model: Model, seed: int) -> Problem:
     return early(masked(p, seed)) if seed % 2 else p
 
 
-def unscaled(kernels: Kernels, p: Problem) -> tuple[Any, Any]:
-    """Without a scaling, by the kernel that has one: it is 1 where all is far away."""
-    return kernels.train(replace(p, content_distance=np.array([1e-200])), "clamped")
+def loss_and_gradient(kernels: Kernels, p: Problem) -> tuple[Any, Any]:
+    """Loss and gradient without a scaling."""
+    return kernels.train(unscaled(p), "clamped")
 
 
 def loss_of(kernels: Kernels, p: Problem) -> float:
-    return float(unscaled(kernels, p)[0].mean())
+    return float(loss_and_gradient(kernels, p)[0].mean())
 
 
 @each_seam
@@ -82,7 +90,7 @@ def require_gradients_of_differences(
     """In random directions; of colours only, where weights count as constants."""
     h = 2e-5
     for seed, p in enumerate(problems):
-        gradient = unscaled(kernels64, p)[1]
+        gradient = loss_and_gradient(kernels64, p)[1]
         rng = np.random.default_rng(seed)
         found, expected = [], []
         for _ in range(12):
@@ -130,7 +138,7 @@ def test_losses_add_up(kernels64: Kernels) -> None:
     p = problem(MODELS["two losses"], 0)
     plain = replace(p, model=model_of("rgb"))
     alone = [replace(p, model=MODELS[name]) for name in ("loss", "loss with sums")]
-    errors = [unscaled(kernels64, q)[0] for q in (plain, *alone, p)]
+    errors = [loss_and_gradient(kernels64, q)[0] for q in (plain, *alone, p)]
     extra = [error - errors[0] for error in errors[1:]]
     assert all((e > 0.0).sum() > 5 for e in extra)
     assert_close(extra[2], extra[0] + extra[1], 1e-12)
@@ -142,7 +150,7 @@ def test_values_of_the_losses(kernels64: Kernels) -> None:
         p = problem(MODELS[name], 0)
         p = replace(p, offsets=np.array([0.5]))
         plain = replace(p, model=model_of("rgb"))
-        found = unscaled(kernels64, p)[0] - unscaled(kernels64, plain)[0]
+        found = loss_and_gradient(kernels64, p)[0] - loss_and_gradient(kernels64, plain)[0]
         assert_close(found, [by_hand(*weights_of(kernels64, p, n)) for n in range(12)], 1e-9)
 
 
@@ -155,7 +163,10 @@ def test_value_of_the_loss_on_samples(kernels64: Kernels) -> None:
         target = torch.tensor(p.target)[:, None].expand_as(seen.colors)
         of_samples = smooth_l1_loss(seen.colors, target, reduction="none", beta=0.3).sum(dim=2)
         expected = 0.5 * (seen.weights * of_samples).sum(dim=1)
-        (found, gradient), (without, other) = unscaled(kernels64, p), unscaled(kernels64, plain)
+        (found, gradient), (without, other) = (
+            loss_and_gradient(kernels64, p),
+            loss_and_gradient(kernels64, plain),
+        )
         assert expected.max() > 0.01
         assert_close(found - without, expected, 1e-9)
         assert np.array_equal(gradient[..., 0], other[..., 0])
@@ -189,9 +200,9 @@ def test_losses_in_a_frustum_are_those_of_distances_in_the_scene(kernels64: Kern
         )
         dt = torch.where(seen.kept, (later - sooner) / (2.0 * h), 0.0)
         expected = 0.7 * distortion_loss(seen.weights, seen.t, dt, 1.3)
-        found = unscaled(kernels64, p)[0] - unscaled(kernels64, plain)[0]
+        found = loss_and_gradient(kernels64, p)[0] - loss_and_gradient(kernels64, plain)[0]
         assert_close(found, expected, 1e-6)
-        exact, rounded = unscaled(kernels64, in_float32(p)), packs.train(in_float32(p))
+        exact, rounded = loss_and_gradient(kernels64, in_float32(p)), packs.train(in_float32(p))
         assert_close(rounded[0], exact[0], 5e-5)
         assert_close(rounded[1], exact[1], 5e-5)
         direction = np.random.default_rng(seed).normal(size=p.raw.shape)
@@ -202,7 +213,7 @@ def test_losses_in_a_frustum_are_those_of_distances_in_the_scene(kernels64: Kern
                 direction[None],
                 h=2e-5,
             )
-            assert_close([np.vdot(direction, unscaled(kernels64, p)[1])], by, 1e-7)
+            assert_close([np.vdot(direction, loss_and_gradient(kernels64, p)[1])], by, 1e-7)
 
 
 def weights_of(kernels: Kernels, p: Problem, ray: int) -> tuple[Any, Any, float]:
@@ -240,7 +251,9 @@ def test_given_distances_of_equal_steps_are_those_of_the_march(kernels64: Kernel
         listed = replace(p, model=AtDistances(edges=edges))
         plain = replace(p, steps=replace(p.steps, far=edges[-1]))
         assert_close(kernels64.forward(listed).rgb, kernels64.forward(plain).rgb, 1e-12)
-        assert_close(unscaled(kernels64, listed)[1], unscaled(kernels64, plain)[1], 1e-11)
+        assert_close(
+            loss_and_gradient(kernels64, listed)[1], loss_and_gradient(kernels64, plain)[1], 1e-11
+        )
 
 
 def flat_scene() -> Scene:
@@ -330,7 +343,12 @@ def test_gradients_in_another_space(kernels64: Kernels) -> None:
     require_gradients_of_differences(problems, kernels64)
     require_gradients_in_float32(problems, kernels64)
     for p, other in zip(problems, linf, strict=True):
-        assert np.abs(unscaled(kernels64, p)[1] - unscaled(kernels64, other)[1]).max() > 1e-4
+        assert (
+            np.abs(
+                loss_and_gradient(kernels64, p)[1] - loss_and_gradient(kernels64, other)[1]
+            ).max()
+            > 1e-4
+        )
 
 
 def test_training_in_another_space(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -108,6 +108,12 @@ def unbounded(problem: Problem, contraction: str, border: float) -> Problem:
     return replace(problem, contraction=contraction, border=border, steps=steps)
 
 
+def unscaled(p: Problem) -> Problem:
+    """The same with a content distance that every sample lies beyond: there the clamped scaling is
+    1, and no kernel without a scaling has to be compiled."""
+    return replace(p, content_distance=np.array([1e-200]))
+
+
 def in_float32(p: Problem) -> Problem:
     """The same with numbers that float32 holds, so that only arithmetic can differ."""
     if p.frustum is not None:
