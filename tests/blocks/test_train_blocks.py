@@ -73,7 +73,7 @@ def test_blocks_are_one_scene(trained: Path, tmp_path: Path) -> None:
     assert all(np.abs(seen[0] - alone).max() > 1e-5 for alone in seen[1:])
 
 
-@pytest.mark.slow  # exports for seconds
+@pytest.mark.ci  # exports for seconds
 def test_exports_are_the_cores_joined(trained: Path, tmp_path: Path) -> None:
     """A ball in the middle of two blocks, which both know, is written once."""
     shutil.copytree(trained, tmp_path / "ball")
@@ -186,7 +186,7 @@ def until(what: Callable[[], bool], process: subprocess.Popen[str]) -> None:
         time.sleep(0.05)
 
 
-@pytest.mark.slow  # trains in processes for seconds
+@pytest.mark.ci  # trains in processes for seconds
 def test_a_lost_block_is_taken_over_and_a_signal_to_all_saves_it(tmp_path: Path) -> None:
     """As a scheduler stops a job: a training is asked twice at once, by it and by its parent."""
     blocks = BlockFolder.read(cut(tmp_path / "room"))

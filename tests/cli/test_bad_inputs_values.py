@@ -163,6 +163,7 @@ def test_box(box: tuple[np.ndarray, np.ndarray]) -> None:
             render_rays(torch.zeros(2, 2, 2, 4), *rays, box, step=0.1)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("march", "message"),
     [
@@ -347,7 +348,7 @@ def looked_at(folder: Path, cache: Path) -> Outcome:
     return outcome
 
 
-@pytest.mark.slow  # compiles what another cache has
+@pytest.mark.ci  # compiles what another cache has
 def test_70_kernel_cache_unwritable(tmp_path: Path) -> None:
     assert_trained(train(make_scene(tmp_path), folder=tmp_path))
     cache = tmp_path / "cache"
@@ -356,7 +357,7 @@ def test_70_kernel_cache_unwritable(tmp_path: Path) -> None:
     assert not said.err
 
 
-@pytest.mark.slow  # as the one before, which is about the same fallback
+@pytest.mark.ci  # as the one before, which is about the same fallback
 def test_70_read_only_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("WARP_CACHE_PATH", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)
@@ -365,7 +366,7 @@ def test_70_read_only_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     assert_trained(assert_fell_back(outcome, "/proc/self/.cache"))
 
 
-@pytest.mark.slow  # compiles what another cache has
+@pytest.mark.ci  # compiles what another cache has
 def test_70_damaged_cached_kernel(tmp_path: Path) -> None:
     assert_trained(train(make_scene(tmp_path), folder=tmp_path))
     cache = tmp_path / "run" / "cache"

@@ -27,7 +27,7 @@ def black_scene(folder: Path) -> Path:
     return scene
 
 
-@pytest.mark.slow  # a training of seconds
+@pytest.mark.ci  # a training of seconds
 def test_the_command_says_that_nothing_was_found(tmp_path: Path) -> None:
     scene = black_scene(tmp_path)
     done = command("train", scene, "--output", "run", *FEW, folder=tmp_path, limit=None)

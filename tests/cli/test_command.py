@@ -238,6 +238,7 @@ def test_a_run_is_named_by_scene_and_time(tmp_path: Path) -> None:
     assert f"training into runs/{folder.name}\nreading" in done.stdout
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(("bad_step", "kept"), [(1, "Nothing was saved"), (4, "Step 3 is saved")])
 def test_what_is_not_finite_ends_the_run(
     tmp_path: Path,

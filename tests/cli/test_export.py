@@ -50,6 +50,7 @@ def contents(folder: Path) -> dict[Path, bytes]:
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("ending", [e for e in FORMATS if e not in (".html", "")])
 def test_every_ending_becomes_a_file(
     run_folder: Path, tmp_path: Path, ending: str, capsys: pytest.CaptureFixture[str]
@@ -66,6 +67,7 @@ def test_every_ending_becomes_a_file(
     assert "10 of 10 training cameras" in said
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("k1", [0.0, 0.01])
 def test_lenses_that_3dgs_does_not_read_are_said(
     run_folder: Path, tmp_path: Path, k1: float, capsys: pytest.CaptureFixture[str]
@@ -130,6 +132,7 @@ def test_bad_input_is_refused_and_nothing_is_written(
     assert [path.name for path in tmp_path.iterdir()] == ["folder.ply"]
 
 
+@pytest.mark.ci
 def test_several_files_are_written_in_one_pass(
     run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -158,6 +158,7 @@ def test_without_viser_nothing_is_begun(
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.ci
 def test_a_training_is_looked_at_and_stopped(run_folder: Path, tmp_path: Path) -> None:
     """With a page that looks: Ctrl-C saves, and what is resumed ends as it does without a page."""
     scene = run_folder.parent / "scene"

@@ -21,6 +21,7 @@ from warpnerf.training.trainer import Trainer
 from warpnerf.training.warmup import rendering_kernels, training_kernels, warm_up
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("contraction", "scaling", "model"),
     [

@@ -172,6 +172,7 @@ AFTER = {
 NEEDS = {"docs/python.md": ("av",), "docs/torch.md": ("torch",), "docs/jax.md": ("jax",)}
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("document", PYTHON)
 def test_python_runs(document: str, small: None, capsys: pytest.CaptureFixture[str]) -> None:
     """All blocks of a document, one after another, with the names of those before."""
@@ -326,7 +327,7 @@ def prepare(folder: Path) -> None:
     (folder / "colmap_project" / "transforms.json").unlink()
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_the_commands_for_ones_own_photographs_run(tmp_path: Path) -> None:
     """All commands of README.md on scenes with poses, in their order, each training shortened; the
     viewer serves until it is stopped, and tests/viewer has its own."""

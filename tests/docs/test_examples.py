@@ -16,6 +16,8 @@ from tests.support.expected import assert_close
 from tests.support.kernel_runner import Kernels
 from warpnerf.model.interface import Model
 
+pytestmark = pytest.mark.ci
+
 FOLDER = Path(__file__).parents[2] / "examples"
 sys.path.insert(0, str(FOLDER))
 SMALL = ("builtin:room-sparse", "--downscale", "8")

@@ -98,7 +98,7 @@ def test_notebooks_are_plain_python() -> None:
             compile(cell, notebook.name, "exec")
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_runs(notebook: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As it stands, cell by cell."""

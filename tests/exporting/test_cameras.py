@@ -62,6 +62,7 @@ def assert_same(read: Scene, scene: Scene) -> None:
         assert view.mask is None or wanted.mask is not None or view.mask.all()
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     "lens",
     [

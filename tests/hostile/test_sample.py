@@ -77,6 +77,7 @@ def test_documents_are_mutated_alike_by_one_seed() -> None:
     assert len(JSON) > 30
 
 
+@pytest.mark.ci
 def test_a_sample_of_all_families() -> None:
     """Each ends in success or in one sentence."""
     with one_at_a_time("commands"):

@@ -24,6 +24,7 @@ def compiled(module: wp.Module, folder: Path) -> str:
     return "".join(path.read_text() for path in folder.glob("*.ptx"))
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("name", ["float32", pytest.param("float64", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("model", "contractions"),
@@ -75,6 +76,7 @@ def test_every_kernel_compiles_for_cuda(
         assert ".entry" in compiled(module, tmp_path / str(number))
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("model", "contraction"),
     [(SMALL, "linf"), pytest.param(Rgb(), "ndc", marks=pytest.mark.slow)],

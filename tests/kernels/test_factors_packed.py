@@ -53,6 +53,7 @@ def gradient(
     return gradient_of(trainer, replace(storage, kind=kind))
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(("name", "contraction"), CASES)
 def test_packs_against_the_plain_form(name: str, contraction: str) -> None:
     packed, plain = (gradient(MODELS[name], k, 1, contraction) for k in (VM, Plain()))

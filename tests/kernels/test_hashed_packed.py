@@ -60,6 +60,7 @@ def gradient(
     return gradient_of(trainer, replace(storage, kind=read_as))
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(("name", "contraction"), CASES)
 def test_packs_against_the_plain_form(name: str, contraction: str) -> None:
     model = MODELS[name]

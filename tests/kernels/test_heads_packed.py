@@ -58,6 +58,7 @@ def assert_none_in_padding(model: Model, values: Any) -> None:
     assert not values[..., 1 + model.n_features :].any()
 
 
+@pytest.mark.ci
 @each_model
 def test_training_launch_against_float64(model: Model) -> None:
     """In batches that are not full: 16 and 21 rays, of one worker; 37 of several."""

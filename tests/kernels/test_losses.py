@@ -304,6 +304,7 @@ def config_of(losses: LossConfig, **changes: Any) -> TrainConfig:
     )
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("name", ["squared", pytest.param("huber", marks=pytest.mark.slow), "all"])
 def test_training(name: str, monkeypatch: pytest.MonkeyPatch, device: str) -> None:
     """The loss falls, and is the same again; PSNR is that of the squared error."""

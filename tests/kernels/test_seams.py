@@ -109,6 +109,7 @@ def require_gradients_of_differences(
         assert_close(found, expected, 1e-7)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     "model",
     [
@@ -264,6 +265,7 @@ def flat_scene() -> Scene:
     return scene
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("name", ["head", "two losses", "loss on samples", "sampler"])
 def test_training(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trainer, "REPORT_EVERY", 1)
@@ -351,6 +353,7 @@ def test_gradients_in_another_space(kernels64: Kernels) -> None:
         )
 
 
+@pytest.mark.ci
 def test_training_in_another_space(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """By its name: it learns, and files hold it; who does not know it is told."""
     monkeypatch.setattr(trainer, "REPORT_EVERY", 1)

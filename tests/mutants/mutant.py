@@ -30,7 +30,7 @@ class Mutant:
 
     @property
     def marks(self) -> str:
-        """Which tests may notice, as pytest selects them: of the host, those that always run."""
+        """Which tests may notice, as pytest selects them: of the host, those that CI runs."""
         return "" if self.root == KERNELS else "not slow"
 
     def apply(self, folder: Path) -> None:

@@ -42,9 +42,9 @@ def test_each_mutant_finds_its_text(mutants: tuple, tmp_path: Path) -> None:
             assert f"def {test.partition('[')[0]}(" in (HERE / file).read_text(), mutant.name
 
 
-@pytest.mark.slow  # collects all tests
+@pytest.mark.ci  # collects all tests
 def test_each_mutant_names_tests_that_there_are(mutants: tuple) -> None:
-    """Also by the parameters in brackets, and where the host's are not slow."""
+    """Also by the parameters in brackets, and where the host's are those that CI runs."""
     collect = [sys.executable, "-m", "pytest", "--collect-only", "-q", "-n0"]
     for marks in ("", "not slow"):
         done = subprocess.run(
@@ -57,7 +57,7 @@ def test_each_mutant_names_tests_that_there_are(mutants: tuple) -> None:
         assert asked and asked <= known, sorted(asked - known)
 
 
-@pytest.mark.slow  # some thirty runs of pytest
+@pytest.mark.ci  # some thirty runs of pytest
 @pytest.mark.timeout(3600)
 def test_mutants_of_the_host_are_noticed() -> None:
     """Every fifteenth; all by ``python tests/mutants warpnerf/``, in more than half an hour."""

@@ -144,7 +144,7 @@ def test_a_file_that_may_not_be_read_is_not_called_damaged(
     assert not isinstance(error.value, DamagedFileError)
 
 
-@pytest.mark.slow  # a training of seconds; test_saves.py has every call that may fail
+@pytest.mark.ci  # a training of seconds; test_saves.py has every call that may fail
 @pytest.mark.skipif(sys.platform == "win32", reason="no limits of a process there")
 def test_71_disk_full_while_training(tmp_path: Path) -> None:
     """A file of the grid before it grows fits, one of the grid after that does not."""

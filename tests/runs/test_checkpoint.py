@@ -50,6 +50,7 @@ def rewrite(path: Path, header: Any = None, **tensors: np.ndarray) -> None:
 MODELS = [Rgb(), SphericalHarmonics(degree=1), Deferred(), PerSample(width=16, hidden_layers=1)]
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("contraction", "model"),
     [*((c, Rgb()) for c in ("none", "linf", "l2")), *(("none", model) for model in MODELS[1:])],

@@ -63,6 +63,7 @@ def test_a_full_disk_at_any_call_costs_nothing_that_was_saved(tmp_path: Path) ->
         require_old_or_new(run.folder, 4, 4)
 
 
+@pytest.mark.ci
 def test_killed_at_any_call_an_old_or_the_new_checkpoint_is_whole(tmp_path: Path) -> None:
     run, state = run_with(tmp_path, 1, 2), state_of(3)
     n_calls = len(calls_of(lambda: run.save_checkpoint(state)))
@@ -88,6 +89,7 @@ def test_killed_at_any_call_an_old_or_the_new_checkpoint_is_whole(tmp_path: Path
     assert set(outcomes) == {False, True}
 
 
+@pytest.mark.ci
 def test_killed_while_it_finishes_the_last_checkpoint_or_the_field_is_whole(tmp_path: Path) -> None:
     state = state_of(2)
     values = state.field.storage.values.numpy()
@@ -166,21 +168,13 @@ def whole_steps(folder: Path) -> set[int]:
     return steps
 
 
-@pytest.mark.parametrize(
-    ("finished", "every"),
-    [
-        (False, 3),
-        pytest.param(False, 1, marks=pytest.mark.slow),
-        pytest.param(True, 1, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.ci
+@pytest.mark.parametrize("finished", [False, True])
 def test_killed_while_replacing_a_run_one_of_the_two_is_whole(
-    tmp_path: Path, finished: bool, every: int
+    tmp_path: Path, finished: bool
 ) -> None:
-    """Up to the first checkpoint of the new run, the old one is in the folder or in previous/.
-
-    Killed at each call, or at every third one.
-    """
+    """Killed at any call up to the first checkpoint of the new run, the old one is in the folder or
+    in previous/."""
 
     def old_run(name: str) -> Path:
         run = run_with(tmp_path / name, 8, 9)
@@ -196,7 +190,7 @@ def test_killed_while_replacing_a_run_one_of_the_two_is_whole(
     replaced(old_run("first"), None)  # which may write what later ones find
     counted = old_run("counted")
     n_calls = len(calls_of(lambda: replaced(counted, None)))
-    for at in range(1, n_calls + 1, every):
+    for at in range(1, n_calls + 1):
         folder = old_run(f"run{at}")
         assert in_child(lambda folder=folder, at=at: replaced(folder, at)) == KILLED
         assert whole_steps(folder) & {1, 9}

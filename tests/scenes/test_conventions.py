@@ -113,6 +113,7 @@ def test_poses_that_fit_stay(room: list[View], wall: list[View]) -> None:
         assert all(a is b for a, b in zip(found, views, strict=True))
 
 
+@pytest.mark.ci
 @pytest.mark.usefixtures("few_references")
 @pytest.mark.parametrize("name", WRITTEN)
 def test_poses_in_other_axes_are_read_as_the_photographs_show(name: str, room: list[View]) -> None:

@@ -135,6 +135,7 @@ def test_what_is_behind_the_scene_is_what_is_asked_for(
             np.testing.assert_allclose(drawn, [expected] * len(drawn), atol=1e-6)
 
 
+@pytest.mark.ci
 def test_in_folded_space_all_pixels_are_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Also where the box holds next to nothing: rays see what is behind it."""
     monkeypatch.setattr(training, "FIRST_LOOK", 0)

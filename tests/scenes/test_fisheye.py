@@ -83,6 +83,7 @@ def test_it_trains_as_well_as_a_lens_without_distortion(
     assert psnr(mistaken, mistaken, device) < with_it - 1.0
 
 
+@pytest.mark.ci
 def test_it_is_inspected_drawn_and_filmed(rooms: tuple[Scene, Scene], tmp_path: Path) -> None:
     _, bent = rooms
     frames = []

@@ -66,6 +66,7 @@ def test_the_command_passes_it_on(pools: list[int], tmp_path: Path) -> None:
     assert pools == [4]
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     "arguments", [["export", "RUN", "OUTPUT.ply"], ["render", "RUN", "--stills", "test"]]
 )

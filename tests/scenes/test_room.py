@@ -82,6 +82,7 @@ def clearance(points: np.ndarray, solids: tuple[Box, ...]) -> np.ndarray:
     return np.min(distances, axis=0)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("kind", "called", "first", "n_train"),
     [

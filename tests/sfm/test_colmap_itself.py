@@ -24,10 +24,13 @@ from warpnerf.scenes.scene import Scene
 from warpnerf.sfm.config import PoseConfig
 from warpnerf.sfm.pose import pose
 
-pytestmark = pytest.mark.skipif(
-    importlib.util.find_spec("pycolmap") is None,
-    reason='needs pycolmap: pip install "warpnerf[sfm]"',
-)
+pytestmark = [
+    pytest.mark.ci,
+    pytest.mark.skipif(
+        importlib.util.find_spec("pycolmap") is None,
+        reason='needs pycolmap: pip install "warpnerf[sfm]"',
+    ),
+]
 
 KILLED = """
 import subprocess, warpnerf.sfm.worker

@@ -104,6 +104,7 @@ SHORT = wn.TrainConfig(
 )
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("poses", "guessed"),
     [

@@ -57,6 +57,7 @@ def learned(trainer: Trainer) -> np.ndarray:
     return np.concatenate([p.values.numpy().ravel() for p in trainer.parameters()])
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("threads", [1, 2, 3])
 def test_the_same_seed_gives_the_same_bits(threads: int, on_cpu: None) -> None:
     found = []

@@ -37,6 +37,7 @@ from warpnerf.training.train import train
 from warpnerf.training.trainer import Trainer
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("model", "threads", "unbounded"),
     [

@@ -127,6 +127,7 @@ passed: set[tuple[str, ...]] = set()
 """Words of checks that do not fail where nothing is spoilt."""
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("method", "spoil", "words"),
     [
@@ -189,6 +190,7 @@ def test_training_that_differs_fails(
     assert not capsys.readouterr().out
 
 
+@pytest.mark.ci
 def test_a_check_that_cannot_run_fails_and_says_why(
     monkeypatch: pytest.MonkeyPatch, device: str
 ) -> None:

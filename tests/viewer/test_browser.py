@@ -30,6 +30,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 from chromium import browser, missing
 
 pytestmark = [
+    pytest.mark.ci,
     pytest.mark.skipif(missing() is not None, reason=f"the page is not tested: {missing()}"),
     pytest.mark.timeout(240),
 ]
