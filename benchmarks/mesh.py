@@ -22,12 +22,12 @@ import numpy as np
 from measuring import machine, options, plain_training, write_record
 from PIL import Image
 from scipy.spatial import cKDTree
+from solids_truth import distances_to
 
 import warpnerf as wn
 from warpnerf.exporting import surface
 from warpnerf.exporting.splats import splats_ply
 from warpnerf.scenes.builtin.room import room_solids
-from warpnerf.scenes.builtin.solids import Ball, Cylinder
 
 sys.path.append(str(Path(__file__).parent.parent))
 from tests.reference.splats import draw_splats, read_splats
@@ -37,26 +37,6 @@ OPACITIES = (0.1, 0.15, 0.2, 0.3, 0.5)
 
 NEAR = 0.05
 """Metres that count as right."""
-
-
-def distance_to_room(points: np.ndarray) -> np.ndarray:
-    """From points [n, 3] to the nearest surface of the room, [n] metres."""
-    nearest = np.full(len(points), np.inf)
-    for solid in room_solids():
-        low, high = np.array(solid.lo), np.array(solid.hi)
-        away, half = points - 0.5 * (low + high), 0.5 * (high - low)
-        if isinstance(solid, Ball):
-            signed = np.linalg.norm(away, axis=1) - half[0]
-        else:
-            if isinstance(solid, Cylinder):
-                across = np.linalg.norm(away[:, :2], axis=1) - half[0]
-                outside = np.stack([across, np.abs(away[:, 2]) - half[2]], axis=1)
-            else:
-                outside = np.abs(away) - half
-            signed = np.linalg.norm(np.maximum(outside, 0.0), axis=1)
-            signed += np.minimum(outside.max(axis=1), 0.0)
-        nearest = np.minimum(nearest, np.abs(signed))
-    return nearest
 
 
 def photographed(scene: wn.Scene) -> tuple[np.ndarray, np.ndarray]:
@@ -86,7 +66,7 @@ def measure_mesh(
     level = -np.log1p(-opacity) / edge
     mesh = wn.extract_surface(field, visible, unseen=unseen, level=level)
     points, colours = truth
-    to_truth = distance_to_room(mesh.points.astype(np.float64))
+    to_truth, _ = distances_to(mesh.points.astype(np.float64), list(room_solids()))
     to_mesh, _ = cKDTree(mesh.points).query(points[::7])
     apart, nearest = cKDTree(points).query(mesh.points)
     close = apart < 0.02

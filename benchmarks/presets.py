@@ -31,7 +31,7 @@ from warpnerf.checks import InputError
 from warpnerf.config import TrainConfig
 from warpnerf.config_json import config_to_json
 from warpnerf.evaluation.metrics import psnr
-from warpnerf.model import storage_kinds
+from warpnerf.model import sampler_kinds, storage_kinds
 from warpnerf.model.models import model_of
 from warpnerf.presets import DEFAULT_PRESETS, PRESETS
 from warpnerf.runtime.parallel import Workers
@@ -203,6 +203,8 @@ def _changed(config: Any, path: Sequence[str], value: Any) -> Any:
         value = model_of(value)
     elif name == "field" and isinstance(value, dict):  # with options that go together only
         value = storage_kinds.from_json(value)
+    elif name == "sampler" and isinstance(value, dict):
+        value = sampler_kinds.from_json(value)
     return replace(config, **{name: value})
 
 

@@ -1,0 +1,107 @@
+"""Meshes of the object of object_scan.py, compared with its surfaces, which are known exactly.
+
+    python benchmarks/object_scan.py crane
+    warpnerf train crane --output runs/crane && warpnerf export runs/crane crane.ply
+    python benchmarks/object_mesh.py crane.ply --edge 0.0125
+
+Chamfer distance: the mean of the distance from points spread over the mesh to the nearest true
+surface, and of that from what the training cameras see, exactly traced, to the nearest point of the
+mesh. The second one by itself for thin parts: bars and ropes of at most THIN across. Meshes may be
+of other versions, or programs, in the units and axes of the capture. Prints a table; writes
+benchmarks/results/object_mesh_<device>.json. Needs scipy and trimesh.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from measuring import machine, options, write_record
+from object_scan import ANGLE_X, AWAY, RADIUS, TURN, poses, solids, tracer
+from scipy.spatial import cKDTree
+from solids_truth import distances_to
+
+from warpnerf.scenes.cameras.camera import Camera
+
+THIN = 0.03
+"""Scene units across."""
+POINTS = 1_000_000
+"""That are spread over a mesh; a hundredth of a scene unit apart or less."""
+SEEN_SIZE = 160
+"""Width and height of the pictures that say what cameras see, pixels."""
+CAMERAS = 100
+"""Those of the training views of object_scan.py."""
+
+
+def main() -> None:
+    parser = options(__doc__ or "")
+    parser.add_argument("meshes", nargs="+", type=Path, help="files that trimesh reads")
+    parser.add_argument("--edge", type=float, help="of a voxel, scene units, to compare with")
+    arguments = parser.parse_args()
+    crane = list(solids())[1:]  # the first is the room around it
+    truth, rows = seen_points(), []
+    thin = np.array([min(np.subtract(s.hi, s.lo)) <= THIN for s in crane])
+    is_thin = thin[distances_to(truth, crane)[1]]
+    print("  mesh->truth  truth->mesh  chamfer  thin: mean  median  90 %   [thousandths of a unit]")
+    for path in arguments.meshes:
+        mesh = trimesh.load(path, force="mesh")
+        points, _ = trimesh.sample.sample_surface(mesh, POINTS, seed=0)
+        points = np.asarray(points) @ turned()  # the inverse, of rows
+        to_truth = distances_to(points, crane)[0]
+        to_mesh, _ = cKDTree(points).query(truth)
+        row = {
+            "mesh": path.name,
+            "faces": len(mesh.faces),
+            "mesh_to_truth": float(to_truth.mean()),
+            "truth_to_mesh": float(to_mesh.mean()),
+            "chamfer": float(0.5 * (to_truth.mean() + to_mesh.mean())),
+            "thin_mean": float(to_mesh[is_thin].mean()),
+            "thin_median": float(np.median(to_mesh[is_thin])),
+            "thin_90": float(np.quantile(to_mesh[is_thin], 0.9)),
+        }
+        if arguments.edge:
+            within = to_mesh[is_thin] <= 0.5 * arguments.edge
+            row["thin_within_half_a_voxel"] = float(within.mean())
+        rows.append(row)
+        shown = [row[key] for key in ("mesh_to_truth", "truth_to_mesh", "chamfer")]
+        shown += [row[key] for key in ("thin_mean", "thin_median", "thin_90")]
+        print("".join(f"{1e3 * value:11.2f}" for value in shown) + f"   {path.name}", flush=True)
+        if arguments.edge:
+            print(f"    thin parts within half a voxel: {row['thin_within_half_a_voxel']:.1%}")
+    record = {"machine": machine(arguments.device, 1), "edge": arguments.edge, "meshes": rows}
+    print(f"wrote {write_record(record, arguments.output, 'object_mesh', arguments.device)}")
+
+
+def turned() -> np.ndarray:
+    """The matrix by which object_scan.py turns the object: of a point p, turned() @ p."""
+    cosine, sine = np.cos(TURN), np.sin(TURN)
+    return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+
+
+def seen_points() -> np.ndarray:
+    """What the training cameras see of the object before it is turned, [n, 3] scene units."""
+    focal = 0.5 * SEEN_SIZE / np.tan(0.5 * ANGLE_X)
+    points = []
+    for c2w in poses(CAMERAS, 0):
+        middle = 0.5 * SEEN_SIZE
+        camera = Camera(
+            width=SEEN_SIZE,
+            height=SEEN_SIZE,
+            fx=focal,
+            fy=focal,
+            cx=middle,
+            cy=middle,
+            c2w=c2w,
+        )
+        depth = tracer().depth(camera)
+        v, u = np.mgrid[:SEEN_SIZE, :SEEN_SIZE] + 0.5
+        local = np.stack([(u - middle) / focal, (middle - v) / focal, -np.ones_like(u)], axis=-1)
+        rays = local / np.linalg.norm(local, axis=-1, keepdims=True) @ camera.c2w[:, :3].T
+        is_object = depth < AWAY + RADIUS
+        points.append((camera.position + rays * depth[..., None])[is_object])
+    return np.concatenate(points)
+
+
+if __name__ == "__main__":
+    main()
