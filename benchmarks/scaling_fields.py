@@ -61,11 +61,10 @@ def main() -> None:
     settings = {name: getattr(args, name) for name in ("steps", "rays", "voxels", "downscale")}
     output = args.output or RESULTS / f"scaling_fields_{args.device.replace(':', '')}.json"
     rows = done_before(output, settings)
-    n = len(args.scenes) * len(args.fields) * len(args.seeds) * len(SCALINGS)
+    n_asked = len(args.scenes) * len(args.fields) * len(args.seeds) * len(SCALINGS)
     scenes = {name: wn.load_scene(path_of(name), downscale=args.downscale) for name in args.scenes}
-    for seed, (name, scene), field, scaling in product(
-        args.seeds, scenes.items(), args.fields, SCALINGS
-    ):
+    asked = product(args.seeds, scenes.items(), args.fields, SCALINGS)
+    for number, (seed, (name, scene), field, scaling) in enumerate(asked, start=1):
         key = {"scene": name, "field": field, "scaling": scaling, "seed": seed}
         if any(key.items() <= row.items() for row in rows):
             continue
@@ -79,7 +78,7 @@ def main() -> None:
         }
         write_record(record, output, "scaling_fields", args.device)
         said = f"{name}, {field}, {scaling}, seed {seed}: {rows[-1]['psnr']:.2f} dB"
-        print(f"[{len(rows)} of {n}] {said}", flush=True)
+        print(f"[{number} of {n_asked}] {said}", flush=True)
     for name in args.scenes:
         print(f"\n{name}")
         for line in table([row for row in rows if row["scene"] == name]):

@@ -110,8 +110,8 @@ class TrainConfig:
     content_distance: float | Literal["auto", "per-camera"] = "auto"
     """D: where gradients reach full strength, scene units; per-camera: for each camera's rays the
     distance of what it sees, as points or short trainings tell; auto: where that is known, the
-    geometric mean of it and of the scene's estimate, or down to half of that where cameras look
-    around and many see the same (``training.extent.content_distances``), else the scene's."""
+    geometric mean of it and of the scene's estimate, or less where many cameras see the same
+    (``training.extent.content_distances``), else the scene's."""
     coarse_steps: int = 200
     """Steps, at most, of a short training on a small grid, with clamped scaling, that finds the
     content distance of captures without points, but for objects with alpha; two of them find the

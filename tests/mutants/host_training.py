@@ -20,7 +20,7 @@ CLIPPED = "scenes/test_extent.py::test_near_and_far_that_leave_no_sample_are_ref
 BEHIND = "scenes/test_extent.py::test_what_is_behind_the_scene_is_what_is_asked_for"
 ALL_DRAWN = "scenes/test_extent.py::test_in_folded_space_all_pixels_are_drawn"
 BETWEEN = "scenes/test_points.py::test_by_default_they_lie_between_each_camera_s_and_the_scene_s"
-FEWER = "scenes/test_overlap.py::test_where_many_look_around_and_see_the_same_gradients_are_scaled_less_far"
+FEWER = "scenes/test_overlap.py::test_where_many_see_the_same_gradients_are_scaled_less_far"
 AUTO_KEPT = "fields/test_factors_training.py::test_auto_stays_what_it_was_when_a_training_began"
 CAME_AFTER = (
     "reports/test_compare.py::test_options_that_came_after_an_experiment_began_have_their_defaults"
@@ -201,7 +201,10 @@ MUTANTS = [
     of_host("far is bounded in contracted space", EXTENT, "        begin = 0.0  # space", "        pass  # space", CLIPPED),
     of_host("each camera's own", EXTENT, "[share * math.sqrt(one * float(own)) for own in each]",
             "[share * float(own) for own in each]", BETWEEN),
-    of_host("all the way for many", EXTENT, "LEAST_SHARE = 0.5", "LEAST_SHARE = 0.7", FEWER),
+    of_host("all the way for many", EXTENT, "LEAST_SHARE_AROUND = 0.5, 0.7",
+            "LEAST_SHARE_AROUND = 0.7, 0.7", FEWER),
+    of_host("as little far around one thing", EXTENT, "LEAST_SHARE_AROUND = 0.5, 0.7",
+            "LEAST_SHARE_AROUND = 0.5, 0.5", FEWER),
     of_host("less far for few", EXTENT, "FEW_VIEWS = 7.0", "FEW_VIEWS = 5.0", FEWER),
     # schedule.py
     of_host("grows late", SCHEDULE, "fraction >= at for at in self.grow_at", "fraction > at + 0.1 for at in self.grow_at",

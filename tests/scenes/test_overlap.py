@@ -64,8 +64,8 @@ def in_circle(n_cameras: int, turned: float) -> Scene:
     )
 
 
-def test_where_many_look_around_and_see_the_same_gradients_are_scaled_less_far() -> None:
-    """By how many do, and never less than half as far; all the way where they look at one thing."""
+def test_where_many_see_the_same_gradients_are_scaled_less_far() -> None:
+    """By how many do, and never less than half as far; than 0.7 where they look at one thing."""
     auto = TrainConfig(model="rgb", grid=GridConfig(voxels=8**3))
     shares = []
     for n_cameras in (8, 50, 200):
@@ -76,13 +76,16 @@ def test_where_many_look_around_and_see_the_same_gradients_are_scaled_less_far()
         shares.append(each[0] / 4.0)
         assert one == 4.0 and each == [each[0]] * n_cameras
         assert shares[-1] == pytest.approx(np.clip(7.0 / seen_by, 0.5, 1.0))
-        unknown = replace(scene, content_distances=None)
-        for given in (in_circle(n_cameras, 0.0), unknown):
-            assert content_distances(given, auto)[1] == [4.0] * n_cameras
+        one_thing, unknown = in_circle(n_cameras, 0.0), replace(scene, content_distances=None)
+        each = content_distances(one_thing, auto)[1]
+        seen_by = views_of_content(one_thing.training_cameras, np.full(n_cameras, 4.0))
+        assert each == pytest.approx([4.0 * np.clip(7.0 / seen_by, 0.7, 1.0)] * n_cameras)
+        assert content_distances(unknown, auto)[1] == [4.0] * n_cameras
         own = replace(auto, content_distance="per-camera")
         assert content_distances(scene, own)[1] == [4.0] * n_cameras
         assert content_distances(scene, replace(auto, content_distance=3.0))[1] == [3.0] * n_cameras
     assert shares[0] == 1.0 and 0.5 < shares[1] < 1.0 and shares[-1] == 0.5
+    assert each[0] == pytest.approx(0.7 * 4.0)
 
 
 def test_overlap_along_rays_of_two_cameras_side_by_side() -> None:

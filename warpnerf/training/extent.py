@@ -24,8 +24,9 @@ most."""
 
 FEW_VIEWS = 7.0
 """Cameras that see the same content, up to which auto scales all the way to its distance."""
-LEAST_SHARE = 0.5
-"""Of the way, that auto scales where many more cameras see the same, and look at no one thing."""
+LEAST_SHARE, LEAST_SHARE_AROUND = 0.5, 0.7
+"""Of that distance, as far as auto scales where many more cameras see the same: where they look at
+no common point, and around one."""
 
 
 def content_distances(scene: Scene, config: TrainConfig) -> tuple[float, list[float]]:
@@ -33,9 +34,9 @@ def content_distances(scene: Scene, config: TrainConfig) -> tuple[float, list[fl
 
     With auto, a camera's is the geometric mean of the scene's and of its own where that is known: a
     camera close to a wall shall draw the wall, but in a scene of few photographs a camera's own is
-    the distance of its floaters as often as not. Where cameras look at no common point and many see
-    the same, it is less, down to half: they contradict a floater before one of them, and scaling
-    would only slow down what the nearer of them draw.
+    the distance of its floaters as often as not. Where many cameras see the same, it is less: they
+    contradict a floater before one of them, and scaling would only slow down what the nearer of
+    them draw.
 
     Raises:
         InputError: It is per-camera, and the scene has none.
@@ -57,9 +58,9 @@ def content_distances(scene: Scene, config: TrainConfig) -> tuple[float, list[fl
         return scene.content_distance, [float(scene.content_distances[i]) for i in train]
     if chosen == "auto" and scene.content_distances is not None:
         one, each = scene.content_distance, scene.content_distances[list(train)]
-        cameras, share = scene.training_cameras, 1.0
-        if find_focus(cameras).guessed:
-            share = min(1.0, max(LEAST_SHARE, FEW_VIEWS / views_of_content(cameras, each)))
+        cameras = scene.training_cameras
+        least = LEAST_SHARE if find_focus(cameras).guessed else LEAST_SHARE_AROUND
+        share = min(1.0, max(least, FEW_VIEWS / views_of_content(cameras, each)))
         return one, [share * math.sqrt(one * float(own)) for own in each]
     one = scene.content_distance if chosen == "auto" else float(chosen)
     return one, [one] * len(train)
