@@ -99,6 +99,17 @@ def test_a_field_alone_is_trained_no_longer_whether_it_was_looked_at_or_not(tmp_
     assert (tmp_path / "run" / "metrics.json").exists()
 
 
+def test_what_auto_stood_for_may_be_named_when_views_are_left_to_look_at(tmp_path: Path) -> None:
+    options = TrainOptions(
+        scene="builtin:room-sparse", output=tmp_path, downscale=8, eval_views="none"
+    )
+    assert train_command(options, TINY | {"field": ("auto",)}) == 0
+    with pytest.raises(InputError, match="^field is .*vm"):
+        resume(tmp_path, given={"field": ("vm",)})
+    assert resume(tmp_path, given={"field": ("dense",)}) == 0
+    assert (tmp_path / "metrics.json").exists()
+
+
 @pytest.mark.parametrize(
     ("ended_by", "raised", "says"),
     [

@@ -207,9 +207,6 @@ def _go_on(
         if peers.rank > 0:
             return 0
         config = changed(begun.train)
-        require_same_config(begun.train, config)
-        if raised(begun.train, config):
-            run.load_state()  # refuses: there is none
         options.require_no_training(run.folder)
         require_machine(config)
         masks = options.masks or masks_of(begun, moved)
@@ -217,6 +214,9 @@ def _go_on(
         scene = _read(
             source, begun.downscale, masks, run.folder, options, config.threads, begun.split
         )
+        require_same_config(*(c.for_kind(scene.kind) for c in (begun.train, config)))
+        if raised(begun.train, config):
+            run.load_state()  # refuses: there is none
         return evaluate_run(run, begun.as_trained(scene), options, config.device, config.threads)
     state, notes = run.load_state()
     config = changed(
