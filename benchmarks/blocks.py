@@ -3,8 +3,9 @@
     python benchmarks/blocks.py builtin:building-4 --count 4 --steps 400 --voxels 32768
 
 Blocks are trained one after the other by one thread and by two, then two at a time by one thread
-each; all by `warpnerf train-blocks`, as users do. The whole is trained with as many nodes and steps
-as all blocks together. Prints wall seconds with reading, compiling and saving, seconds of training
+each: in processes, and by two workers of Ray, where that is installed. All by `warpnerf
+train-blocks`, as users do. The whole is trained with as many nodes and steps as all blocks
+together. Prints wall seconds with reading, compiling, saving, and starting Ray, seconds of training
 alone, PSNR of the test views, and what a block reads and writes; writes
 benchmarks/results/blocks_<device>.json.
 """
@@ -16,6 +17,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +26,13 @@ from measuring import machine, options, write_record
 from warpnerf.blocks.folder import BlockFolder
 from warpnerf.runs.listing import last_report
 
-WAYS = {"1 process, 1 thread": (1, 1), "1 process, 2 threads": (1, 2), "2 processes": (2, 1)}
-"""Workers and threads of each."""
+WAYS = {
+    "1 process, 1 thread": (1, 1, "local"),
+    "1 process, 2 threads": (1, 2, "local"),
+    "2 processes": (2, 1, "local"),
+    "2 workers of Ray": (2, 1, "ray"),
+}
+"""Workers, threads of each, and engine."""
 
 
 def main() -> None:
@@ -44,12 +51,15 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         root = Path(temporary)
         warm(root, arguments.scene, size, of_block)
-        for way, (workers, threads) in WAYS.items():
+        for way, (workers, threads, engine) in WAYS.items():
+            if engine == "ray" and find_spec("ray") is None:
+                print("Ray is not installed: pip install 'warpnerf[scale]'")
+                continue
             folder = root / way.replace(" ", "_")
             command(
                 "blocks", arguments.scene, *size, "--output", folder, "--count", arguments.count
             )
-            how = ("--workers", workers, "--threads", threads)
+            how = ("--engine", engine, "--workers", workers, "--threads", threads)
             seconds = command("train-blocks", folder, *how, "--", *of_block)
             rows.append({"way": way, "wall": seconds, **of_folder(folder), **psnr(folder)})
         whole = root / "whole"

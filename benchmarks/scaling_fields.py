@@ -2,10 +2,11 @@
 
     python benchmarks/scaling_fields.py builtin:room-sparse room-scan fox_q stitch
 
-Four fields, dense, vm and hash with marched rays and else the preset fast, the preset mip360, and
-hash with two other epsilons of Adam; scalings none, quadratic and clamped; several seeds. Trainings
-are small: so many steps of so many rays on so many voxels, one after another. The record is written
-after each, and a run that was stopped resumes when it is started again.
+The fields dense, vm and hash, each in the preset fast with marched rays, hash also with two other
+epsilons of Adam, and the preset mip360, also without its distortion loss; scalings none, quadratic
+and clamped; several seeds. Trainings are small: so many steps of so many rays on so many voxels,
+one after another. The record is written after each, and a run that was stopped resumes when it is
+started again.
 
 Prints, by capture and field, mean and half of the range over the seeds without scaling, and what
 the others gain over that with the same seed: PSNR and SSIM of test views, LPIPS with --lpips, near

@@ -256,16 +256,19 @@ def test_the_truth_of_meshes():
     """What photographs of the room show lies on surfaces that mesh.py measures distances to."""
     pytest.importorskip("scipy")
     import mesh
+    from solids_truth import distances_to
 
+    from warpnerf.scenes.builtin.room import room_solids
     from warpnerf.scenes.formats.load import load_scene
 
+    solids = list(room_solids())
     points, colours = mesh.photographed(load_scene("builtin:room", downscale=20))
     assert points.shape == colours.shape == (120 * 8 * 6, 3)
-    assert mesh.distance_to_room(points).max() < 1e-4
+    assert distances_to(points, solids)[0].max() < 1e-4
     lifted = points + np.array([0.0, 0.0, 0.01])  # off the floor and into the ceiling
     level = np.isclose(points[:, 2], 0.0, atol=1e-6) | np.isclose(points[:, 2], 2.6, atol=1e-6)
     assert level.sum() > 100
-    np.testing.assert_allclose(mesh.distance_to_room(lifted[level]).max(), 0.01, atol=1e-4)
+    np.testing.assert_allclose(distances_to(lifted[level], solids)[0].max(), 0.01, atol=1e-4)
 
 
 @pytest.mark.slow

@@ -201,9 +201,9 @@ MUTANTS = [
     of_host("far is bounded in contracted space", EXTENT, "        begin = 0.0  # space", "        pass  # space", CLIPPED),
     of_host("each camera's own", EXTENT, "[share * math.sqrt(one * float(own)) for own in each]",
             "[share * float(own) for own in each]", BETWEEN),
-    of_host("all the way for many", EXTENT, "LEAST_SHARE_AROUND = 0.5, 0.7",
+    of_host("0.7 for many without a common point", EXTENT, "LEAST_SHARE_AROUND = 0.5, 0.7",
             "LEAST_SHARE_AROUND = 0.7, 0.7", FEWER),
-    of_host("as little far around one thing", EXTENT, "LEAST_SHARE_AROUND = 0.5, 0.7",
+    of_host("half for many around one thing", EXTENT, "LEAST_SHARE_AROUND = 0.5, 0.7",
             "LEAST_SHARE_AROUND = 0.5, 0.5", FEWER),
     of_host("less far for few", EXTENT, "FEW_VIEWS = 7.0", "FEW_VIEWS = 5.0", FEWER),
     # schedule.py

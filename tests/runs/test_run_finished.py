@@ -104,7 +104,7 @@ def test_what_auto_stood_for_may_be_named_when_views_are_left_to_look_at(tmp_pat
         scene="builtin:room-sparse", output=tmp_path, downscale=8, eval_views="none"
     )
     assert train_command(options, TINY | {"field": ("auto",)}) == 0
-    with pytest.raises(InputError, match="^field is .*vm"):
+    with pytest.raises(InputError, match=r"^field is .*vm"):
         resume(tmp_path, given={"field": ("vm",)})
     assert resume(tmp_path, given={"field": ("dense",)}) == 0
     assert (tmp_path / "metrics.json").exists()

@@ -65,7 +65,7 @@ def in_circle(n_cameras: int, turned: float) -> Scene:
 
 
 def test_where_many_see_the_same_gradients_are_scaled_less_far() -> None:
-    """By how many do, and never less than half as far; than 0.7 where they look at one thing."""
+    """By how many do: at least half as far, and 0.7 where they look at one thing."""
     auto = TrainConfig(model="rgb", grid=GridConfig(voxels=8**3))
     shares = []
     for n_cameras in (8, 50, 200):

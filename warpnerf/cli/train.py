@@ -18,6 +18,7 @@ from warpnerf.cli.train_options import USUAL, TrainOptions
 from warpnerf.cli.training import describe, evaluate_run, split_to_look_at, train_to_the_end
 from warpnerf.cli.view import training_page
 from warpnerf.config import TrainConfig
+from warpnerf.model.storage_kinds import AUTO_FIELD
 from warpnerf.presets import PRESETS
 from warpnerf.runs import lock
 from warpnerf.runs.names import new_folder
@@ -207,6 +208,9 @@ def _go_on(
         if peers.rank > 0:
             return 0
         config = changed(begun.train)
+        require_same_config(_with_auto_of(begun.train, config), config)
+        if raised(begun.train, config):
+            run.load_state()  # refuses: there is none
         options.require_no_training(run.folder)
         require_machine(config)
         masks = options.masks or masks_of(begun, moved)
@@ -215,8 +219,6 @@ def _go_on(
             source, begun.downscale, masks, run.folder, options, config.threads, begun.split
         )
         require_same_config(*(c.for_kind(scene.kind) for c in (begun.train, config)))
-        if raised(begun.train, config):
-            run.load_state()  # refuses: there is none
         return evaluate_run(run, begun.as_trained(scene), options, config.device, config.threads)
     state, notes = run.load_state()
     config = changed(
@@ -257,6 +259,15 @@ def _go_on(
         run.rewind_log(trainer.steps_done)
         del state  # the trainer has copies
         return train_to_the_end(run, scene, trainer, session, options)
+
+
+def _with_auto_of(begun: TrainConfig, asked: TrainConfig) -> TrainConfig:
+    """What was begun, with what is asked for where it was auto: the scene tells what that was."""
+    grid = begun.grid
+    if grid.voxels == "auto":
+        grid = dataclasses.replace(grid, voxels=asked.grid.voxels)
+    field = asked.field if begun.field == AUTO_FIELD else begun.field
+    return dataclasses.replace(begun, grid=grid, field=field)
 
 
 def _read(

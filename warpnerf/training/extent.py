@@ -25,8 +25,8 @@ most."""
 FEW_VIEWS = 7.0
 """Cameras that see the same content, up to which auto scales all the way to its distance."""
 LEAST_SHARE, LEAST_SHARE_AROUND = 0.5, 0.7
-"""Of that distance, as far as auto scales where many more cameras see the same: where they look at
-no common point, and around one."""
+"""Least share of that distance, however many cameras see the same: where they look at no common
+point, and where they do."""
 
 
 def content_distances(scene: Scene, config: TrainConfig) -> tuple[float, list[float]]:
@@ -34,9 +34,9 @@ def content_distances(scene: Scene, config: TrainConfig) -> tuple[float, list[fl
 
     With auto, a camera's is the geometric mean of the scene's and of its own where that is known: a
     camera close to a wall shall draw the wall, but in a scene of few photographs a camera's own is
-    the distance of its floaters as often as not. Where many cameras see the same, it is less: they
-    contradict a floater before one of them, and scaling would only slow down what the nearer of
-    them draw.
+    the distance of its floaters as often as not. Where many cameras see the same, it is less, down
+    to LEAST_SHARE or LEAST_SHARE_AROUND: they contradict a floater before one of them, and scaling
+    would only slow down what the nearer of them draw.
 
     Raises:
         InputError: It is per-camera, and the scene has none.
