@@ -156,6 +156,12 @@ def test_a_finished_run_is_trained_for_longer(trained: tuple[Path, str], tmp_pat
     assert code == 0, err
     assert "resuming after step 30" in out
     assert (folder / "field.safetensors").read_bytes() == whole
+    Run(folder).checkpoints[0].unlink()
+    code, out, err = run("train", "--resume", folder, "--steps", "35")
+    assert code == 0, err
+    assert "steps 35, not 40, to which the run had been told to be extended" in out
+    assert "learning rates rise" not in out
+    assert json.loads((folder / "config.json").read_text())["train"]["steps"] == 35
 
 
 def test_other_threads_are_allowed_and_noted(trained: tuple[Path, str]) -> None:

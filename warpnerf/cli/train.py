@@ -246,6 +246,9 @@ def _go_on(
             print(f"  note: {name} {new} instead of {old}: sums are rounded in another order")
     for name in longer:
         old, new = getattr(begun.train, name), getattr(config, name)
+        if new < old:
+            print(f"  note: {name} {new}, not {old}, to which the run had been told to be extended")
+            continue
         print(
             f"  note: {name} {new} instead of {old}: learning rates rise to those of the "
             "longer training; one that is as long from the start ends otherwise"
