@@ -11,6 +11,7 @@ from warpnerf.reports.paired import CONFIDENCE
 
 COLUMNS = {
     "psnr": ("PSNR [dB]", 2),
+    "ssim": ("SSIM", 4),
     "training_psnr": ("of training views", 2),
     "pulled_psnr": ("moved back", 2),
     "front_train": ("light in front", 3),

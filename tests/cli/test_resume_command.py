@@ -159,8 +159,8 @@ def test_a_finished_run_is_trained_for_longer(trained: tuple[Path, str], tmp_pat
     Run(folder).checkpoints[0].unlink()
     code, out, err = run("train", "--resume", folder, "--steps", "35")
     assert code == 0, err
-    assert "steps 35, not 40, to which the run had been told to be extended" in out
-    assert "learning rates rise" not in out
+    assert "steps 35, not 40, to which the run had been extended" in out
+    assert "steps 35 instead of 30: learning rates rise" in out
     assert json.loads((folder / "config.json").read_text())["train"]["steps"] == 35
 
 

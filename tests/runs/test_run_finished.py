@@ -8,7 +8,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from tests.support.faulty_saves import (
     KILLED,
@@ -20,6 +22,7 @@ from tests.support.faulty_saves import (
     run_with,
     state_of,
 )
+from tests.support.tiny_scenes import ring, write_blender
 from tests.training.test_determinism import small_scene
 from warpnerf.checks import InputError
 from warpnerf.cli.train import train_command
@@ -99,15 +102,31 @@ def test_a_field_alone_is_trained_no_longer_whether_it_was_looked_at_or_not(tmp_
     assert (tmp_path / "run" / "metrics.json").exists()
 
 
-def test_what_auto_stood_for_may_be_named_when_views_are_left_to_look_at(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("object", "named", "other"), [(False, "dense", "vm"), (True, "vm", "dense")]
+)
+def test_what_auto_stood_for_may_be_named_when_views_are_left_to_look_at(
+    object: bool, named: str, other: str, tmp_path: Path
+) -> None:
+    scene = "builtin:room-sparse"
+    if object:
+        scene = str(tmp_path / "scene")
+        for split, n in (("train", 4), ("test", 1)):
+            write_blender(Path(scene), split, ring(n, radius=3.0))
+            for path in Path(scene, split).glob("*.png"):
+                pixels = np.full((18, 24, 4), 255, np.uint8)
+                v, u = np.mgrid[:18, :24]
+                pixels[..., 3] *= np.hypot(v - 8.5, u - 11.5) < 4.0
+                Image.fromarray(pixels).save(path)
+    folder = tmp_path / "run"
     options = TrainOptions(
-        scene="builtin:room-sparse", output=tmp_path, downscale=8, eval_views="none"
+        scene=scene, output=folder, downscale=1 if object else 8, eval_views="none"
     )
     assert train_command(options, TINY | {"field": ("auto",)}) == 0
-    with pytest.raises(InputError, match=r"^field is .*vm"):
-        resume(tmp_path, given={"field": ("vm",)})
-    assert resume(tmp_path, given={"field": ("dense",)}) == 0
-    assert (tmp_path / "metrics.json").exists()
+    with pytest.raises(InputError, match=f"^field.* {other}"):
+        resume(folder, given={"field": (other,)})
+    assert resume(folder, given={"field": (named,)}) == 0
+    assert (folder / "metrics.json").exists()
 
 
 @pytest.mark.parametrize(

@@ -218,7 +218,8 @@ def _go_on(
         scene = _read(
             source, begun.downscale, masks, run.folder, options, config.threads, begun.split
         )
-        require_same_config(*(c.for_kind(scene.kind) for c in (begun.train, config)))
+        decided = begun.train.for_kind(scene.kind)  # a name keeps what that field is then
+        require_same_config(decided, changed(decided).for_kind(scene.kind))
         return evaluate_run(run, begun.as_trained(scene), options, config.device, config.threads)
     state, notes = run.load_state()
     config = changed(
@@ -245,10 +246,11 @@ def _go_on(
         if new != old:
             print(f"  note: {name} {new} instead of {old}: sums are rounded in another order")
     for name in longer:
-        old, new = getattr(begun.train, name), getattr(config, name)
-        if new < old:
-            print(f"  note: {name} {new}, not {old}, to which the run had been told to be extended")
-            continue
+        told, old, new = (getattr(c, name) for c in (begun.train, state.config, config))
+        if new < told:
+            print(
+                f"  note: {name} {new}, not {told}, to which the run had been told to be extended"
+            )
         print(
             f"  note: {name} {new} instead of {old}: learning rates rise to those of the "
             "longer training; one that is as long from the start ends otherwise"
