@@ -248,9 +248,7 @@ def _go_on(
     for name in longer:
         told, old, new = (getattr(c, name) for c in (begun.train, state.config, config))
         if new < told:
-            print(
-                f"  note: {name} {new}, not {told}, to which the run had been told to be extended"
-            )
+            print(f"  note: {name} {new}, not {told}, to which the run had been extended")
         print(
             f"  note: {name} {new} instead of {old}: learning rates rise to those of the "
             "longer training; one that is as long from the start ends otherwise"
