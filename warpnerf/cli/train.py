@@ -249,10 +249,11 @@ def _go_on(
         told, old, new = (getattr(c, name) for c in (begun.train, state.config, config))
         if new < told:
             print(f"  note: {name} {new}, not {told}, to which the run had been extended")
-        print(
-            f"  note: {name} {new} instead of {old}: learning rates rise to those of the "
-            "longer training; one that is as long from the start ends otherwise"
-        )
+        if new > old:
+            print(
+                f"  note: {name} {new} instead of {old}: learning rates rise to those of the "
+                "longer training; one that is as long from the start ends otherwise"
+            )
     print(f"  resuming after step {trainer.steps_done}")
     with training_page(options.page, scene, trainer) as session:
         if longer:
