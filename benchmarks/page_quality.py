@@ -5,6 +5,8 @@ Each function writes one; see ``write_docs``.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from page_parts import Records, below, of, place, seeds, table, text, values
 
@@ -70,10 +72,27 @@ def equal_steps(records: Records) -> str:
 
 
 def by_field(records: Records) -> str:
-    record = records["scaling_fields"]
-    rows, settings = record["rows"], record["settings"]
+    record, epsilons = records["scaling_fields"], records["scaling_fields_epsilon"]
+    settings = record["settings"]
+    return below(
+        text(
+            f"""{settings["steps"]} equal steps of {settings["rays"]} rays, what clamped
+            scaling gains over none, PSNR in dB (negative: it loses;
+            [by capture](decisions/fields.md)): {gains(record["rows"])}.""",
+            records.source("scaling_fields"),
+        ),
+        text(
+            f"""The same of hashes whose entries have other epsilons of Adam:
+            {gains(epsilons["rows"])}.""",
+            records.source("scaling_fields_epsilon"),
+        ),
+    )
 
-    def gains(field: str) -> str:
+
+def gains(rows: list[dict[str, Any]]) -> str:
+    """What clamped scaling gains in each field, from the capture that gains least to the other."""
+    said = []
+    for field in values(rows, "field"):
         means = [
             [
                 np.mean([r["psnr"] for r in of(rows, field=field, scene=scene, scaling=scaling)])
@@ -82,15 +101,8 @@ def by_field(records: Records) -> str:
             for scaling in ("clamped", "none")
         ]
         of_captures = np.subtract(*means)
-        return f"`{field}` {of_captures.min():+.2f} to {of_captures.max():+.2f}"
-
-    said = ", ".join(map(gains, values(rows, "field")))
-    return text(
-        f"""{settings["steps"]} equal steps of {settings["rays"]} rays, what clamped
-        scaling gains over none, PSNR in dB (negative: it loses;
-        [by capture](decisions/fields.md)): {said}.""",
-        records.source("scaling_fields"),
-    )
+        said.append(f"`{field}` {of_captures.min():+.2f} to {of_captures.max():+.2f}")
+    return ", ".join(said)
 
 
 def extents(records: Records) -> str:
