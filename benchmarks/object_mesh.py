@@ -43,7 +43,7 @@ COLUMNS = {
     "chamfer": "chamfer",
     "thin_mean": "thin, mean",
     "thin_median": "median",
-    "thin_90": "90 %",
+    "thin_most": "nine tenths",
     "apart": "points",
 }
 
@@ -51,6 +51,7 @@ COLUMNS = {
 def main() -> None:
     parser = options(__doc__ or "")
     parser.add_argument("meshes", nargs="+", type=Path, help="files that trimesh reads")
+    parser.add_argument("--about", default="", help="how the meshes were made, for the record")
     parser.add_argument("--edge", type=float, help="of a voxel, scene units, to compare with")
     arguments = parser.parse_args()
     crane = list(solids())[1:]  # the first is the room around it
@@ -74,7 +75,7 @@ def main() -> None:
             "chamfer": float(0.5 * (to_truth.mean() + to_mesh.mean())),
             "thin_mean": float(to_mesh[is_thin].mean()),
             "thin_median": float(np.median(to_mesh[is_thin])),
-            "thin_90": float(np.quantile(to_mesh[is_thin], 0.9)),
+            "thin_most": float(np.quantile(to_mesh[is_thin], 0.9)),
             "apart": float(tree.query(some, 2)[0][:, 1].mean()),
         }
         print("".join(f"{1e3 * row[name]:13.2f}" for name in COLUMNS) + f"   {path.name}")
@@ -84,7 +85,13 @@ def main() -> None:
             )
             print(f"  of thin parts, within half a voxel: {row['thin_within_half_a_voxel']:.1%}")
         rows.append(row)
-    record = {"machine": machine(arguments.device, 1), "edge": arguments.edge, "rows": rows}
+    record = {
+        "machine": machine(arguments.device, 1),
+        "about": arguments.about,
+        "edge": arguments.edge,
+        "thin": THIN,
+        "rows": rows,
+    }
     print(f"wrote {write_record(record, arguments.output, 'object_mesh', arguments.device)}")
 
 

@@ -255,7 +255,7 @@ def exports(records: Records) -> str:
     splats = record["splats"]
     figures = splats["psnr_against_field"]
     of_object = records["object_mesh"]
-    names = ("mesh_to_truth", "truth_to_mesh", "chamfer", "thin_mean", "thin_90", "apart")
+    names = ("mesh_to_truth", "truth_to_mesh", "chamfer", "thin_mean", "thin_most", "apart")
     meshes = [
         [row["mesh"], f"{row['faces']:,}", *(f"{1e3 * row[name]:.1f}" for name in names)]
         for row in of_object["rows"]
@@ -271,19 +271,18 @@ def exports(records: Records) -> str:
         ),
         table(["opacity of a voxel edge", "mesh to truth", "truth to mesh", "colours"], rows),
         text(
-            """Meshes of the object of `object_scan.py` against its exact surfaces, in thousandths
+            f"""Meshes of the object of `object_scan.py` against its exact surfaces, in thousandths
             of a scene unit: mean distance from the mesh to the truth; from what the training
             cameras see to points on the mesh, which hardly comes below how far these are apart
-            (last column); and the mean of both, the chamfer distance. Of thin parts, at most 30
-            across, the mean distance to the mesh, and what nine tenths stay below. Exported after
-            `warpnerf train crane --time-limit 75`, with `--preset quality`, and without by commit
-            4f25a8d.""",
+            (last column); and the mean of both, the chamfer distance. Of thin parts, at most
+            {1e3 * of_object["thin"]:.0f} across, the mean distance to the mesh, and what nine
+            tenths stay below. {of_object["about"]}""",
             records.source("object_mesh"),
         ),
         table(
             [
                 *("mesh", "faces", "to truth", "from truth", "chamfer"),
-                *("thin parts", "90 %", "points apart"),
+                *("thin parts", "nine tenths", "points apart"),
             ],
             meshes,
         ),

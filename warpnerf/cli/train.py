@@ -266,7 +266,7 @@ def _go_on(
 
 
 def _with_auto_of(begun: TrainConfig, asked: TrainConfig) -> TrainConfig:
-    """What was begun, with what is asked for where it was auto: the scene tells what that was."""
+    """What was begun, with what is requested where it was auto: the scene tells what that was."""
     grid = begun.grid
     if grid.voxels == "auto":
         grid = dataclasses.replace(grid, voxels=asked.grid.voxels)
