@@ -57,6 +57,8 @@ class Processes(Peers):
             self._training = dist.new_group(timeout=PATIENCE)
             self._saving = dist.new_group(timeout=SAVING)
             self._devices: dist.ProcessGroup | None = None
+            # Who refuses its options ends at once, and others would still ask its store.
+            dist.barrier(self._saving)
         except (RuntimeError, ValueError) as error:
             why = str(error).strip().partition("\n")[0][:200].rstrip(".")
             raise InputError(
