@@ -20,11 +20,12 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from measuring import machine, options, write_record
-from object_scan import ANGLE_X, AWAY, RADIUS, TURN, poses, solids, tracer
+from object_scan import ANGLE_X, AWAY, RADIUS, poses, solids, tracer, turning
 from scipy.spatial import cKDTree
 from solids_truth import distances_to
 
 from warpnerf.scenes.cameras.camera import Camera
+from warpnerf.scenes.cameras.overlap import content_at
 
 THIN = 0.03
 """Scene units across, in two directions."""
@@ -63,7 +64,7 @@ def main() -> None:
     for path in arguments.meshes:
         mesh = trimesh.load(path, force="mesh")
         points, _ = trimesh.sample.sample_surface(mesh, POINTS, seed=0)
-        points = np.asarray(points) @ turned()  # the inverse, of rows
+        points = np.asarray(points) @ turning()  # the inverse, of rows
         some = points[:: POINTS // CHECKED]
         tree = cKDTree(points)
         to_truth, to_mesh = distances_to(some, crane)[0], tree.query(truth)[0]
@@ -95,12 +96,6 @@ def main() -> None:
     print(f"wrote {write_record(record, arguments.output, 'object_mesh', arguments.device)}")
 
 
-def turned() -> np.ndarray:
-    """The matrix by which object_scan.py turns the object: of a point p, turned() @ p."""
-    cosine, sine = np.cos(TURN), np.sin(TURN)
-    return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-
-
 def seen_points() -> np.ndarray:
     """What the training cameras see of the object before it is turned, [n, 3] scene units."""
     focal, middle = 0.5 * SEEN_SIZE / np.tan(0.5 * ANGLE_X), 0.5 * SEEN_SIZE
@@ -109,11 +104,8 @@ def seen_points() -> np.ndarray:
     for c2w in poses(CAMERAS, 0):
         camera = Camera(**size, fx=focal, fy=focal, cx=middle, cy=middle, c2w=c2w)
         depth = tracer().depth(camera)
-        v, u = np.mgrid[:SEEN_SIZE, :SEEN_SIZE] + 0.5
-        local = np.stack([(u - middle) / focal, (middle - v) / focal, -np.ones_like(u)], axis=-1)
-        rays = local / np.linalg.norm(local, axis=-1, keepdims=True) @ camera.c2w[:, :3].T
-        is_object = depth < AWAY + RADIUS
-        points.append((camera.position + rays * depth[..., None])[is_object])
+        v, u = np.nonzero(depth < AWAY + RADIUS)  # the object's pixels
+        points.append(content_at(camera, u + 0.5, v + 0.5, depth[v, u]))
     return np.concatenate(points)
 
 

@@ -189,6 +189,12 @@ def poses(n: int, seed: int) -> Iterator[np.ndarray]:
         yield np.stack([right, np.cross(back, right), back, AWAY * back], axis=1)
 
 
+def turning() -> np.ndarray:
+    """The rotation of the object against the axes, [3, 3]: a point p comes to turning() @ p."""
+    cosine, sine = np.cos(TURN), np.sin(TURN)
+    return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+
+
 def _write(job: tuple[Path, np.ndarray, int]) -> None:
     path, c2w, size = job
     focal = 0.5 * size / np.tan(0.5 * ANGLE_X)
@@ -209,8 +215,7 @@ def write_scan(
         size: Width and height, pixels.
         workers: Processes; None: one for each core.
     """
-    cosine, sine = np.cos(TURN), np.sin(TURN)
-    turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    turn = turning()
     jobs = []
     for seed, (split, n) in enumerate(n_views.items()):
         (folder / split).mkdir(parents=True)

@@ -1,5 +1,6 @@
 """The generated object: a scene that the readers take, with alpha and highlights."""
 
+import json
 import sys
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 
 import warpnerf as wn
+from warpnerf.scenes.builtin.solids import Ball, Cylinder
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 
@@ -68,3 +70,41 @@ def test_highlights_depend_on_the_eye() -> None:
         object_scan.Lacquer.eye = points[:, 0] + 4.0 * eye
         shine.append(top.texture(top.locate(points)).max())
     assert shine[0] == pytest.approx(0.5, rel=1e-4) and shine[1] < 0.1
+
+
+def test_a_mesh_of_the_solids_is_where_they_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And one that is moved, or lacks the bars, is not."""
+    trimesh = pytest.importorskip("trimesh")
+    pytest.importorskip("scipy")
+    import object_mesh
+
+    for name, value in {"POINTS": 200_000, "CHECKED": 2000, "SEEN_SIZE": 24, "CAMERAS": 4}.items():
+        monkeypatch.setattr(object_mesh, name, value)
+    parts = []
+    for solid in list(object_scan.solids())[1:]:
+        low, high = np.array(solid.lo), np.array(solid.hi)
+        if isinstance(solid, Ball):
+            part = trimesh.creation.icosphere(radius=0.5 * (high - low)[0])
+        elif isinstance(solid, Cylinder):
+            part = trimesh.creation.cylinder(0.5 * (high - low)[0], (high - low)[2])
+        else:
+            part = trimesh.creation.box(high - low)
+        parts.append(part.apply_translation(0.5 * (low + high)))
+    turn = np.eye(4)
+    turn[:3, :3] = object_scan.turning()
+    thick = [part for part in parts if np.sort(part.extents)[1] > object_mesh.THIN]
+    paths = []
+    for name, solids, away in (("right", parts, 0.0), ("moved", parts, 0.1), ("thick", thick, 0.0)):
+        mesh = trimesh.util.concatenate(solids).apply_translation([0.0, 0.0, away])
+        paths.append(tmp_path / f"{name}.ply")
+        mesh.apply_transform(turn).export(paths[-1])
+    output = tmp_path / "record.json"
+    monkeypatch.setattr(sys, "argv", ["object_mesh.py", *map(str, paths), "--output", str(output)])
+    object_mesh.main()
+    right, moved, thick = json.loads(output.read_text())["rows"]
+    assert right["mesh_to_truth"] < 1e-3  # balls and cylinders have flat faces
+    assert right["truth_to_mesh"] < 2.0 * right["apart"] and right["thin_most"] < 0.01
+    assert moved["chamfer"] > 0.01
+    assert thick["thin_mean"] > 3.0 * right["thin_mean"]
