@@ -33,6 +33,7 @@ from warpnerf.optim_config import OPTIM_RATES, OPTIM_VARIATION, OptimConfig, Sce
 
 Scaling = Literal["none", "quadratic", "clamped"]
 Jacobian = Literal["none", "density", "paper"]
+Appearance = Literal["auto", "none", "affine"]
 Background = Literal["auto", "white", "black", "random"]
 
 OBJECT_FIELD = Vm(density=8, appearance=24, learning_rate=0.05, sparsity=1e-4)
@@ -124,6 +125,10 @@ class TrainConfig:
     background: Background | tuple[float, float, float] = "auto"
     """What is seen behind the scene: a colour, rgb in [0, 1], or random colours while training
     (white when rendering); auto: white where photographs have alpha, else black."""
+    appearance: Appearance = "auto"
+    """What each photograph does to the scene's colours: none, affine, a gain and an offset of each
+    channel, fitted while training, for photographs whose exposure or white balance differ; or auto:
+    affine where photographs differ so much that it helps. What is rendered has their mean."""
     occupancy_every: int = 100
     """Updates of the grid between two looks for free space, each of one or several steps."""
     skip_empty_rays: bool = True
@@ -289,6 +294,7 @@ class TrainConfig:
         require_whole("seed", self.seed, 0)
         require_one_of("scaling", self.scaling, get_args(Scaling))
         require_one_of("jacobian", self.jacobian, get_args(Jacobian))
+        require_one_of("appearance", self.appearance, get_args(Appearance))
         space = SPACES.get(self.grid.contraction)
         if space is not None and space.has_frustum and self.jacobian != "none":
             raise InputError(

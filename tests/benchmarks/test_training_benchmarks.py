@@ -176,6 +176,18 @@ def test_calibration(tmp_path):
 
 
 @pytest.mark.slow
+def test_exposures(tmp_path):
+    options = ("builtin:room-sparse", "--steps", "40", "--voxels", "20000", "--stops", "0.4")
+    output = "--picture", str(tmp_path / "seen.jpg")
+    record, printed = run("exposures.py", tmp_path / "record.json", *options, *output)
+    rows = {row["appearance"]: row for row in record["rows"]}
+    assert [row["used"] for row in rows.values()] == [False, True, True]
+    for row in rows.values():
+        assert row["cc_psnr"] > row["psnr"] and f"{row['cc_psnr']:.2f}" in printed
+    assert (tmp_path / "seen.jpg").stat().st_size > 1000
+
+
+@pytest.mark.slow
 def test_a_camera_that_was_moved_is_found_again():
     scene = wn.load_scene("builtin:room", downscale=2)
     config = replace(wn.PRESETS["fast"], steps=600, coarse_steps=0)

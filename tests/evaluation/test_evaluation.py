@@ -113,14 +113,14 @@ def test_json_has_the_promised_form() -> None:
     field = tiny_field()
     without = json.loads(evaluate(field, scene_of(field, depth=False)).to_json())
     assert list(without) == ["mean", "floaters", "images"]
-    assert list(without["mean"]) == ["psnr", "ssim", "flip"]
+    assert list(without["mean"]) == ["psnr", "cc_psnr", "ssim", "flip"]
     assert list(without["floaters"]) == ["within", "near_mass", "near_rays"]
     assert [list(image) for image in without["images"]] == [
-        ["name", "psnr", "ssim", "flip", "near_rays"]
+        ["name", "psnr", "cc_psnr", "ssim", "flip", "near_rays"]
     ]
     assert without["mean"]["psnr"] == without["images"][0]["psnr"]
     known = json.loads(evaluate(field, scene_of(field, depth=True)).to_json())
-    assert list(known["mean"]) == ["psnr", "ssim", "flip", "depth_error"]
+    assert list(known["mean"]) == ["psnr", "cc_psnr", "ssim", "flip", "depth_error"]
 
 
 def test_what_is_not_installed_or_given_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -128,7 +128,7 @@ def test_what_is_not_installed_or_given_is_left_out(monkeypatch: pytest.MonkeyPa
     scene = scene_of(field, depth=False)
     monkeypatch.setattr(evaluate_module, "has_flip", lambda: False)
     result = evaluate(field, scene)
-    assert list(result.mean) == ["psnr", "ssim"]
+    assert list(result.mean) == ["psnr", "cc_psnr", "ssim"]
     assert "FLIP" not in str(result)
     pairs = []
 

@@ -14,7 +14,7 @@ from skimage.metrics import structural_similarity
 
 from warpnerf.checks import InputError
 from warpnerf.evaluation import metrics
-from warpnerf.evaluation.metrics import flip, has_flip, psnr, ssim
+from warpnerf.evaluation.metrics import colour_corrected, flip, has_flip, psnr, ssim
 from warpnerf.runtime.memory import usable_cores
 
 
@@ -27,6 +27,22 @@ def images(seed: int, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
 def test_psnr_of_a_known_error() -> None:
     truth = np.full((4, 5, 3), 0.5)
     assert psnr(truth + 0.1, truth) == pytest.approx(20.0, abs=1e-9)
+
+
+def test_corrected_colours_are_those_of_another_exposure() -> None:
+    rng = np.random.default_rng(0)
+    rgb, mask = rng.random((12, 15, 3)), rng.random((12, 15)) < 0.6
+    truth = rgb * [0.5, 0.7, 0.3] + [0.1, 0.2, 0.0]
+    np.testing.assert_allclose(colour_corrected(rgb, truth), truth, atol=1e-12)
+    outside = np.where(mask[..., None], truth, rng.random(rgb.shape))
+    np.testing.assert_allclose(colour_corrected(rgb, outside, mask)[mask], truth[mask], atol=1e-12)
+    assert np.abs(colour_corrected(rgb, outside) - truth)[mask].max() > 0.05
+    bright = colour_corrected(rgb, np.clip(3.0 * rgb, 0.0, 1.0))
+    assert bright.max() == 1.0 and bright.min() >= 0.0
+    grey = np.full_like(rgb, 0.3)  # which tells no gain
+    np.testing.assert_allclose(
+        colour_corrected(grey, truth), np.broadcast_to(truth.mean(axis=(0, 1)), rgb.shape)
+    )
 
 
 @pytest.mark.parametrize(("height", "width"), [(11, 11), (13, 40), (48, 31)])

@@ -279,6 +279,7 @@ def launch_draw(
     jitter: int = 0,
     rays_before: int = 0,
     at_once: int = NODES,
+    which: Any = None,
 ) -> tuple[Any, Any]:
     """A batch's rays, and what they should see."""
     camera, vec3 = kernels.module("space.camera"), kernels.types.vec3
@@ -288,7 +289,10 @@ def launch_draw(
     rays.origins, rays.directions = kernels.zeros(n, vec3), kernels.zeros(n, vec3)
     rays.offsets, rays.content_distance = kernels.zeros(n), kernels.zeros(n)
     rays.background = kernels.zeros(n, vec3)
-    kernels.workers.launch(camera.sample_pixels, n, source, how, rays, target, at_once=at_once)
+    if which is None:
+        which = wp.zeros(n, dtype=wp.int32, device=kernels.device)
+    given = source, how, rays, target, which
+    kernels.workers.launch(camera.sample_pixels, n, *given, at_once=at_once)
     return rays, target
 
 
@@ -312,6 +316,29 @@ def test_sampled_pixels_are_their_rays(kernels64: Kernels) -> None:
         at = v[of_view], u[of_view]
         np.testing.assert_allclose(black["origins"][of_view], origins[at], rtol=1e-14)
         np.testing.assert_allclose(black["directions"][of_view], directions[at], atol=1e-12)
+
+
+def test_exposures_are_taken_out_of_pixels_before_their_background(kernels64: Kernels) -> None:
+    """And rays say whose pixel they see, but where that is not opaque."""
+    n, vec3 = 600, kernels64.types.vec3
+    photographs = [
+        wp.array(np.tile(rgba, WIDTH * HEIGHT), dtype=wp.uint8, device=kernels64.device)
+        for rgba in ([51, 102, 153], [51, 102, 153, 255], [51, 102, 153, 102])
+    ]
+    views = [
+        view(kernels64, pose(k), {}, pixels=pixels, channels=3 + (k > 0), first_pixel=k * 4800)
+        for k, pixels in enumerate(photographs)
+    ]
+    source = source_of(kernels64, views)
+    gains, offsets = 0.5 + np.arange(9.0).reshape(3, 3), 0.01 * np.arange(9.0).reshape(3, 3)
+    source.gains, source.offsets = kernels64.array(gains, vec3), kernels64.array(offsets, vec3)
+    which = wp.zeros(n, dtype=wp.int32, device=kernels64.device)
+    rays, target = launch_draw(kernels64, n, source, 7, (0.3, 0.6, 0.9), which=which)
+    number = np.searchsorted([2.0, 3.0, 5.0], rays.content_distance.numpy())
+    pixel = (np.array([0.2, 0.4, 0.6]) - offsets) / gains
+    pixel[2] = 0.4 * pixel[2] + 0.6 * np.array([0.3, 0.6, 0.9])
+    np.testing.assert_allclose(target.numpy(), pixel[number], atol=1e-12)
+    np.testing.assert_array_equal(which.numpy(), np.array([0, 1, -1])[number])
 
 
 def test_pixels_beyond_32_bits_are_drawn_evenly(kernels32: Kernels) -> None:

@@ -49,6 +49,7 @@ GIVEN: dict[str, tuple[str, Any]] = {
     "jacobian": ("density", "density"),
     "rays_per_step": ("512", 512),
     "background": ("0.1 0.2 0.3", (0.1, 0.2, 0.3)),
+    "appearance": ("affine", "affine"),
     "occupancy_every": ("7", 7),
     "skip_empty_rays": ("false", False),
     "alpha_min": ("0.01", 0.01),

@@ -56,6 +56,13 @@ def test_the_largest_is_named(
     assert says in str(limit)
 
 
+def test_exposures_are_named_where_corrected_colours_come_closer() -> None:
+    for corrected, name in ((28.4, "nothing"), (29.9, "exposures")):
+        limit = what_limits(reports(0.3), 1.3, 28.1, corrected)
+        assert limit is not None and limit.name == name
+    assert "come 1.8 dB closer" in str(limit) and "try --appearance affine" in str(limit)
+
+
 def test_pixels_that_meet_nothing_count() -> None:
     """As they do in test views: or an object that fills a tenth of them has 10 dB less."""
     assert reports(0.3, seen=0.1)[-1].picture_psnr == pytest.approx(30.0)

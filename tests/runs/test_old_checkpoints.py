@@ -138,6 +138,7 @@ def test_files_of_the_version_before_hold_the_model_rgb(tmp_path: Path) -> None:
     then = {
         "sampler": MARCHED,
         "skip_empty_rays": False,
+        "appearance": "none",
         "alpha_min": 0.01,
         "march": MarchConfig(growth=0.02),
         "grid": GridConfig(grow_at=(0.3, 0.4, 0.5, 0.6), box="scene", border=0.2),

@@ -52,10 +52,12 @@ def recorded(peers: Peers) -> list[dict[str, np.ndarray]]:
 def trained(peers: Peers, file: Path) -> int:
     """Train, and write the first update's gradients and the field to a file."""
     found = recorded(peers)
-    trainer = Trainer(ball(), tiny_config(), peers=peers)
+    trainer = Trainer(ball(), tiny_config(appearance="affine"), peers=peers)
     progress = trainer.run()
     fields = {f"field.{name}": array for name, array in trainer.storage.tensors().items()}
     fields |= {"field.weights": trainer.weights.numpy()}
+    assert trainer.exposures is not None
+    fields |= {"field.exposures": trainer.exposures.sums.numpy()}
     np.savez(file, **found[0], **fields, loss=progress.loss, n_updates=len(found))
     return 0
 
@@ -87,6 +89,9 @@ def test_processes_with_a_share_of_the_rays_are_one_with_all(tmp_path: Path) -> 
             np.testing.assert_allclose(one[name], expected[name], rtol=0.0, atol=2e-6 * largest)
         assert np.array_equal(one["touched"] != 0, expected["touched"] != 0)
         assert int(one["n_updates"]) == int(expected["n_updates"]) == STEPS
+        counts = [of["field.exposures"].reshape(3, 3, 5)[..., 0] for of in (one, expected)]
+        np.testing.assert_allclose(*counts, rtol=1e-5)  # of the same rays
+        assert counts[0].min() > 0.0
         assert one["field.values"].shape == expected["field.values"].shape  # it has grown alike
         assert np.abs(one["field.values"] - expected["field.values"]).mean() < 0.05
 

@@ -15,6 +15,7 @@ from warpnerf.checks import InputError
 from warpnerf.evaluation.metrics import (
     SSIM_WINDOW,
     alike_where_masked,
+    colour_corrected,
     flip,
     has_flip,
     psnr,
@@ -43,6 +44,7 @@ Distance = Callable[[np.ndarray, np.ndarray], float]
 
 HEADINGS = {
     "psnr": ("PSNR", ".2f"),
+    "cc_psnr": ("cc-PSNR", ".2f"),
     "ssim": ("SSIM", ".4f"),
     "flip": ("FLIP", ".4f"),
     "lpips": ("LPIPS", ".4f"),
@@ -50,6 +52,9 @@ HEADINGS = {
 }
 """Heading and format of each figure in a table."""
 
+
+NOTABLE_CORRECTION = 0.3
+"""dB of PSNR by which colours that are corrected come closer, on average, for tables to say so."""
 
 FOG_PSNR = 20.0
 """dB, below which a view whose rays end close to its camera counts as fog, not as a close-up."""
@@ -63,6 +68,9 @@ class ImageMetrics:
     """The view's."""
     psnr: float
     """dB."""
+    cc_psnr: float | None = None
+    """dB, with each channel of the rendering mapped affinely to the photograph's: what is left
+    where exposures differ."""
     ssim: float | None
     """At most 1; None where a mask leaves no window of it."""
     flip: float | None = None
@@ -118,6 +126,8 @@ class Evaluation:
     def __str__(self) -> str:
         """A table, the means last, and what is known of floaters."""
         mean = self.mean
+        if mean.get("cc_psnr", 0.0) < mean["psnr"] + NOTABLE_CORRECTION:
+            mean.pop("cc_psnr", None)
 
         def cells(name: str, figures: Callable[[str], float | None]) -> list[str]:
             values = ((figures(key), HEADINGS[key][1]) for key in mean)
@@ -195,6 +205,7 @@ def evaluate(
             ImageMetrics(
                 name=view.name,
                 psnr=psnr(rgb, target, mask),
+                cc_psnr=psnr(colour_corrected(rgb, target, mask), target, mask),
                 ssim=ssim(rgb, target, mask),
                 flip=flip(rgb, target, mask) if has_flip() else None,
                 lpips=None if lpips is None else lpips(alike, target),

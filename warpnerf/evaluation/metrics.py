@@ -49,6 +49,31 @@ def psnr(rgb: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None) ->
     return -10.0 * math.log10(max(error, 10.0 ** (-MAX_PSNR / 10.0)))
 
 
+def colour_corrected(
+    rgb: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None
+) -> np.ndarray:
+    """A rendering with the exposure of its photograph: each channel mapped affinely, in [0, 1].
+
+    By least squares, as nothing else says which exposure a photograph has that was not trained on.
+
+    Args:
+        rgb: [H, W, 3] in [0, 1].
+        target: The same shape.
+        mask: [H, W] bool, at least one pixel true: those that count; None: all.
+
+    Raises:
+        InputError: Shapes differ, or a value is not finite.
+    """
+    a, b = _checked(rgb, target)
+    counted = (a, b) if mask is None else (a[mask], b[mask])
+    x, y = (image.reshape(-1, 3) for image in counted)
+    mean_x, mean_y = x.mean(axis=0), y.mean(axis=0)
+    variance = ((x - mean_x) ** 2).mean(axis=0)
+    covariance = ((x - mean_x) * (y - mean_y)).mean(axis=0)
+    gain = covariance / np.maximum(variance, 1e-12)
+    return np.clip(mean_y + gain * (a - mean_x), 0.0, 1.0)
+
+
 def ssim(rgb: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None) -> float | None:
     """Structural similarity, mean over pixels and channels; 1 for equal images.
 

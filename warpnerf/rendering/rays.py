@@ -42,7 +42,9 @@ class RayBatch:
     content_distance: wp.array
     """[n_rays] or [1], scene units."""
     target_rgb: wp.array
-    """[n_rays] vec3 in [0, 1]."""
+    """[n_rays] vec3 in [0, 1]; in the field's colours, where photographs have exposures."""
+    views: wp.array | None = None
+    """[n_rays] int32, whose pixel that is, -1 where it is not opaque; None: not drawn from any."""
 
     @property
     def count(self) -> int:
@@ -184,6 +186,15 @@ class PixelSampler:
             self._n_pixels += int(np.count_nonzero(mask))
         return struct
 
+    def expose(self, gains: wp.array, offsets: wp.array) -> None:
+        """From now on take exposures out of the photographs: (pixel - offset) / gain.
+
+        Args:
+            gains: [n_views] vec3 above 0, read at each draw.
+            offsets: [n_views] vec3, likewise.
+        """
+        self._source.gains, self._source.offsets = gains, offsets
+
     def cull_background(self, lattice: Lattice, free: FreeCells) -> float:
         """From now on draw no pixels whose rays, and those of all around them, meet nothing.
 
@@ -261,7 +272,7 @@ class PixelSampler:
         self._workers.launch(
             kernels.sample_pixels,
             batch.count,
-            *(self._source, self._draw, batch.struct, batch.target_rgb),
+            *(self._source, self._draw, batch.struct, batch.target_rgb, batch.views),
             cache=self._launches,
         )
         return batch
@@ -333,4 +344,5 @@ def _room(n_rays: int, workers: Workers) -> RayBatch:
         background=empty(vec3),
         content_distance=empty(real),
         target_rgb=empty(vec3),
+        views=empty(wp.int32),
     )

@@ -206,6 +206,8 @@ class TrainingPass:
         self.n_rays = n_rays
         """Rays of the last run; before the first, those that there is room for."""
         self._outputs = outputs = train_outputs(n_rays, "float32", workers)
+        self.rgb: wp.array = outputs.rgb
+        """What each of these sees, vec3, then room."""
         self.error: wp.array = outputs.error
         """Squared error of each of these, then room."""
         self.loss: wp.array = outputs.loss

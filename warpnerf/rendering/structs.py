@@ -256,6 +256,7 @@ def train_outputs(n_rays: int, precision: str, workers: Workers) -> Any:
     """
     load, device = loader(precision), workers.device
     outputs, real = load("launch.assembly").TrainOutputs(), load("base.types").real
+    outputs.rgb = wp.zeros(n_rays, dtype=load("base.types").vec3, device=device)
     outputs.error = wp.zeros(n_rays, dtype=real, device=device)
     outputs.loss = wp.zeros(n_rays, dtype=real, device=device)
     outputs.n_samples = wp.zeros(n_rays, dtype=wp.int32, device=device)

@@ -22,6 +22,9 @@ USUAL_GAP = 1.5
 USUAL_RISE = 0.5
 """dB that the PSNR rises in the last third of a training that has had time enough: learning rates
 fall then."""
+USUAL_CORRECTION = 0.3
+"""dB by which test views come closer where their colours are corrected, of photographs of one
+exposure."""
 NOTABLE = 0.5
 """dB that a limit is thought to cost before it is named."""
 
@@ -31,7 +34,7 @@ class Limit:
     """What a training's quality is limited by most."""
 
     name: str
-    """voxels, photographs, time; or nothing: none of these stands out."""
+    """voxels, photographs, time, exposures; or nothing: none of these stands out."""
     cost: float
     """About how many dB it costs, a guess."""
     sentence: str
@@ -61,7 +64,10 @@ def voxel_pixels(trainer: Trainer) -> float | None:
 
 
 def what_limits(
-    reports: Sequence[Progress], width: float | None, test_psnr: float | None
+    reports: Sequence[Progress],
+    width: float | None,
+    test_psnr: float | None,
+    corrected: float | None = None,
 ) -> Limit | None:
     """What limits the quality of a training.
 
@@ -70,6 +76,8 @@ def what_limits(
         width: Of a voxel of the final grid where cameras look, pixels; None: voxels do not say how
             fine the field is.
         test_psnr: Mean PSNR of its test views, dB; None: there are none.
+        corrected: The same with their colours corrected, where photographs are thought to have one
+            exposure; None: they are not.
 
     Returns:
         What costs most, by thresholds that are rules of thumb; None: there are too few reports, as
@@ -83,6 +91,9 @@ def what_limits(
     reached = float(psnr[late].mean())
     rise = reached - float(psnr[before].mean())
     gap = 0.0 if test_psnr is None else reached - test_psnr
+    known = test_psnr is not None and corrected is not None
+    gain = corrected - test_psnr if known else 0.0  # type: ignore[operator]
+    of_exposures = max(gain - USUAL_CORRECTION, 0.0)
     wide = "" if width is None else f"voxels are {width:.2g} pixels wide, "
     pixels = SHARP if width is None else max(width, SHARP)
     limits = [
@@ -94,7 +105,7 @@ def what_limits(
         ),
         Limit(
             name="photographs",
-            cost=gap - USUAL_GAP,
+            cost=gap - of_exposures - USUAL_GAP,
             sentence=f"limited by photographs: training views reach {reached:.1f} dB, test views "
             f"{reached - gap:.1f}; try photographs from more places, or fewer --voxels",
         ),
@@ -103,6 +114,12 @@ def what_limits(
             cost=rise - USUAL_RISE,
             sentence=f"limited by time: PSNR of training views rose by {rise:.1f} dB in the last "
             "third; try more --steps, and a longer --time-limit where there is one",
+        ),
+        Limit(
+            name="exposures",
+            cost=of_exposures,
+            sentence=f"limited by exposures: test views come {gain:.1f} dB closer with their "
+            "brightness and white balance corrected; try --appearance affine",
         ),
     ]
     most = max(limits, key=lambda limit: limit.cost)

@@ -39,6 +39,8 @@ from warpnerf.runs.tensor_file import read_tensors, refuse, write_tensors
 from warpnerf.runtime.parallel import Workers
 from warpnerf.scenes.extent.frustum import Frustum
 from warpnerf.scenes.extent.space import grid_size
+from warpnerf.training.exposure import NUMBERS
+from warpnerf.training.exposure import STATE as EXPOSURES
 from warpnerf.training.optim import OPTIMISERS, first_states
 from warpnerf.training.plan import OlderPlan, TrainingPlan
 from warpnerf.training.plan_json import decode, plan_to_json, prepared
@@ -314,6 +316,16 @@ def _optimiser(
             if not fits:
                 refuse(path, f"its tensor '{parameter}.{name}' does not fit its values")
             arrays[name] = wp.array(tensor, dtype=array.dtype, device=workers.device)
+    if (name := f"{EXPOSURES}.sums") in tensors:
+        sums, applied = tensors[name], tensors[f"{EXPOSURES}.applied"]
+        if sums.dtype != np.float32 or sums.size % NUMBERS or not np.isfinite(sums).all():
+            refuse(path, f"its tensor '{name}' does not fit its photographs")
+        if applied.size != 1 or applied.item() not in (0.0, 1.0):
+            refuse(path, f"its tensor '{EXPOSURES}.applied' is neither 0 nor 1")
+        states[EXPOSURES] = {
+            name: wp.array(tensor.ravel(), dtype=wp.float32, device=workers.device)
+            for name, tensor in (("sums", sums), ("applied", applied))
+        }
     return states
 
 
@@ -438,6 +450,11 @@ def _read(path: Path) -> tuple[_Header, dict[str, np.ndarray]]:
             for parameter, rule in rules.items()
             for name in OPTIMISERS[rule].state_names
         }
+        plan = header.training.plan
+        exposed = {f"{EXPOSURES}.sums", f"{EXPOSURES}.applied"}
+        appearance = "none" if plan is None else plan.config.appearance
+        if appearance == "affine" or (appearance == "auto" and exposed & set(tensors)):
+            names |= exposed
     if set(tensors) != names or (header.training is not None) != (kind == TRAINING):
         refuse(path, f"it holds {', '.join(sorted(tensors))} instead of {', '.join(sorted(names))}")
     return header, tensors

@@ -294,6 +294,11 @@ class Scene:
         """The cameras of the training split."""
         return [self.views[index].camera for index in self.splits["train"]]
 
+    @property
+    def training_names(self) -> list[str]:
+        """The names of the views of the training split."""
+        return [self.views[index].name for index in self.splits["train"]]
+
 
 def require_split(scene: Scene, split: str) -> tuple[int, ...]:
     """Indices of a split's views; "all" is every view.

@@ -141,6 +141,7 @@ def extent_by_training(
         march=replace(config.march, growth=QUICK_GROWTH if contracted else "auto"),
         # Without a decay: what is near is not known yet.
         optim=replace(config.optim, restart_at_growth=False, near_decay=0.0),
+        appearance="none",
         field=DENSE,
         sampler=MARCHED,
     )

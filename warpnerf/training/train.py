@@ -13,6 +13,7 @@ from warpnerf.rendering.field import Field
 from warpnerf.runtime.progress import ProgressBar, has_bar
 from warpnerf.scenes.scene import Scene
 from warpnerf.training.coarse import prepare_trainer
+from warpnerf.training.exposure import Exposure
 from warpnerf.training.held_out import HeldOut, require_eval
 from warpnerf.training.state import Progress, TrainingState
 
@@ -29,6 +30,8 @@ class TrainResult:
     """The last report."""
     scene: Scene
     """What was trained on, with the extent that was used: it may have been looked for first."""
+    exposures: dict[str, Exposure] | None
+    """Of the training views, by name, where ``TrainConfig.appearance`` fits them."""
 
 
 @checked_arguments
@@ -98,4 +101,7 @@ def train(
         content_distance=trainer.plan.content_distance,
         progress=last or end,
         scene=trainer.scene,
+        exposures=None
+        if trainer.exposures is None
+        else trainer.exposures.by_name(scene.training_names),
     )

@@ -27,6 +27,7 @@ from warpnerf.runtime.memory import release_free_memory
 from warpnerf.runtime.parallel import Workers
 from warpnerf.scenes.extent.points import ObservedExtent, with_extent
 from warpnerf.scenes.scene import Scene
+from warpnerf.training.exposure import STATE, Exposures
 from warpnerf.training.extent import march_steps, require_samples
 from warpnerf.training.growth import (
     first_storage,
@@ -140,6 +141,14 @@ class Trainer:
             self.optimiser = first_states(self.parameters(), self.workers)
         else:
             self._restore(resume)
+        self.exposures: Exposures | None = None
+        """Those of the training views, where it fits them."""
+        exposed = self.optimiser.pop(STATE, None)
+        if config.appearance != "none" and (exposed is not None or resume is None):
+            always = config.appearance == "affine"
+            n_views = len(scene.splits["train"])
+            self.exposures = Exposures(n_views, self.workers, always, exposed)
+            self._sampler.expose(self.exposures.gains, self.exposures.offsets)
         self._occupied = self.free.share()
         self._seen = 1.0
         if resume is not None:
@@ -247,6 +256,8 @@ class Trainer:
         self._pass.run(self.free, batch, n_steps, share)
         if self._resampling is not None:
             self._resampling.learn(batch, n_steps * share, self._updates, self.fraction)
+        if self.exposures is not None:
+            self.exposures.add(batch, self._pass.rgb, self.fraction)
 
     def _add_gradients(self) -> None:
         """Sum the gradients of all processes."""
@@ -255,6 +266,8 @@ class Trainer:
             gradients = self._resampling.gradients
             parameters = self.proposal.parameters(self.config.optim)
             accumulated += [(gradients, parameter) for parameter in parameters]
+        if self.exposures is not None:
+            accumulated.append(self.exposures.accumulated)
         self.peers.add(accumulated)
 
     def _regularise(self, fraction: float, n_steps: int) -> None:
@@ -272,6 +285,9 @@ class Trainer:
         adam_step(*of_field, *how, self.workers, self._decays)
         if self._resampling is not None:
             self._resampling.step(self.optimiser, *how)
+        if self.exposures is not None:
+            self.exposures.fit(n_steps)
+            self.exposures = self.exposures.settled(self.fraction)
 
     def report(self) -> Progress:
         """Where training stands; FloatingPointError where the loss is not finite."""
@@ -316,7 +332,7 @@ class Trainer:
             restarted=self._restarted,
             progress=progress,
             field=self.field(),
-            optimiser=self.optimiser,
+            optimiser=self.optimiser | ({} if self.exposures is None else self.exposures.state),
         )
 
     def _require_finite(self) -> None:

@@ -11,7 +11,7 @@ from typing import get_args
 import warp as wp
 from warpnerf_kernels.fields import dense_bound
 from warpnerf_kernels.launch import assembly
-from warpnerf_kernels.optim import adam, near_decay
+from warpnerf_kernels.optim import adam, exposure, near_decay
 from warpnerf_kernels.sampling import coverage, occupancy
 from warpnerf_kernels.space import camera
 
@@ -54,6 +54,7 @@ def training_kernels(
     stored: StorageKind = DENSE,
     sampler: SamplerKind = MARCHED,
     decays: bool = False,
+    exposes: bool = False,
 ) -> list[wp.Kernel]:
     """The kernels of a training from its first step to its last; at least one for each module.
 
@@ -69,6 +70,7 @@ def training_kernels(
         assembly.render_train_kernel(variant),
         *class_of(stored).kernels(stored, model),
         *(decaying if decays else []),
+        *([exposure.add_moments] if exposes else []),
         adam.adam_weights,
         dense_bound.join_highest,
         occupancy.mark_occupied_kernel(
@@ -94,6 +96,7 @@ def kernels_of(plan: TrainingPlan, contraction: Contraction, device: wp.Device) 
         config.field,
         plan.sampler,
         config.optim.near_decay > 0.0,
+        config.appearance != "none",
     )
 
 

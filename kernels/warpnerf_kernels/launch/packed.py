@@ -268,6 +268,7 @@ def train(variant: Variant) -> wp.Kernel:
                 rgb = scratch.rows[row + r].rgb + scratch.rows[row + r].transmittance * ray_value(
                     rays.background, i
                 )
+                out_rays.rgb[i] = rgb
                 out_rays.error[i] = squared_error(rgb, target_rgb[i])
                 loss = photometric_value(scene.loss.photometric, rgb, target_rgb[i])
                 if wp.static(has_loss):

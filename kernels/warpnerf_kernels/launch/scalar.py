@@ -153,6 +153,7 @@ def train(variant: Variant) -> wp.Kernel:
         opacity = real(1.0) - total.transmittance
         rgb = shade(scene.head, ray.direction, total.channels, opacity)
         rgb += total.transmittance * behind_all
+        out_rays.rgb[i] = rgb
         out_rays.error[i] = squared_error(rgb, target_rgb[i])
         loss = photometric_value(scene.loss.photometric, rgb, target_rgb[i])
         loss += ray_loss(scene.loss.on_ray, total.loss, total.transmittance)

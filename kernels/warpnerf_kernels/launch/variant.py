@@ -34,6 +34,7 @@ def render_outputs_type(n_channels: int) -> type:
 class TrainOutputs:
     """What a training launch tells of rays."""
 
+    rgb: wp.array(dtype=vec3)  # [n_rays] with background
     error: wp.array(dtype=real)  # [n_rays] squared error
     loss: wp.array(dtype=real)  # [n_rays]
     n_samples: wp.array(dtype=wp.int32)  # [n_rays]

@@ -54,6 +54,8 @@ class PixelSource:
     views: wp.array(dtype=CameraParams)  # [n_views], by first_pixel
     n_pixels: wp.int64  # that count in all of them
     content_distances: wp.array(dtype=real)  # [n_views] scene units
+    gains: wp.array(dtype=vec3)  # [n_views] of their exposures; empty: pixels are as they are
+    offsets: wp.array(dtype=vec3)  # [n_views] likewise
     block: int  # edge of a block of pixels
     first_blocks: wp.array(dtype=int)  # [n_views] how many the views before have
     covered: wp.array(dtype=wp.uint8)  # [n_blocks] 0: nothing is drawn there; empty: draw anywhere
@@ -316,6 +318,7 @@ def sample_pixels(
     # out
     out_rays: Rays,
     out_target_rgb: wp.array(dtype=vec3),  # [n_rays] the pixel over its background, in [0, 1]
+    out_views: wp.array(dtype=wp.int32),  # [n_rays] its photograph; -1: the pixel is not opaque
 ):
     """A batch of rays through random pixels, all that count and are covered equally likely."""
     i = first + wp.tid()
@@ -342,7 +345,10 @@ def sample_pixels(
     unit = real(1.0) / real(255.0)
     alpha = real(opaque) * unit
     rgb = unit * vec3(real(view.pixels[at]), real(view.pixels[at + 1]), real(view.pixels[at + 2]))
+    if source.gains.shape[0] > 0:
+        rgb = wp.cw_div(rgb - source.offsets[v], source.gains[v])
     out_rays.offsets[i] = offset
     out_rays.background[i] = behind
     out_rays.content_distance[i] = source.content_distances[v]
     out_target_rgb[i] = alpha * rgb + (real(1.0) - alpha) * behind
+    out_views[i] = wp.where(opaque == wp.uint8(255), v, -1)

@@ -1,0 +1,163 @@
+"""Exposures of photographs, fitted while a field trains."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+
+import warpnerf as wn
+from tests.support.tiny_fields import assert_same_state
+from tests.support.tiny_trainings import (
+    NO_GROWTH,
+    STEPS,
+    ball,
+    early_growth,
+    stopped_at,
+    tiny_config,
+    without_seconds,
+)
+from warpnerf.checks import InputError
+from warpnerf.rendering.rays import RayBatch
+from warpnerf.runs.checkpoint import load_checkpoint, save_checkpoint
+from warpnerf.runtime.parallel import Workers
+from warpnerf.training import exposure
+from warpnerf.training.exposure import Exposures
+from warpnerf.training.trainer import Trainer
+
+__all__ = ["early_growth"]
+
+GAINS = np.array([[0.6, 0.8, 0.7], [1.0, 1.1, 1.2], [1.5, 1.2, 1.1]])
+OFFSETS = np.array([[0.1, 0.0, 0.05], [0.0, 0.02, 0.0], [-0.1, -0.02, -0.05]])
+
+
+def test_exposures_of_known_photographs_are_found(device: str) -> None:
+    """Up to those of all, which the field has: colours of the field are fitted once more."""
+    workers, rng = Workers(device, 2), np.random.default_rng(0)
+    exposures = Exposures(3, workers)
+    for _ in range(30):
+        views = rng.integers(0, 3, 3000)
+        colours = rng.uniform(0.2, 0.8, (3000, 3))
+        pixels = GAINS[views] * colours + OFFSETS[views]
+        gains, offsets = exposures.gains.numpy(), exposures.offsets.numpy()
+        target = (pixels - offsets[views]) / gains[views]
+        vectors = [wp.array(v, dtype=wp.vec3, device=workers.device) for v in (target, colours)]
+        batch = RayBatch(
+            **dict.fromkeys(("directions", "offsets", "background"), vectors[0]),
+            origins=vectors[0],
+            content_distance=vectors[0],
+            target_rgb=vectors[0],
+            views=wp.array(views, dtype=wp.int32, device=workers.device),
+        )
+        exposures.add(batch, vectors[1], 1.0)
+        exposures.fit(1)
+    found = exposures.by_name(["a", "b", "c"])
+    mean = np.exp(np.log(GAINS).mean(axis=0))
+    for name, gain in zip("abc", GAINS, strict=True):
+        np.testing.assert_allclose(found[name].gain, gain / mean, rtol=0.02)
+    offsets = np.array([found[name].offset for name in "abc"])
+    np.testing.assert_allclose(offsets.mean(axis=0), 0.0, atol=1e-6)
+    words = exposures.in_words(["a", "b", "c"])
+    assert words.endswith("grey, a is 0.81 times as bright, c 1.17 times")
+
+
+def exposed() -> wn.Scene:
+    """The ball, of one colour, whose second photograph is much darker."""
+    scene = ball()
+    for view in scene.views:
+        view.image[..., :3] = [50, 60, 40] if view is scene.views[1] else [150, 180, 120]
+    return scene
+
+
+def grey_of(result: wn.TrainResult) -> dict[str, float]:
+    """What half grey looks like in each photograph."""
+    assert result.exposures is not None
+    of_all = result.exposures.items()
+    return {name: float(0.5 * np.mean(of.gain) + np.mean(of.offset)) for name, of in of_all}
+
+
+def test_a_darker_photograph_has_a_smaller_gain() -> None:
+    result = wn.train(exposed(), tiny_config(grid=NO_GROWTH, appearance="affine", steps=80))
+    grey = grey_of(result)
+    assert list(grey) == result.scene.training_names
+    assert min(grey, key=grey.__getitem__) == result.scene.views[1].name
+    assert min(grey.values()) < 0.8 * max(grey.values())
+    plain = wn.train(exposed(), tiny_config(grid=NO_GROWTH, appearance="none"))
+    assert plain.exposures is None
+
+
+def test_auto_fits_those_that_differ_alone() -> None:
+    """And changes no bit where photographs are alike."""
+    config = tiny_config(grid=NO_GROWTH, appearance="auto", steps=120)
+    result = wn.train(exposed(), config)
+    assert grey_of(result)[result.scene.views[1].name] < 0.45
+    alike = exposed()
+    for view in alike.views:
+        view.image[..., :3] = [150, 180, 120]
+    auto, none = (
+        wn.train(alike, replace(config, appearance=appearance)) for appearance in ("auto", "none")
+    )
+    assert auto.exposures is None
+    for name, tensor in auto.field.storage.tensors().items():
+        np.testing.assert_array_equal(tensor, none.field.storage.tensors()[name])
+
+
+def test_auto_judges_once() -> None:
+    exposures = Exposures(3, Workers("cpu", 1), applied=False)
+    assert exposures.settled(exposure.JUDGED - 0.01) is exposures and not exposures.applied
+    assert exposures.settled(exposure.JUDGED) is None
+    exposures.applied = True
+    assert exposures.settled(1.0) is exposures
+
+
+def test_the_first_share_of_a_training_has_none() -> None:
+    trainer = Trainer(exposed(), tiny_config(appearance="affine", steps=80))
+    assert trainer.exposures is not None
+    while trainer.fraction < exposure.BEGIN:
+        trainer.update()
+    assert (trainer.exposures.sums.numpy() == 0.0).all()
+    assert (trainer.exposures.gains.numpy() == 1.0).all()
+    trainer.update()
+    assert (trainer.exposures.gains.numpy() != 1.0).any()
+
+
+@pytest.mark.parametrize("appearance", ["auto", "affine"])
+@pytest.mark.parametrize("step", [1, 2, 9, 17])
+def test_resumed_it_ends_the_same(
+    step: int, appearance: Any, tmp_path: Path, on_cpu: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(exposure, "JUDGED", 0.3)
+    config = tiny_config(appearance=appearance, threads=2)
+    whole = stopped_at(STEPS, tmp_path / "whole", config, exposed())
+    begun = stopped_at(step, tmp_path / "begun", config, exposed())
+    resumed = stopped_at(STEPS, tmp_path / "resumed", begun.config, exposed(), begun)
+    assert_same_state(without_seconds(resumed), without_seconds(whole))
+    assert (whole.optimiser[exposure.STATE]["sums"].numpy() != 0.0).any()
+
+
+def test_what_does_not_fit_the_photographs_is_refused(tmp_path: Path, on_cpu: None) -> None:
+    file, config = tmp_path / "begun", tiny_config(appearance="affine")
+    begun = stopped_at(9, file, config, exposed())
+    n = exposure.NUMBERS
+    for sums, applied, says in (
+        (np.zeros(2 * n), 1.0, "exposures of 2 photographs, but the scene has 3; bring"),
+        (np.zeros(7), 1.0, "its tensor 'exposures.sums' does not fit its photographs"),
+        (np.full(3 * n, np.nan), 1.0, "does not fit its photographs"),
+        (np.zeros(3 * n), 0.5, "its tensor 'exposures.applied' is neither 0 nor 1"),
+    ):
+        arrays = {
+            name: wp.array(values, dtype=wp.float32, device="cpu")
+            for name, values in (("sums", sums), ("applied", [applied]))
+        }
+        other = replace(begun, optimiser=begun.optimiser | {exposure.STATE: arrays})
+        save_checkpoint(file, other)
+        with pytest.raises(InputError, match=says):
+            Trainer(exposed(), config, load_checkpoint(file))
+    with pytest.raises(InputError, match="appearance is none, but the training to be resumed has"):
+        Trainer(exposed(), tiny_config(appearance="none"), begun)
+    with pytest.raises(InputError, match="appearance must be one of auto, none, affine, not"):
+        tiny_config(appearance="gain")
