@@ -70,7 +70,7 @@ def test_every_warning_is_in_the_guide() -> None:
 def test_what_the_guide_quotes_is_said() -> None:
     strings = [
         text_of(node)
-        for tree in sources("scenes", "inspection", "sfm", "reports")
+        for tree in sources("scenes", "inspection", "sfm", "reports", "training")
         for node in ast.walk(tree)
         if isinstance(node, ast.JoinedStr | ast.Constant)
     ]

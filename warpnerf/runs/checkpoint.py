@@ -450,7 +450,7 @@ def _read(path: Path) -> tuple[_Header, dict[str, np.ndarray]]:
             for parameter, rule in rules.items()
             for name in OPTIMISERS[rule].state_names
         }
-        plan = header.training.plan
+        plan = header.training.plan or header.training.older
         exposed = {f"{EXPOSURES}.sums", f"{EXPOSURES}.applied"}
         appearance = "none" if plan is None else plan.config.appearance
         if appearance == "affine" or (appearance == "auto" and exposed & set(tensors)):
