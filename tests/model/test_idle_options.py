@@ -108,6 +108,7 @@ def test_a_short_training_takes_over_what_it_has_a_use_for(
     def prepare_trainer(scene: wn.Scene, config: wn.TrainConfig, **options: Any) -> None:
         assert config.grid.grow_at == () and config.grid.contraction == "linf"
         assert config.optim.near_decay == 0.0  # what is near is not known yet
+        assert config.appearance == "none"
         raise Begun
 
     monkeypatch.setattr(coarse, "Trainer", prepare_trainer)

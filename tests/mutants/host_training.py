@@ -45,6 +45,21 @@ TILE_DECAY = f"{NEAR_DECAY}::test_each_tile_has_that_of_its_middle_node"
 FAR_DECAY = f"{NEAR_DECAY}::test_places_at_infinity_have_none"
 BENT_DECAY = f"{NEAR_DECAY}::test_a_lens_that_bends_sees_all_along_its_rays"
 DECAYED = f"{NEAR_DECAY}::test_an_update_lowers_the_densities_that_it_moves"
+OF_EXPOSURE = "training/test_exposure.py::test_"
+FIRST_SHARE, DIFFER_ALONE, JUDGES_ONCE, AS_THEY_STAND, EXPOSED_RESUMED, EXPOSED_REFUSED = (
+    f"{OF_EXPOSURE}{name}"
+    for name in (
+        "the_first_share_of_a_training_has_none",
+        "auto_fits_those_that_differ_alone",
+        "auto_judges_once",
+        "batches_are_drawn_by_the_exposures_as_they_stand",
+        "resumed_it_ends_the_same",
+        "what_does_not_fit_the_photographs_is_refused",
+    )
+)
+PROCESSES = "training/test_processes.py::test_processes_with_a_share_of_the_rays_are_one_with_all"
+CORRECTED = "evaluation/test_metrics.py::test_corrected_colours_are_those_of_another_exposure"
+LIMIT_EXPOSURES = "reports/test_limits.py::test_exposures_are_named_where_corrected_colours_come_closer"
 SHORT_USES = "model/test_idle_options.py::test_a_short_training_takes_over_what_it_has_a_use_for"
 FACE = "training/test_optim.py::test_total_variation_counts_the_face_between_two_nodes"
 ADAM_WEIGHTS = (
@@ -265,6 +280,23 @@ MUTANTS = [
     of_host("a decay that no update has", TRAINER, "self.workers, self._decays)", "self.workers)", DECAYED),
     of_host("a decay that is always on", "fields/dense.py", "if strength == 0.0:", "if False:", DECAYED),
     of_host("a decay in the short training", COARSE, ", near_decay=0.0)", ")", SHORT_USES),
+    # exposure.py
+    of_host("exposures: fitted from the start", "training/exposure.py", "if fraction < BEGIN:", "if False:", FIRST_SHARE),
+    of_host("exposures: auto takes all", "training/exposure.py", ".std()) < DIFFERENT", ".std()) < 0.0", DIFFER_ALONE),
+    of_host("exposures: auto takes none", "training/exposure.py", ".std()) < DIFFERENT", ".std()) < 9.0", DIFFER_ALONE),
+    of_host("exposures: auto judges again", "training/exposure.py", "if self.applied or fraction < JUDGED:", "if fraction < JUDGED:", JUDGES_ONCE),
+    of_host("exposures: on trial but used", "training/exposure.py", "(self.gains, self.offsets) if self.applied else self._on_trial", "(self.gains, self.offsets)", DIFFER_ALONE),
+    of_host("exposures: none drawn", TRAINER, "            self._sampler.expose(self.exposures.gains, self.exposures.offsets)\n", "", AS_THEY_STAND),
+    of_host("exposures: begun again", TRAINER, "self.workers, always, exposed)", "self.workers, always)", EXPOSED_RESUMED),
+    of_host("exposures: judged again where resumed", "training/exposure.py", "self.sums, self.applied = state[\"sums\"], bool(state[\"applied\"].numpy()[0])", "self.sums = state[\"sums\"]", EXPOSED_RESUMED),
+    of_host("exposures: without those of other processes", TRAINER, "            accumulated.append(self.exposures.accumulated)\n", "            pass\n", PROCESSES),
+    of_host("exposures: of any number of photographs", "training/exposure.py", "if self.sums.size != n_views * NUMBERS:", "if False:", EXPOSED_REFUSED),
+    of_host("exposures: no number", CHECKPOINT, "or not np.isfinite(sums).all():", "or False:", EXPOSED_REFUSED),
+    of_host("exposures: half applied", CHECKPOINT, "applied.item() not in (0.0, 1.0)", "False", EXPOSED_REFUSED),
+    of_host("exposures: in the short training", COARSE, '        appearance="none",\n', "", SHORT_USES),
+    of_host("corrected by the whole picture", "evaluation/metrics.py", "(a, b) if mask is None else (a[mask], b[mask])", "(a, b)", CORRECTED),
+    of_host("corrected beyond white", "evaluation/metrics.py", "np.clip(mean_y + gain * (a - mean_x), 0.0, 1.0)", "mean_y + gain * (a - mean_x)", CORRECTED),
+    of_host("exposures are photographs that are missing", "reports/limits.py", "cost=gap - of_exposures - USUAL_GAP", "cost=gap - USUAL_GAP", LIMIT_EXPOSURES),
     # optim.py
     of_host("edges for faces", SMOOTHING, "** (2.0 / 3.0)", "** (1.0 / 3.0)", FACE),
     of_host("each update's own", SMOOTHING, "factor = face * self.every * ", "factor = face * ", FACE),

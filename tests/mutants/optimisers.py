@@ -5,6 +5,8 @@ from mutant import Mutant
 TILES = "kernels/test_tiles.py"
 VARIATION = "kernels/test_total_variation.py"
 ADAM, NEAR_DECAY = "kernels/test_adam.py", "fields/test_near_decay.py"
+EXPOSURE = "kernels/test_exposure.py"
+EXPOSED = "kernels/test_camera_rays.py::test_exposures_are_taken_out_of_pixels_before_their_background"
 
 MUTANTS = [
     # tiles.py
@@ -104,6 +106,25 @@ MUTANTS = [
            " and place[1] < camera.high[1] * depth + margin", "", NEAR_DECAY),
     Mutant("decay near cameras: a fisheye sees all around", "optim/near_decay.py",
            "return depth + margin > camera.cosine * wp.length(away)", "return True", NEAR_DECAY),
+    # exposure.py
+    Mutant("exposures: pixels that are cut off count", "optim/exposure.py",
+           "if pixel > real(wp.static(CLIPPED)) and pixel < real(wp.static(1.0 - CLIPPED)):", "if True:", EXPOSURE),
+    Mutant("exposures: pixels in the field's colours", "optim/exposure.py",
+           "gains[v][c] * target_rgb[i][c] + offsets[v][c]", "target_rgb[i][c]", EXPOSURE),
+    Mutant("exposures: all photographs count", "optim/exposure.py", "    if v < 0:\n        return\n", "    v = wp.max(v, 0)\n", EXPOSURE),
+    Mutant("exposures: moments of another", "optim/exposure.py",
+           "wp.atomic_add(out_moments, 0, at + 4, x * y)", "wp.atomic_add(out_moments, 0, at + 4, y * y)", EXPOSURE),
+    Mutant("exposures: nothing is forgotten", "optim/exposure.py", "keep * out_sums[at + k] +", "out_sums[at + k] +", EXPOSURE),
+    Mutant("exposures: moments count again", "optim/exposure.py", "            out_moments[0, at + k] = real(0.0)\n", "", EXPOSURE),
+    Mutant("exposures: a prior of no colours", "optim/exposure.py", "out_sums[at + 3] + prior * real(1.0 / 12.0)", "out_sums[at + 3]", EXPOSURE),
+    Mutant("exposures: a prior that darkens", "optim/exposure.py", "xy = out_sums[at + 4] + prior * real(1.0 / 12.0)", "xy = out_sums[at + 4]", EXPOSURE),
+    Mutant("exposures: slopes of noise", "optim/exposure.py", "real(1.0) / most, most)", "real(-100.0), most)", EXPOSURE),
+    Mutant("exposures: offsets about black", "optim/exposure.py", "(y - slope * x) / n - half * slope", "(y - slope * x) / n", EXPOSURE),
+    Mutant("exposures: the arithmetic mean", "optim/exposure.py", "mean = wp.exp(total / real(n))", "mean = wp.exp(total)", EXPOSURE),
+    Mutant("exposures: offsets keep their mean", "optim/exposure.py", "offset[c] - gain[c] * darker", "offset[c]", EXPOSURE),
+    Mutant("draw: offsets added", "space/camera.py", "rgb - source.offsets[v]", "rgb + source.offsets[v]", EXPOSED),
+    Mutant("draw: the first photograph's exposure", "space/camera.py", "source.gains[v])", "source.gains[0])", EXPOSED),
+    Mutant("draw: transparent pixels are somebody's", "space/camera.py", "wp.where(opaque == wp.uint8(255), v, -1)", "v", EXPOSED),
     # adam.py
     Mutant("Adam: a decay raises", "optim/adam.py", "+ adam.epsilon) - fall;", "+ adam.epsilon) + fall;", ADAM),
     Mutant("Adam: all numbers decay", "optim/adam.py", "(c + n) % FLOATS ? 0.0f : decay", "decay", ADAM),

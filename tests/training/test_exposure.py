@@ -125,6 +125,19 @@ def test_the_first_share_of_a_training_has_none() -> None:
     assert (trainer.exposures.gains.numpy() != 1.0).any()
 
 
+def test_batches_are_drawn_by_the_exposures_as_they_stand() -> None:
+    trainer = Trainer(exposed(), tiny_config(appearance="affine"))
+    assert trainer.exposures is not None
+    before = trainer._draw(1).target_rgb.numpy().copy()
+    trainer.exposures.gains.fill_(wp.vec3(0.5, 0.5, 0.5))
+    batch = trainer._draw(1)
+    opaque = batch.views.numpy() >= 0
+    assert opaque.any() and not opaque.all()
+    after = batch.target_rgb.numpy()
+    np.testing.assert_allclose(after[opaque], 2.0 * before[opaque], rtol=1e-6)
+    np.testing.assert_array_equal(after[~opaque], before[~opaque])
+
+
 @pytest.mark.parametrize("appearance", ["auto", "affine"])
 @pytest.mark.parametrize("step", [1, 2, 9, 17])
 def test_resumed_it_ends_the_same(
