@@ -1,6 +1,6 @@
 """What photographs of different exposure cost a field, and what fitting their exposures gives back.
 
-    python benchmarks/exposures.py fox_q stitch lund_door builtin:room --steps 1500
+    python benchmarks/exposures.py fox_q stitch lund_door builtin:room-sparse
 
 Training views are given an exposure and a white balance of their own: their light (sRGB decoded)
 is multiplied by 2^x, x normal of deviation --stops, and each channel by 2^y, y of a quarter of
@@ -38,7 +38,7 @@ BALANCE = 0.25
 def main() -> None:
     parser = options(__doc__)
     parser.add_argument("scenes", nargs="+", help="builtin:room, folders")
-    parser.add_argument("--stops", type=float, nargs="+", default=[0.0, 0.2, 0.4])
+    parser.add_argument("--stops", type=float, nargs="+", default=[0.0, 0.4])
     parser.add_argument("--steps", type=int, default=1500)
     parser.add_argument("--voxels", type=int, default=2_000_000)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])

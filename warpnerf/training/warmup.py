@@ -186,6 +186,7 @@ def warm_up(
                     stored,
                     sampler,
                     config.optim.near_decay > 0.0,
+                    config.appearance != "none",
                 ):
                     words = _words(kernel, contraction, stored, scaling, losses) + of_model
                     words += ", proposal" * (kernel in proposals)
