@@ -15,7 +15,13 @@ from warpnerf.model.spaces import part_of
 from warpnerf.model.storage_kinds import Vm
 from warpnerf.rendering.structs import variant_of
 
-SHARED = ["optim.exposure", "optim.near_decay", "sampling.occupancy", "space.camera", "space.reprojection"]
+SHARED = [
+    "optim.exposure",
+    "optim.near_decay",
+    "sampling.occupancy",
+    "space.camera",
+    "space.reprojection",
+]
 """Modules of the kernels that all models share."""
 
 

@@ -46,12 +46,21 @@ FAR_DECAY = f"{NEAR_DECAY}::test_places_at_infinity_have_none"
 BENT_DECAY = f"{NEAR_DECAY}::test_a_lens_that_bends_sees_all_along_its_rays"
 DECAYED = f"{NEAR_DECAY}::test_an_update_lowers_the_densities_that_it_moves"
 OF_EXPOSURE = "training/test_exposure.py::test_"
-FIRST_SHARE, DIFFER_ALONE, JUDGES_ONCE, AS_THEY_STAND, EXPOSED_RESUMED, EXPOSED_REFUSED = (
+(
+    FIRST_SHARE,
+    DIFFER_ALONE,
+    JUDGES_ONCE,
+    COUNT_LESS,
+    AS_THEY_STAND,
+    EXPOSED_RESUMED,
+    EXPOSED_REFUSED,
+) = (
     f"{OF_EXPOSURE}{name}"
     for name in (
         "the_first_share_of_a_training_has_none",
         "auto_fits_those_that_differ_alone",
         "auto_judges_once",
+        "older_rays_count_less_by_how_many_came_since",
         "batches_are_drawn_by_the_exposures_as_they_stand",
         "resumed_it_ends_the_same",
         "what_does_not_fit_the_photographs_is_refused",
@@ -59,7 +68,9 @@ FIRST_SHARE, DIFFER_ALONE, JUDGES_ONCE, AS_THEY_STAND, EXPOSED_RESUMED, EXPOSED_
 )
 PROCESSES = "training/test_processes.py::test_processes_with_a_share_of_the_rays_are_one_with_all"
 CORRECTED = "evaluation/test_metrics.py::test_corrected_colours_are_those_of_another_exposure"
-LIMIT_EXPOSURES = "reports/test_limits.py::test_exposures_are_named_where_corrected_colours_come_closer"
+LIMIT_EXPOSURES = (
+    "reports/test_limits.py::test_exposures_are_named_where_corrected_colours_come_closer"
+)
 SHORT_USES = "model/test_idle_options.py::test_a_short_training_takes_over_what_it_has_a_use_for"
 FACE = "training/test_optim.py::test_total_variation_counts_the_face_between_two_nodes"
 ADAM_WEIGHTS = (
@@ -286,6 +297,7 @@ MUTANTS = [
     of_host("exposures: auto takes none", "training/exposure.py", ".std()) < DIFFERENT", ".std()) < 9.0", DIFFER_ALONE),
     of_host("exposures: auto judges again", "training/exposure.py", "if self.applied or fraction < JUDGED:", "if fraction < JUDGED:", JUDGES_ONCE),
     of_host("exposures: on trial but used", "training/exposure.py", "(self.gains, self.offsets) if self.applied else self._on_trial", "(self.gains, self.offsets)", DIFFER_ALONE),
+    of_host("exposures: older rays by all that came", "training/exposure.py", "(n_views * WINDOW)", "WINDOW", COUNT_LESS),
     of_host("exposures: none drawn", TRAINER, "            self._sampler.expose(self.exposures.gains, self.exposures.offsets)\n", "", AS_THEY_STAND),
     of_host("exposures: begun again", TRAINER, "self.workers, always, exposed)", "self.workers, always)", EXPOSED_RESUMED),
     of_host("exposures: judged again where resumed", "training/exposure.py", "self.sums, self.applied = state[\"sums\"], bool(state[\"applied\"].numpy()[0])", "self.sums = state[\"sums\"]", EXPOSED_RESUMED),

@@ -6,7 +6,9 @@ TILES = "kernels/test_tiles.py"
 VARIATION = "kernels/test_total_variation.py"
 ADAM, NEAR_DECAY = "kernels/test_adam.py", "fields/test_near_decay.py"
 EXPOSURE = "kernels/test_exposure.py"
-EXPOSED = "kernels/test_camera_rays.py::test_exposures_are_taken_out_of_pixels_before_their_background"
+EXPOSED = (
+    "kernels/test_camera_rays.py::test_exposures_are_taken_out_of_pixels_before_their_background"
+)
 
 MUTANTS = [
     # tiles.py

@@ -54,7 +54,7 @@ def test_exposures_of_known_photographs_are_found(device: str) -> None:
             views=wp.array(views, dtype=wp.int32, device=workers.device),
         )
         exposures.add(batch, vectors[1], 1.0)
-        exposures.fit(1)
+        exposures.fit(3000)
     found = exposures.by_name(["a", "b", "c"])
     mean = np.exp(np.log(GAINS).mean(axis=0))
     for name, gain in zip("abc", GAINS, strict=True):
@@ -104,6 +104,14 @@ def test_auto_fits_those_that_differ_alone() -> None:
     assert auto.exposures is None
     for name, tensor in auto.field.storage.tensors().items():
         np.testing.assert_array_equal(tensor, none.field.storage.tensors()[name])
+
+
+def test_older_rays_count_less_by_how_many_came_since() -> None:
+    exposures = Exposures(3, Workers("cpu", 1))
+    exposures.sums.fill_(1.0)
+    exposures.fit(1500)  # of which each photograph has 500
+    exposures.fit(10_500)
+    np.testing.assert_allclose(exposures.sums.numpy(), np.exp(-1.0), rtol=1e-6)
 
 
 def test_auto_judges_once() -> None:

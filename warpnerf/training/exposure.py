@@ -7,6 +7,7 @@ near the cameras, which each camera sees alone.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -29,8 +30,8 @@ JUDGED = 0.08
 """Share of the training after which auto judges whether photographs differ."""
 DIFFERENT = 0.03
 """Deviation of the logarithm of their brightness from which they do."""
-KEPT = 0.99
-"""Weight of a ray relative to one of the next step."""
+WINDOW = 4000.0
+"""Rays of a photograph, after which the weight of those before has fallen to 1/e."""
 PRIOR = 50.0
 """Rays, of colours that are uniform and the same in photograph and field, which each photograph has
 besides its own."""
@@ -140,15 +141,17 @@ class Exposures:
         )
         return gradients, parameter
 
-    def fit(self, n_steps: int) -> None:
+    def fit(self, n_rays: int) -> None:
         """Fit the exposures to what was taken in.
 
         Args:
-            n_steps: Since the last time.
+            n_rays: Drawn since the last time, of all photographs.
         """
         found = (self.gains, self.offsets) if self.applied else self._on_trial
-        given = KEPT**n_steps, PRIOR, self._moments, self.sums
-        self._workers.launch(kernels.fit_exposures, len(self.gains), *given, *found)
+        n_views = len(self.gains)
+        kept = math.exp(-n_rays / (n_views * WINDOW))
+        given = kept, PRIOR, self._moments, self.sums
+        self._workers.launch(kernels.fit_exposures, n_views, *given, *found)
         self._workers.launch(kernels.centre_exposures, 3, *found)
 
     @property

@@ -286,7 +286,7 @@ class Trainer:
         if self._resampling is not None:
             self._resampling.step(self.optimiser, *how)
         if self.exposures is not None:
-            self.exposures.fit(n_steps)
+            self.exposures.fit(self._sampler.count(n_steps))
             self.exposures = self.exposures.settled(self.fraction)
 
     def report(self) -> Progress:
