@@ -170,9 +170,33 @@ def calibration(records: Records) -> str:
         )
         moved = float(np.median([row["moved"] for row in found]))
         parts.append(f"{place(scene)} {posed:+.2f} and {coloured:+.2f} dB ({moved:.1f} pixels)")
-    return text(
-        f"""After {record["steps"]} steps of `fast` with {record["voxels"]:,} voxels, the pose of
-        each test view, or its colours, is fitted to its photograph. Mean gain there, and by how
-        many pixels poses move, as median: {"; ".join(parts)}.""",
-        records.source("calibration"),
+    exposed = records["exposures"]
+    rows = [
+        [
+            place(row["scene"]) if row["appearance"] == "none" else "",
+            f"{row['stops']:.1f}" if row["appearance"] == "none" else "",
+            row["appearance"] + (", used" if row["used"] and row["appearance"] == "auto" else ""),
+            f"{row['psnr']:.2f}",
+            f"{row['cc_psnr']:.2f}",
+            f"{row['ssim']:.3f}",
+            f"{row['near_mass']:.4f}",
+        ]
+        for row in exposed["rows"]
+    ]
+    head = ["scene", "stops", "`--appearance`", "PSNR [dB]", "cc-PSNR [dB]", "SSIM", "near mass"]
+    return below(
+        text(
+            f"""After {record["steps"]} steps of `fast` with {record["voxels"]:,} voxels, the pose
+            of each test view, or its colours, is fitted to its photograph. Mean gain there, and by
+            how many pixels poses move, as median: {"; ".join(parts)}.""",
+            records.source("calibration"),
+        ),
+        text(
+            f"""Photographs of different exposure: that of each training view is changed by so many
+            stops, as standard deviation, and its white balance by a quarter of that; test views stay
+            as they are. After {exposed["steps"]} steps of `fast` on {exposed["voxels"]:,} voxels;
+            with `auto` photographs are taken as they are, unless it says used.""",
+            records.source("exposures"),
+        ),
+        table(head, rows),
     )

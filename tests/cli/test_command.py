@@ -45,6 +45,20 @@ def test_version() -> None:
     assert out.startswith("warpnerf ")
 
 
+def test_exposures_that_were_fitted_are_said(tmp_path: Path) -> None:
+    outcome = cli_process.train(
+        cli_process.make_scene(tmp_path), "--appearance", "affine", folder=tmp_path
+    )
+    assert outcome.code == 0, outcome.err
+    says = r"exposures of photographs differ: where the scene is grey, \S+ is \d\.\d\d times as"
+    assert re.search(says, outcome.out)
+    assert "cc_psnr" in json.loads((outcome.run / "metrics.json").read_text())["mean"]
+    outcome = cli_process.train(
+        tmp_path / "scene", "--appearance", "none", "--overwrite", folder=tmp_path
+    )
+    assert outcome.code == 0 and "exposures" not in outcome.out
+
+
 def test_training_leaves_a_whole_run(trained: tuple[Path, str]) -> None:
     folder, out = trained
     assert "content distance" in out
