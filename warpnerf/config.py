@@ -128,7 +128,8 @@ class TrainConfig:
     appearance: Appearance = "auto"
     """What each photograph does to the scene's colours: none, affine, a gain and an offset of each
     channel, fitted while training, for photographs whose exposure or white balance differ; or auto:
-    affine where photographs differ so much that it helps. What is rendered has their mean."""
+    affine where the brightness of photographs differs, else none. What is rendered has the mean of
+    all exposures."""
     occupancy_every: int = 100
     """Updates of the grid between two looks for free space, each of one or several steps."""
     skip_empty_rays: bool = True

@@ -53,6 +53,7 @@ OPTIONS: dict[str, type] = {
     "field": str,
     "sampler": str,
     "scaling": str,
+    "appearance": str,
     "steps": int,
     "rays_per_step": int,
     "seed": int,
@@ -210,7 +211,8 @@ def configured(overrides: dict[str, Any], background: np.ndarray | None) -> Trai
     """The configuration that --set requests.
 
     Args:
-        overrides: Names and values of ``OPTIONS``; a preset, "fast" unless named, is the start.
+        overrides: Names and values of ``OPTIONS``; a preset, "fast" unless named, is the start,
+            with photographs as they are.
         background: [3] uint8, what is behind the photographs of the dataset, if it says so.
 
     Raises:
@@ -228,7 +230,8 @@ def configured(overrides: dict[str, Any], background: np.ndarray | None) -> Trai
     preset = given.pop("preset", "fast")
     if preset not in PRESETS:
         raise InputError(f"--set preset must be {' or '.join(PRESETS)}, not {preset!r}.")
-    config = PRESETS[preset]
+    # Its protocols measure test views as they are, whatever their exposure.
+    config = replace(PRESETS[preset], appearance="none")
     if "steps" in given:
         config = replace(config, time_limit=None)
     if "voxels" in given:

@@ -2,8 +2,8 @@
 
 ``fast`` and ``quality`` are what warpnerf reaches in a minute or three and in a quarter of an hour
 on two cores; docs/decisions/presets.md says how they were chosen. The others are there to compare
-with, and take hours on two cores: the published hyperparameters of DirectVoxGO, TensoRF and
-Instant-NGP, and ``mip360``, which samples as Mip-NeRF 360 does.
+with, and take up to hours on two cores: the published hyperparameters of DirectVoxGO, TensoRF and
+Instant-NGP, and ``mip360``, which samples as Mip-NeRF 360 does. They take photographs as they are.
 
 ``dvgo``, ``dvgo-unbounded`` and ``dvgo-llff`` are DirectVoxGO's: Sun et al. 2022 (CVPR), Sun et
 al. 2022 (arXiv 2206.05085), and default.py, nerf_unbounded_default.py and llff_default.py in their
@@ -92,6 +92,7 @@ from warpnerf.optim_config import OptimConfig
 _FAST = TrainConfig()
 
 _DVGO = TrainConfig(
+    appearance="none",
     sampler=MARCHED,
     steps=20_000,
     rays_per_step=8192,
@@ -205,6 +206,7 @@ PRESETS: dict[str, TrainConfig] = {
         loss=LossConfig(),
     ),
     "ngp": TrainConfig(
+        appearance="none",
         sampler=MARCHED,
         steps=35_000,
         background="random",
@@ -230,6 +232,7 @@ PRESETS: dict[str, TrainConfig] = {
         loss=LossConfig(photometric="huber"),
     ),
     "mip360": TrainConfig(
+        appearance="none",
         steps=25_000,
         model=PerSample(
             features=15, width=64, hidden_layers=2, residual=False, learning_rate_mlp=2e-3

@@ -177,7 +177,7 @@ def test_calibration(tmp_path):
 
 @pytest.mark.slow
 def test_exposures(tmp_path):
-    options = ("builtin:room-sparse", "--steps", "40", "--voxels", "20000", "--stops", "0.4")
+    options = ("builtin:room-sparse", "--steps", "400", "--voxels", "20000", "--stops", "0.4")
     output = "--picture", str(tmp_path / "seen.jpg")
     record, printed = run("exposures.py", tmp_path / "record.json", *options, *output)
     rows = {row["appearance"]: row for row in record["rows"]}

@@ -37,6 +37,11 @@ def reports(rise: float, seen: float = 1.0, n: int = 100) -> list[Progress]:
     ]
 
 
+def metrics_of(psnr: float | None) -> dict[str, float] | None:
+    """Of test views of the same exposure."""
+    return None if psnr is None else {"psnr": psnr, "cc_psnr": psnr + 0.1}
+
+
 @pytest.mark.parametrize(
     ("rise", "pixels", "test_psnr", "name", "says"),
     [
@@ -51,22 +56,24 @@ def reports(rise: float, seen: float = 1.0, n: int = 100) -> list[Progress]:
 def test_the_largest_is_named(
     rise: float, pixels: float | None, test_psnr: float | None, name: str, says: str
 ) -> None:
-    limit = what_limits(reports(rise), pixels, test_psnr)
+    limit = what_limits(reports(rise), pixels, metrics_of(test_psnr))
     assert limit is not None and limit.name == name
     assert says in str(limit)
 
 
 def test_exposures_are_named_where_corrected_colours_come_closer() -> None:
     for test, corrected, name in ((28.1, 28.4, "nothing"), (26.4, 27.9, "exposures")):
-        limit = what_limits(reports(0.3), 1.3, test, corrected)
+        limit = what_limits(reports(0.3), 1.3, {"psnr": test, "cc_psnr": corrected})
         assert limit is not None and limit.name == name
+    fitted = what_limits(reports(0.3), 1.3, {"psnr": 22.0, "cc_psnr": 28.4}, exposed=True)
+    assert fitted is not None and fitted.name == "nothing"  # test views have others
     assert "come 1.5 dB closer" in str(limit) and "try --appearance affine" in str(limit)
 
 
 def test_pixels_that_meet_nothing_count() -> None:
     """As they do in test views: or an object that fills a tenth of them has 10 dB less."""
     assert reports(0.3, seen=0.1)[-1].picture_psnr == pytest.approx(30.0)
-    limit = what_limits(reports(0.3, seen=0.1), 1.3, 26.2)
+    limit = what_limits(reports(0.3, seen=0.1), 1.3, metrics_of(26.2))
     assert limit is not None and limit.name == "photographs"
 
 
@@ -88,5 +95,5 @@ def test_the_width_of_voxels_is_that_of_the_plan_in_the_box_that_there_is() -> N
 
 
 def test_a_training_of_few_reports_says_nothing() -> None:
-    assert what_limits(reports(0.3)[-3:], 4.5, 20.0) is None
+    assert what_limits(reports(0.3)[-3:], 4.5, metrics_of(20.0)) is None
     assert what_limits([], 4.5, None) is None

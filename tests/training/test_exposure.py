@@ -27,9 +27,18 @@ from warpnerf.runs.checkpoint import load_checkpoint, save_checkpoint
 from warpnerf.runtime.parallel import Workers
 from warpnerf.training import exposure
 from warpnerf.training.exposure import Exposures
+from warpnerf.training.peers import ALONE
 from warpnerf.training.trainer import Trainer
 
 __all__ = ["early_growth"]
+
+
+@pytest.fixture(autouse=True)
+def early_exposures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Photographs are judged within a short training."""
+    monkeypatch.setattr(exposure, "FIRST_RAYS", 0)
+    monkeypatch.setattr(exposure, "JUDGED_RAYS", 0)
+
 
 GAINS = np.array([[0.6, 0.8, 0.7], [1.0, 1.1, 1.2], [1.5, 1.2, 1.1]])
 OFFSETS = np.array([[0.1, 0.0, 0.05], [0.0, 0.02, 0.0], [-0.1, -0.02, -0.05]])
@@ -53,7 +62,7 @@ def test_exposures_of_known_photographs_are_found(device: str) -> None:
             target_rgb=vectors[0],
             views=wp.array(views, dtype=wp.int32, device=workers.device),
         )
-        exposures.add(batch, vectors[1], 1.0)
+        exposures.add(batch, vectors[1], 1.0, 1)
         exposures.fit(3000)
     found = exposures.by_name(["a", "b", "c"])
     mean = np.exp(np.log(GAINS).mean(axis=0))
@@ -63,6 +72,7 @@ def test_exposures_of_known_photographs_are_found(device: str) -> None:
     np.testing.assert_allclose(offsets.mean(axis=0), 0.0, atol=1e-6)
     words = exposures.in_words(["a", "b", "c"])
     assert words.endswith("grey, a is 0.81 times as bright, c 1.17 times")
+    assert exposures.used
 
 
 def exposed() -> wn.Scene:
@@ -106,20 +116,76 @@ def test_auto_fits_those_that_differ_alone() -> None:
         np.testing.assert_array_equal(tensor, none.field.storage.tensors()[name])
 
 
+def of_sums(sums: np.ndarray, applied: bool) -> Exposures:
+    """Exposures as they are resumed, of three photographs with these sums of each channel."""
+    each = np.broadcast_to(sums, (3, 3, 5)).ravel()
+    arrays = (each, [float(applied)])
+    of_arrays = (wp.array(values, dtype=wp.float32, device="cpu") for values in arrays)
+    return Exposures(
+        3, Workers("cpu", 1), state=dict(zip(("sums", "applied"), of_arrays, strict=True))
+    )
+
+
+ALIKE = np.array([500.0, 0.0, 0.0, 40.0, 40.0])
+RED = ALIKE * np.array([1.0, 1.0, 1.0, 1.0, 1.3])
+"""Sums of a channel whose photographs all have a gain of about 1, and of one with a larger."""
+
+
 def test_older_rays_count_less_by_how_many_came_since() -> None:
-    exposures = Exposures(3, Workers("cpu", 1))
-    exposures.sums.fill_(1.0)
+    exposures = of_sums(ALIKE, True)
     exposures.fit(1500)  # of which each photograph has 500
     exposures.fit(10_500)
-    np.testing.assert_allclose(exposures.sums.numpy(), np.exp(-1.0), rtol=1e-6)
+    np.testing.assert_allclose(exposures.sums.numpy()[::5], 500.0 * np.exp(-1.0), rtol=1e-6)
 
 
-def test_auto_judges_once() -> None:
-    exposures = Exposures(3, Workers("cpu", 1), applied=False)
-    assert exposures.settled(exposure.JUDGED - 0.01) is exposures and not exposures.applied
-    assert exposures.settled(exposure.JUDGED) is None
-    exposures.applied = True
-    assert exposures.settled(1.0) is exposures
+def test_auto_judges_once_it_is_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(exposure, "JUDGED_RAYS", 320)
+    alike = of_sums(ALIKE, False)
+    for fraction, drawn in ((exposure.JUDGED - 0.01, 320), (0.5, 319)):
+        assert alike.judged(fraction, drawn, ALONE) is alike and not alike.applied
+    assert alike.judged(exposure.JUDGED, 320, ALONE) is None
+    used = of_sums(ALIKE, True)
+    assert used.judged(1.0, 1000, ALONE) is used
+
+
+@pytest.mark.parametrize("red", [0.05, -0.05])
+def test_brightness_is_judged_and_not_white_balance(red: float) -> None:
+    """A field whose colours depend on the direction of view has that of one exposure, too."""
+    sums = np.broadcast_to(ALIKE, (3, 3, 5)).copy()
+    sums[1, :, 2] += ALIKE[0] * np.array([red, 0.0, 0.05])
+    exposures = of_sums(sums, False)
+    differ = exposures.judged(1.0, 2_000_000, ALONE) is exposures
+    assert differ == exposures.applied == (red > 0.0)
+
+
+def test_a_limit_that_is_raised_leaves_exposures_as_they_are() -> None:
+    """Rays are taken in then as before, though less than BEGIN of the training is done."""
+    exposures = of_sums(RED, True)
+    batch = Trainer(exposed(), tiny_config())._draw(1)
+    exposures.add(batch, batch.target_rgb, 0.0, 0)
+    assert exposures.accumulated[0].arrays["weights"].numpy().any()
+    fresh = Exposures(3, Workers("cpu", 1))
+    fresh.add(batch, batch.target_rgb, 0.0, 0)
+    fresh.fit(1000)
+    assert not fresh.accumulated[0].arrays["weights"].numpy().any() and not fresh.used
+
+
+def test_the_mean_of_one_photograph_is_itself() -> None:
+    scene = replace(exposed(), splits={"train": (0,), "test": (3,)})
+    with pytest.raises(InputError, match="noise has one training photograph, and none that it"):
+        Trainer(scene, tiny_config(appearance="affine"))
+    result = wn.train(scene, tiny_config(grid=NO_GROWTH))
+    assert result.exposures is None
+
+
+def test_photographs_of_the_room_are_alike(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also in a training that is too short to show more than a blur."""
+    monkeypatch.undo()
+    scene = wn.load_scene("builtin:room-sparse", downscale=4)
+    grid = wn.GridConfig(voxels=100_000)
+    config = replace(wn.PRESETS["fast"], model="rgb", coarse_steps=0, grid=grid, threads=2)
+    for steps in (100, 330):
+        assert wn.train(scene, replace(config, steps=steps), progress=False).exposures is None
 
 
 def test_the_first_share_of_a_training_has_none() -> None:
@@ -147,7 +213,7 @@ def test_batches_are_drawn_by_the_exposures_as_they_stand() -> None:
 
 
 @pytest.mark.parametrize("appearance", ["auto", "affine"])
-@pytest.mark.parametrize("step", [1, 2, 9, 17])
+@pytest.mark.parametrize("step", [1, 2, 5, 6, 7, 17])
 def test_resumed_it_ends_the_same(
     step: int, appearance: Any, tmp_path: Path, on_cpu: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -168,7 +234,9 @@ def test_what_does_not_fit_the_photographs_is_refused(tmp_path: Path, on_cpu: No
         (np.zeros(2 * n), 1.0, "exposures of 2 photographs, but the scene has 3; bring"),
         (np.zeros(7), 1.0, "its tensor 'exposures.sums' does not fit its photographs"),
         (np.full(3 * n, np.nan), 1.0, "does not fit its photographs"),
-        (np.zeros(3 * n), 0.5, "its tensor 'exposures.applied' is neither 0 nor 1"),
+        (np.tile([-1.0, 0.0, 0.0, 0.0, 0.0], 9), 1.0, "does not fit its photographs"),
+        (np.tile([9.0, 9.0, 0.0, 1.0, 0.0], 9), 1.0, "does not fit its photographs"),
+        (np.zeros(3 * n), 0.0, "its tensor 'exposures.applied' does not fit its appearance"),
     ):
         arrays = {
             name: wp.array(values, dtype=wp.float32, device="cpu")

@@ -20,6 +20,7 @@ from tests.support.tiny_trainings import early_growth as early_growth
 from warpnerf.checks import InputError
 from warpnerf.cli.main import main
 from warpnerf.cli.processes import share_of_machine
+from warpnerf.training import exposure
 from warpnerf.training.peers import Peers
 from warpnerf.training.trainer import Trainer
 
@@ -52,19 +53,23 @@ def recorded(peers: Peers) -> list[dict[str, np.ndarray]]:
 def trained(peers: Peers, file: Path) -> int:
     """Train, and write the first update's gradients and the field to a file."""
     found = recorded(peers)
-    trainer = Trainer(ball(), tiny_config(appearance="affine"), peers=peers)
+    trainer = Trainer(ball(), tiny_config(appearance="auto"), peers=peers)
     progress = trainer.run()
     fields = {f"field.{name}": array for name, array in trainer.storage.tensors().items()}
     fields |= {"field.weights": trainer.weights.numpy()}
-    assert trainer.exposures is not None
+    assert trainer.exposures is not None and trainer.exposures.used
     fields |= {"field.exposures": trainer.exposures.sums.numpy()}
     np.savez(file, **found[0], **fields, loss=progress.loss, n_updates=len(found))
     return 0
 
 
-def test_processes_with_a_share_of_the_rays_are_one_with_all(tmp_path: Path) -> None:
+def test_processes_with_a_share_of_the_rays_are_one_with_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """To rounding, which Adam blows up after the first update; and to the bit each other, and when
     done again, where one cannot reach the memory of the first."""
+    for name, value in (("FIRST_RAYS", 0), ("JUDGED_RAYS", 9), ("DIFFERENT", 0.0)):
+        monkeypatch.setattr(exposure, name, value)
     alone = tmp_path / "alone.npz"
     trained(Peers(), alone)
     for turn in range(2):

@@ -97,7 +97,7 @@ def train_to_the_end(
         if trainer.fraction >= 1.0:
             run.save_field(trainer.field(), keep == "checkpoint")
             run.draw_curves(scene.name)
-            if trainer.exposures is not None:
+            if trainer.exposures is not None and trainer.exposures.used:
                 print(trainer.exposures.in_words(scene.training_names))
         exit_code = processes.exit_code_of(stop, trainer)
     if session is not None:
@@ -113,14 +113,11 @@ def train_to_the_end(
         print(f"wrote {run.folder}: field.safetensors, log.jsonl and config.json")
         return 0
     device, threads, pixels = trainer.config.device, trainer.config.threads, voxel_pixels(trainer)
-    exposed = trainer.exposures is not None
+    exposed = trainer.exposures is not None and trainer.exposures.used
     del trainer  # its grid, and what its optimiser keeps
 
     def at_end(metrics: Mapping[str, float], split: str) -> None:
-        # Test views have exposures of their own, which were not fitted.
-        test, corrected = metrics["psnr"], metrics["cc_psnr"]
-        known = (corrected, None) if exposed else (test, corrected)
-        limit = what_limits(reports, pixels, *(known if split == "test" else (None, None)))
+        limit = what_limits(reports, pixels, metrics if split == "test" else None, exposed)
         if limit is not None:
             print(limit)
         if log is not None:

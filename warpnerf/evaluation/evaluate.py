@@ -68,7 +68,7 @@ class ImageMetrics:
     """The view's."""
     psnr: float
     """dB."""
-    cc_psnr: float | None = None
+    cc_psnr: float
     """dB, with each channel of the rendering mapped affinely to the photograph's: what is left
     where exposures differ."""
     ssim: float | None

@@ -42,7 +42,8 @@ class RayBatch:
     content_distance: wp.array
     """[n_rays] or [1], scene units."""
     target_rgb: wp.array
-    """[n_rays] vec3 in [0, 1]; in the field's colours, where photographs have exposures."""
+    """[n_rays] vec3, pixels over their background in [0, 1]; beyond that where exposures are taken
+    out of them."""
     views: wp.array | None = None
     """[n_rays] int32, whose pixel that is, -1 where it is not opaque; None: not drawn from any."""
 
@@ -186,8 +187,8 @@ class PixelSampler:
             self._n_pixels += int(np.count_nonzero(mask))
         return struct
 
-    def expose(self, gains: wp.array, offsets: wp.array) -> None:
-        """From now on take exposures out of the photographs: (pixel - offset) / gain.
+    def take_out_exposures(self, gains: wp.array, offsets: wp.array) -> None:
+        """From now on draw (pixel - offset) / gain in place of the photographs' pixels.
 
         Args:
             gains: [n_views] vec3 above 0, read at each draw.

@@ -51,6 +51,9 @@ def _light(split: str, rays: str) -> dict[str, Figure]:
 
 FIGURES = {
     "psnr": Figure(heading="PSNR [dB]", path=("mean", "psnr"), better=1, digits=2),
+    "cc_psnr": Figure(
+        heading="PSNR, colours corrected [dB]", path=("mean", "cc_psnr"), better=1, digits=2
+    ),
     "ssim": Figure(heading="SSIM", path=("mean", "ssim"), better=1, digits=4),
     "training_psnr": Figure(
         heading="PSNR of training views [dB]",

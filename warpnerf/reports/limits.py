@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -66,8 +66,8 @@ def voxel_pixels(trainer: Trainer) -> float | None:
 def what_limits(
     reports: Sequence[Progress],
     width: float | None,
-    test_psnr: float | None,
-    corrected: float | None = None,
+    test: Mapping[str, float] | None,
+    exposed: bool = False,
 ) -> Limit | None:
     """What limits the quality of a training.
 
@@ -75,9 +75,9 @@ def what_limits(
         reports: Of the training, from its first to its last.
         width: Of a voxel of the final grid where cameras look, pixels; None: voxels do not say how
             fine the field is.
-        test_psnr: Mean PSNR of its test views, dB; None: there are none.
-        corrected: The same with their colours corrected, where photographs are thought to have one
-            exposure; None: they are not.
+        test: Mean metrics of its test views, psnr and cc_psnr among them; None: there are none.
+        exposed: Whether exposures of photographs were fitted: those of test views were not, so that
+            cc_psnr tells how good these are.
 
     Returns:
         What costs most, by thresholds that are rules of thumb; None: there are too few reports, as
@@ -90,9 +90,9 @@ def what_limits(
         return None
     reached = float(psnr[late].mean())
     rise = reached - float(psnr[before].mean())
-    gap = 0.0 if test_psnr is None else reached - test_psnr
-    known = test_psnr is not None and corrected is not None
-    gain = corrected - test_psnr if known else 0.0  # type: ignore[operator]
+    psnr_of_test = reached if test is None else test["cc_psnr" if exposed else "psnr"]
+    gap = reached - psnr_of_test
+    gain = 0.0 if test is None else test["cc_psnr"] - psnr_of_test
     of_exposures = max(gain - USUAL_CORRECTION, 0.0)
     wide = "" if width is None else f"voxels are {width:.2g} pixels wide, "
     pixels = SHARP if width is None else max(width, SHARP)

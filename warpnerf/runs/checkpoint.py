@@ -39,7 +39,7 @@ from warpnerf.runs.tensor_file import read_tensors, refuse, write_tensors
 from warpnerf.runtime.parallel import Workers
 from warpnerf.scenes.extent.frustum import Frustum
 from warpnerf.scenes.extent.space import grid_size
-from warpnerf.training.exposure import NUMBERS
+from warpnerf.training.exposure import NUMBERS, are_sums
 from warpnerf.training.exposure import STATE as EXPOSURES
 from warpnerf.training.optim import OPTIMISERS, first_states
 from warpnerf.training.plan import OlderPlan, TrainingPlan
@@ -318,10 +318,11 @@ def _optimiser(
             arrays[name] = wp.array(tensor, dtype=array.dtype, device=workers.device)
     if (name := f"{EXPOSURES}.sums") in tensors:
         sums, applied = tensors[name], tensors[f"{EXPOSURES}.applied"]
-        if sums.dtype != np.float32 or sums.size % NUMBERS or not np.isfinite(sums).all():
+        if sums.dtype != np.float32 or sums.size % NUMBERS or not are_sums(sums):
             refuse(path, f"its tensor '{name}' does not fit its photographs")
-        if applied.size != 1 or applied.item() not in (0.0, 1.0):
-            refuse(path, f"its tensor '{EXPOSURES}.applied' is neither 0 nor 1")
+        known = (1.0,) if config.appearance == "affine" else (0.0, 1.0)
+        if applied.size != 1 or applied.item() not in known:
+            refuse(path, f"its tensor '{EXPOSURES}.applied' does not fit its appearance")
         states[EXPOSURES] = {
             name: wp.array(tensor.ravel(), dtype=wp.float32, device=workers.device)
             for name, tensor in (("sums", sums), ("applied", applied))

@@ -22,14 +22,17 @@ from warpnerf.fields.gradients import Gradients
 from warpnerf.fields.parameters import Parameter
 from warpnerf.rendering.rays import RayBatch
 from warpnerf.runtime.parallel import RAYS, LaunchCache, Workers
+from warpnerf.training.peers import Peers
 
-BEGIN = 0.05
-"""Share of the training before the first fit: a field that shows nothing yet has the mean colour of
-each photograph explained by its exposure."""
-JUDGED = 0.08
-"""Share of the training after which auto judges whether photographs differ."""
-DIFFERENT = 0.03
-"""Deviation of the logarithm of their brightness from which they do."""
+BEGIN, FIRST_RAYS = 0.05, 200_000
+"""Share of the training, and rays, before the first fit: a field that shows nothing yet has the
+mean colour of each photograph explained by its exposure."""
+JUDGED, JUDGED_RAYS = 0.08, 1_300_000
+"""Share of the training, and rays, after which auto judges whether photographs differ: a field that
+is still blurred shows differences between photographs of one exposure."""
+DIFFERENT = 0.027
+"""Deviation of the logarithm of their brightness from which they do. Single channels deviate more,
+also of photographs of one exposure, where colours depend on the direction of view."""
 WINDOW = 4000.0
 """Rays of a photograph, after which the weight of those before has fallen to 1/e."""
 PRIOR = 50.0
@@ -66,7 +69,7 @@ class Exposures:
         Args:
             n_views: Photographs.
             workers: Where to work.
-            applied: Whether they are used from the first fit on; else ``settled`` judges it.
+            applied: Whether they are used from the first fit on; else ``judged`` tells.
             state: Of that training.
 
         Raises:
@@ -80,31 +83,43 @@ class Exposures:
         """[n_views] vec3, by which photographs are drawn."""
         self.offsets = wp.zeros(n_views, dtype=vec3, device=device)
         """[n_views] vec3, likewise."""
-        self._on_trial = wp.clone(self.gains), wp.clone(self.offsets)
+        self._fitted = wp.clone(self.gains), wp.clone(self.offsets)
         self._moments = wp.zeros((1, n_views * NUMBERS), device=device)
-        self.applied = applied
+        self._begun = False
+        self.applied = False
         """Whether photographs are drawn by what was fitted."""
         self.sums = wp.zeros(n_views * NUMBERS, device=device)
         """[n_views * 3 * 5], see ``warpnerf_kernels.optim.exposure``."""
         if state is not None:
-            self.sums, self.applied = state["sums"], bool(state["applied"].numpy()[0])
+            self.sums, applied = state["sums"], bool(state["applied"].numpy()[0])
             if self.sums.size != n_views * NUMBERS:
                 raise InputError(
                     f"the training to be resumed has exposures of {self.sums.size // NUMBERS} "
                     f"photographs, but the scene has {n_views}; bring its photographs back, or "
                     "start a new training."
                 )
+            self._begun = bool(self.sums.numpy().any())
             self.fit(0)
+        if applied:
+            self._apply()
 
-    def add(self, batch: RayBatch, rgb: wp.array, fraction: float) -> None:
+    @property
+    def used(self) -> bool:
+        """Whether photographs have been drawn by what was fitted."""
+        return self.applied and self._begun
+
+    def add(self, batch: RayBatch, rgb: wp.array, fraction: float, drawn: int) -> None:
         """Take rays of a batch in, those of opaque pixels that are neither black nor white.
 
         Args:
             batch: As it was drawn.
             rgb: [n_rays] vec3, what was rendered.
-            fraction: Of the training, that is done; before BEGIN nothing is taken in.
+            fraction: Of the training, that is done. The first rays are taken in after BEGIN, those
+                that follow always: a limit may be raised.
+            drawn: Rays of the steps done, FIRST_RAYS or more likewise.
         """
-        if fraction < BEGIN:
+        self._begun = self._begun or (fraction >= BEGIN and drawn >= FIRST_RAYS)
+        if not self._begun:
             return
         self._in_turn.launch(
             kernels.add_moments,
@@ -114,23 +129,39 @@ class Exposures:
             cache=self._launches,
         )
 
-    def settled(self, fraction: float) -> Exposures | None:
-        """From JUDGED on, those that differ so much that they are used, or None.
+    def judged(self, fraction: float, drawn: int, peers: Peers) -> Exposures | None:
+        """Whether photographs differ, once it is time to say so, and from then on as was said.
 
         Args:
             fraction: Of the training, that is done.
+            drawn: Rays of the steps done.
+            peers: The first of them judges.
+
+        Returns:
+            These, or None: photographs are alike.
         """
-        if self.applied or fraction < JUDGED:
+        if self.applied or fraction < JUDGED or drawn < JUDGED_RAYS:
             return self
-        gains, offsets = (array.numpy() for array in self._on_trial)
-        if float(np.log(brightness(gains, offsets)).std()) < DIFFERENT:
+        if not peers.from_first(self._differ):
             return None
-        self.applied = True
+        self._apply()
         return self
+
+    def _differ(self) -> bool:
+        gains, offsets = (array.numpy() for array in self._fitted)
+        return bool(np.log(brightness(gains, offsets)).std() >= DIFFERENT)
+
+    def _apply(self) -> None:
+        """From now on photographs are drawn by what is fitted."""
+        wp.copy(self.gains, self._fitted[0])
+        wp.copy(self.offsets, self._fitted[1])
+        self._fitted = self.gains, self.offsets
+        self.applied = True
 
     @cached_property
     def accumulated(self) -> tuple[Gradients, Parameter]:
-        """What was taken in since the last fit, as several processes add it up."""
+        """What was taken in since the last fit, as several processes add it up: as the gradient of
+        weights is, which no rule updates."""
         gradients = Gradients(arrays={"weights": self._moments}, struct=None)
         parameter = Parameter(
             name=STATE,
@@ -147,16 +178,17 @@ class Exposures:
         Args:
             n_rays: Drawn since the last time, of all photographs.
         """
-        found = (self.gains, self.offsets) if self.applied else self._on_trial
+        if not self._begun:
+            return
         n_views = len(self.gains)
         kept = math.exp(-n_rays / (n_views * WINDOW))
         given = kept, PRIOR, self._moments, self.sums
-        self._workers.launch(kernels.fit_exposures, n_views, *given, *found)
-        self._workers.launch(kernels.centre_exposures, 3, *found)
+        self._workers.launch(kernels.fit_exposures, n_views, *given, *self._fitted)
+        self._workers.launch(kernels.centre_exposures, 3, *self._fitted)
 
     @property
     def state(self) -> dict[str, dict[str, wp.array]]:
-        """What a checkpoint keeps: live arrays."""
+        """What a checkpoint keeps; the sums are live."""
         applied = wp.array([float(self.applied)], dtype=wp.float32, device=self.sums.device)
         return {STATE: {"sums": self.sums, "applied": applied}}
 
@@ -169,8 +201,8 @@ class Exposures:
         grey = brightness(self.gains.numpy(), self.offsets.numpy())
         low, high = int(grey.argmin()), int(grey.argmax())
         return (
-            f"exposures of photographs differ: where the scene is grey, {names[low]} is "
-            f"{grey[low]:.2f} times as bright, {names[high]} {grey[high]:.2f} times"
+            f"exposures: where the scene is grey, {names[low]} is {grey[low]:.2f} times as bright, "
+            f"{names[high]} {grey[high]:.2f} times"
         )
 
     def by_name(self, names: Sequence[str]) -> dict[str, Exposure]:
@@ -185,10 +217,23 @@ class Exposures:
 
 
 def brightness(gains: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """How much brighter each photograph is where the field is half grey, [n_views].
+    """How much brighter each photograph is where the field is half grey.
 
     Args:
         gains: [n_views, 3].
         offsets: [n_views, 3].
+
+    Returns:
+        [n_views], at least 0.001.
     """
     return np.maximum((gains + 2.0 * offsets).mean(axis=1), 1e-3)
+
+
+def are_sums(sums: np.ndarray) -> bool:
+    """Whether numbers can be sums over rays: finite, counts and variances not below 0.
+
+    Args:
+        sums: [n_views * NUMBERS], in any shape.
+    """
+    n, x, _, xx, _ = sums.reshape(-1, kernels.MOMENTS).T.astype(np.float64)
+    return bool(np.isfinite(sums).all() and (n >= 0).all() and (n * xx - x * x >= -1e-3 * n).all())

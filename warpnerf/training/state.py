@@ -42,7 +42,8 @@ class Progress:
     loss: float
     """Of the last update: mean over its rays of what is minimised."""
     psnr: float
-    """Of the squared error of the last update's rays, dB."""
+    """Of the squared error of the last update's rays, dB; in the field's colours, where exposures
+    are taken out of the photographs."""
     samples_per_ray: float
     """Visited steps per ray of the last update."""
     size: tuple[int, int, int]

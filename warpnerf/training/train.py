@@ -102,6 +102,6 @@ def train(
         progress=last or end,
         scene=trainer.scene,
         exposures=None
-        if trainer.exposures is None
+        if trainer.exposures is None or not trainer.exposures.used
         else trainer.exposures.by_name(scene.training_names),
     )

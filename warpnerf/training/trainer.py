@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import warp as wp
 
+from warpnerf.checks import InputError
 from warpnerf.config import TrainConfig
 from warpnerf.fields.lattice import Lattice
 from warpnerf.fields.occupancy import FreeCells
@@ -145,10 +146,14 @@ class Trainer:
         """Those of the training views, where it fits them."""
         exposed = self.optimiser.pop(STATE, None)
         if config.appearance != "none" and (exposed is not None or resume is None):
-            always = config.appearance == "affine"
             n_views = len(scene.splits["train"])
+            if (always := config.appearance == "affine") and n_views == 1:
+                raise InputError(
+                    f"appearance is affine, but {scene.name} has one training photograph, and none "
+                    "that it could differ from; leave --appearance out."
+                )
             self.exposures = Exposures(n_views, self.workers, always, exposed)
-            self._sampler.expose(self.exposures.gains, self.exposures.offsets)
+            self._sampler.take_out_exposures(self.exposures.gains, self.exposures.offsets)
         self._occupied = self.free.share()
         self._seen = 1.0
         if resume is not None:
@@ -218,6 +223,11 @@ class Trainer:
         return min(done, 1.0)
 
     @property
+    def _rays_drawn(self) -> int:
+        """Rays of the steps done, those counted that met nothing."""
+        return self.steps_done * self.config.rays_per_step
+
+    @property
     def report_due(self) -> bool:
         """Whether it is time for a report."""
         return self._report_due or self.fraction >= 1.0
@@ -257,7 +267,7 @@ class Trainer:
         if self._resampling is not None:
             self._resampling.learn(batch, n_steps * share, self._updates, self.fraction)
         if self.exposures is not None:
-            self.exposures.add(batch, self._pass.rgb, self.fraction)
+            self.exposures.add(batch, self._pass.rgb, self.fraction, self._rays_drawn)
 
     def _add_gradients(self) -> None:
         """Sum the gradients of all processes."""
@@ -287,7 +297,7 @@ class Trainer:
             self._resampling.step(self.optimiser, *how)
         if self.exposures is not None:
             self.exposures.fit(self._sampler.count(n_steps))
-            self.exposures = self.exposures.settled(self.fraction)
+            self.exposures = self.exposures.judged(self.fraction, self._rays_drawn, self.peers)
 
     def report(self) -> Progress:
         """Where training stands; FloatingPointError where the loss is not finite."""

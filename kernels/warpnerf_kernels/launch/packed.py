@@ -235,7 +235,7 @@ def train(variant: Variant) -> wp.Kernel:
         scene: RenderParams,
         # rays
         rays: Rays,
-        target_rgb: wp.array(dtype=vec3),  # [n_rays] in [0, 1]
+        target_rgb: wp.array(dtype=vec3),  # [n_rays] in the field's colours
         # choices
         loss_weight: real,  # of one ray
         # out

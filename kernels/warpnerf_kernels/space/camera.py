@@ -317,7 +317,7 @@ def sample_pixels(
     draw: Draw,
     # out
     out_rays: Rays,
-    out_target_rgb: wp.array(dtype=vec3),  # [n_rays] the pixel over its background, in [0, 1]
+    out_target_rgb: wp.array(dtype=vec3),  # [n_rays] the pixel over its background
     out_views: wp.array(dtype=wp.int32),  # [n_rays] its photograph; -1: the pixel is not opaque
 ):
     """A batch of rays through random pixels, all that count and are covered equally likely."""
