@@ -317,15 +317,15 @@ def _optimiser(
                 refuse(path, f"its tensor '{parameter}.{name}' does not fit its values")
             arrays[name] = wp.array(tensor, dtype=array.dtype, device=workers.device)
     if (name := f"{EXPOSURES}.sums") in tensors:
-        sums, applied = tensors[name], tensors[f"{EXPOSURES}.applied"]
+        sums, settled = tensors[name], tensors[f"{EXPOSURES}.settled"]
         if sums.dtype != np.float32 or sums.size % NUMBERS or not are_sums(sums):
             refuse(path, f"its tensor '{name}' does not fit its photographs")
         known = (1.0,) if config.appearance == "affine" else (0.0, 1.0)
-        if applied.size != 1 or applied.item() not in known:
-            refuse(path, f"its tensor '{EXPOSURES}.applied' does not fit its appearance")
+        if settled.size != 1 or settled.item() not in known:
+            refuse(path, f"its tensor '{EXPOSURES}.settled' does not fit its appearance")
         states[EXPOSURES] = {
             name: wp.array(tensor.ravel(), dtype=wp.float32, device=workers.device)
-            for name, tensor in (("sums", sums), ("applied", applied))
+            for name, tensor in (("sums", sums), ("settled", settled))
         }
     return states
 
@@ -452,7 +452,7 @@ def _read(path: Path) -> tuple[_Header, dict[str, np.ndarray]]:
             for name in OPTIMISERS[rule].state_names
         }
         plan = header.training.plan or header.training.older
-        exposed = {f"{EXPOSURES}.sums", f"{EXPOSURES}.applied"}
+        exposed = {f"{EXPOSURES}.sums", f"{EXPOSURES}.settled"}
         appearance = "none" if plan is None else plan.config.appearance
         if appearance == "affine" or (appearance == "auto" and exposed & set(tensors)):
             names |= exposed

@@ -27,10 +27,12 @@ from warpnerf.training.peers import Peers
 BEGIN, FIRST_RAYS = 0.05, 200_000
 """Share of the training, and rays, before the first fit: a field that shows nothing yet has the
 mean colour of each photograph explained by its exposure."""
+LATEST = 0.1
+"""Share of the training after which auto no longer begins: too few rays are left to judge by."""
 JUDGED, JUDGED_RAYS = 0.08, 1_300_000
 """Share of the training, and rays, after which auto judges whether photographs differ: a field that
 is still blurred shows differences between photographs of one exposure."""
-DIFFERENT = 0.027
+DIFFERENT = 0.06
 """Deviation of the logarithm of their brightness from which they do. Single channels deviate more,
 also of photographs of one exposure, where colours depend on the direction of view."""
 WINDOW = 4000.0
@@ -61,7 +63,7 @@ class Exposures:
         self,
         n_views: int,
         workers: Workers,
-        applied: bool = True,
+        settled: bool = True,
         state: dict[str, wp.array] | None = None,
     ) -> None:
         """Those that change nothing, or those of a training to be resumed.
@@ -69,7 +71,7 @@ class Exposures:
         Args:
             n_views: Photographs.
             workers: Where to work.
-            applied: Whether they are used from the first fit on; else ``judged`` tells.
+            settled: Whether they stay, whatever ``judged`` would find.
             state: Of that training.
 
         Raises:
@@ -83,30 +85,23 @@ class Exposures:
         """[n_views] vec3, by which photographs are drawn."""
         self.offsets = wp.zeros(n_views, dtype=vec3, device=device)
         """[n_views] vec3, likewise."""
-        self._fitted = wp.clone(self.gains), wp.clone(self.offsets)
         self._moments = wp.zeros((1, n_views * NUMBERS), device=device)
-        self._begun = False
-        self.applied = False
-        """Whether photographs are drawn by what was fitted."""
+        self.settled = settled
+        """Whether it is known that photographs differ, or does not matter."""
+        self.used = False
+        """Whether something was fitted, and photographs have been drawn by it."""
         self.sums = wp.zeros(n_views * NUMBERS, device=device)
         """[n_views * 3 * 5], see ``warpnerf_kernels.optim.exposure``."""
         if state is not None:
-            self.sums, applied = state["sums"], bool(state["applied"].numpy()[0])
+            self.sums, self.settled = state["sums"], bool(state["settled"].numpy()[0])
             if self.sums.size != n_views * NUMBERS:
                 raise InputError(
                     f"the training to be resumed has exposures of {self.sums.size // NUMBERS} "
                     f"photographs, but the scene has {n_views}; bring its photographs back, or "
                     "start a new training."
                 )
-            self._begun = bool(self.sums.numpy().any())
+            self.used = bool(self.sums.numpy().any())
             self.fit(0)
-        if applied:
-            self._apply()
-
-    @property
-    def used(self) -> bool:
-        """Whether photographs have been drawn by what was fitted."""
-        return self.applied and self._begun
 
     def add(self, batch: RayBatch, rgb: wp.array, fraction: float, drawn: int) -> None:
         """Take rays of a batch in, those of opaque pixels that are neither black nor white.
@@ -118,8 +113,8 @@ class Exposures:
                 that follow always: a limit may be raised.
             drawn: Rays of the steps done, FIRST_RAYS or more likewise.
         """
-        self._begun = self._begun or (fraction >= BEGIN and drawn >= FIRST_RAYS)
-        if not self._begun:
+        self.used = self.used or (fraction >= BEGIN and drawn >= FIRST_RAYS)
+        if not self.used:
             return
         self._in_turn.launch(
             kernels.add_moments,
@@ -138,25 +133,24 @@ class Exposures:
             peers: The first of them judges.
 
         Returns:
-            These, or None: photographs are alike.
+            These, or None: photographs are alike, and drawn as they are from now on.
         """
-        if self.applied or fraction < JUDGED or drawn < JUDGED_RAYS:
+        if self.settled:
             return self
-        if not peers.from_first(self._differ):
-            return None
-        self._apply()
-        return self
+        if not self.used:
+            return None if fraction > LATEST else self
+        if fraction < JUDGED or drawn < JUDGED_RAYS:
+            return self
+        self.settled = peers.from_first(self._differ)
+        if self.settled:
+            return self
+        self.gains.fill_(vec3(1.0, 1.0, 1.0))
+        self.offsets.zero_()
+        return None
 
     def _differ(self) -> bool:
-        gains, offsets = (array.numpy() for array in self._fitted)
-        return bool(np.log(brightness(gains, offsets)).std() >= DIFFERENT)
-
-    def _apply(self) -> None:
-        """From now on photographs are drawn by what is fitted."""
-        wp.copy(self.gains, self._fitted[0])
-        wp.copy(self.offsets, self._fitted[1])
-        self._fitted = self.gains, self.offsets
-        self.applied = True
+        found = brightness(self.gains.numpy(), self.offsets.numpy())
+        return bool(np.log(found).std() >= DIFFERENT)
 
     @cached_property
     def accumulated(self) -> tuple[Gradients, Parameter]:
@@ -178,19 +172,20 @@ class Exposures:
         Args:
             n_rays: Drawn since the last time, of all photographs.
         """
-        if not self._begun:
+        if not self.used:
             return
         n_views = len(self.gains)
         kept = math.exp(-n_rays / (n_views * WINDOW))
+        found = self.gains, self.offsets
         given = kept, PRIOR, self._moments, self.sums
-        self._workers.launch(kernels.fit_exposures, n_views, *given, *self._fitted)
-        self._workers.launch(kernels.centre_exposures, 3, *self._fitted)
+        self._workers.launch(kernels.fit_exposures, n_views, *given, *found)
+        self._workers.launch(kernels.centre_exposures, 3, *found)
 
     @property
     def state(self) -> dict[str, dict[str, wp.array]]:
         """What a checkpoint keeps; the sums are live."""
-        applied = wp.array([float(self.applied)], dtype=wp.float32, device=self.sums.device)
-        return {STATE: {"sums": self.sums, "applied": applied}}
+        settled = wp.array([float(self.settled)], dtype=wp.float32, device=self.sums.device)
+        return {STATE: {"sums": self.sums, "settled": settled}}
 
     def in_words(self, names: Sequence[str]) -> str:
         """How far they differ.
