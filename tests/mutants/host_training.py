@@ -320,7 +320,7 @@ MUTANTS = [
     of_host("exposures: older rays by all that came", "training/exposure.py", "(n_views * WINDOW)", "WINDOW", COUNT_LESS),
     of_host("exposures: none drawn", TRAINER, "            self._sampler.take_out_exposures(self.exposures.gains, self.exposures.offsets)\n", "", AS_THEY_STAND),
     of_host("exposures: begun again", TRAINER, "self.workers, always, exposed)", "self.workers, always)", EXPOSED_RESUMED),
-    of_host("exposures: judged again where resumed", "training/exposure.py", "self.sums, self.settled = state[\"sums\"], bool(state[\"settled\"].numpy()[0])", "self.sums = state[\"sums\"]", EXPOSED_RESUMED),
+    of_host("exposures: judged again where resumed", "training/exposure.py", "self.sums, self.settled = state[\"sums\"], bool(state[\"settled\"].numpy()[0])", "self.sums = state[\"sums\"]", JUDGES_ONCE),
     of_host("exposures: without those of other processes", TRAINER, "            accumulated.append(self.exposures.accumulated)\n", "            pass\n", PROCESSES),
     of_host("exposures: of any number of photographs", "training/exposure.py", "if self.sums.size != n_views * NUMBERS:", "if False:", EXPOSED_REFUSED),
     of_host("exposures: no number", CHECKPOINT, "or not are_sums(sums):", "or False:", EXPOSED_REFUSED),

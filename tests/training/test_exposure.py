@@ -121,9 +121,8 @@ def of_sums(sums: np.ndarray, settled: bool) -> Exposures:
     each = np.broadcast_to(sums, (3, 3, 5)).ravel()
     arrays = (each, [float(settled)])
     of_arrays = (wp.array(values, dtype=wp.float32, device="cpu") for values in arrays)
-    return Exposures(
-        3, Workers("cpu", 1), state=dict(zip(("sums", "settled"), of_arrays, strict=True))
-    )
+    state = dict(zip(("sums", "settled"), of_arrays, strict=True))
+    return Exposures(3, Workers("cpu", 1), settled=not settled, state=state)
 
 
 ALIKE = np.array([500.0, 0.0, 0.0, 40.0, 40.0])
@@ -153,11 +152,11 @@ def test_auto_leaves_photographs_as_they_are_where_it_cannot_begin_in_time() -> 
     assert exposures.judged(exposure.LATEST + 0.01, 10, ALONE) is None
 
 
-@pytest.mark.parametrize("red", [0.12, -0.12])
+@pytest.mark.parametrize("red", [0.3, -0.3])
 def test_brightness_is_judged_and_not_white_balance(red: float) -> None:
     """A field whose colours depend on the direction of view has that of one exposure, too."""
     sums = np.broadcast_to(ALIKE, (3, 3, 5)).copy()
-    sums[1, :, 2] += ALIKE[0] * np.array([red, 0.0, 0.12])
+    sums[1, :, 2] += ALIKE[0] * np.array([red, 0.0, 0.3])
     exposures = of_sums(sums, False)
     assert (exposures.gains.numpy() == 1.0).all() and (exposures.offsets.numpy() != 0.0).any()
     differ = exposures.judged(1.0, 2_000_000, ALONE) is exposures
