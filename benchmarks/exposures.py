@@ -7,8 +7,9 @@ is multiplied by 2^x, x normal of deviation --stops, and each channel by 2^y, y 
 that; then encoded and cut off as a camera does. Test views stay as they are, so that PSNR has
 their colours corrected (cc-PSNR, docs/metrics.md). Each capture trains as it is and so changed,
 with appearance none, auto and affine, the preset fast for so many steps. Prints a table and writes
-benchmarks/results/exposures_<device>.json; --picture FILE shows a test view and its depth by the
-fields of the first scene's last change.
+benchmarks/results/exposures_<device>.json; --picture FILE shows, of the first scene's last change,
+the darkest and the brightest training view, and a test view and its depth by the fields trained
+with none and with affine.
 """
 
 from __future__ import annotations
@@ -31,6 +32,8 @@ from warpnerf.presets import PRESETS
 from warpnerf.runtime.parallel import Workers
 
 APPEARANCES = ("none", "auto", "affine")
+WIDTH = 960
+"""Pixels of the picture, at least half as many."""
 BALANCE = 0.25
 """Deviation of the white balance's stops, over that of the exposure's."""
 
@@ -76,7 +79,10 @@ def main() -> None:
         "rows": rows,
     }
     if args.picture is not None:
-        Image.fromarray(picture(pictured[:2])).save(args.picture, quality=90)
+        pixels = picture(pictured[:2])
+        larger = max(1, WIDTH // pixels.shape[1])
+        pixels = pixels.repeat(larger, axis=0).repeat(larger, axis=1)
+        Image.fromarray(pixels).save(args.picture, quality=90)
         print(f"picture: {args.picture}")
     print(f"record: {write_record(record, args.output, 'exposures', args.device)}")
 
@@ -122,7 +128,7 @@ def trained(scene: wn.Scene, config: TrainConfig) -> tuple[wn.TrainResult, dict[
 
 
 def picture(pairs: Sequence[tuple[wn.Scene, wn.Field]]) -> np.ndarray:
-    """A test view, and below it depths: truth, then by each field; two training views first."""
+    """The darkest and the brightest training view, then a test view and its depth by each field."""
     scene = pairs[0][0]
     test = scene.splits["test"]
     view = scene.views[test[len(test) // 2]]

@@ -36,7 +36,7 @@ class Records:
     def source(self, name: str, today: str = "") -> str:
         """Command, link, machine and day of a record; `today` says what the command now needs."""
         machine = self[name]["machine"]
-        command = re.sub(r" --output \S+", "", machine["command"])
+        command = re.sub(r" --(output|picture) \S+", "", machine["command"])
         cpu = machine["cpu"].replace("(R)", "").removesuffix(" Processor")
         link = f"[record](../benchmarks/results/{name}_cpu.json)"
         return f"`{command}`{today} ({link}, {cpu}, {machine['date'][:10]})"
