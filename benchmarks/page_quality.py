@@ -195,7 +195,7 @@ def calibration(records: Records) -> str:
             f"""Photographs of different exposure: that of each training view is changed by so many
             stops, as standard deviation, and its white balance by a quarter of that; test views
             stay as they are. After {exposed["steps"]} steps of `fast` on {exposed["voxels"]:,}
-            voxels; with `auto` photographs are taken as they are, unless it says used.""",
+            voxels; `auto` drops early what it has fitted, unless it says used.""",
             records.source("exposures"),
         ),
         table(head, rows),

@@ -139,9 +139,10 @@ def test_older_rays_count_less_by_how_many_came_since() -> None:
 def test_auto_judges_once_it_is_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(exposure, "JUDGED_RAYS", 320)
     alike = of_sums(ALIKE, False)
-    for fraction, drawn in ((exposure.JUDGED - 0.01, 320), (0.5, 319)):
+    for fraction, drawn in ((exposure.JUDGED - 0.01, 320), (exposure.JUDGED_BY - 0.01, 319)):
         assert alike.judged(fraction, drawn, ALONE) is alike and not alike.settled
     assert alike.judged(exposure.JUDGED, 320, ALONE) is None
+    assert of_sums(ALIKE, False).judged(exposure.JUDGED_BY, 319, ALONE) is None
     settled = of_sums(ALIKE, True)
     assert settled.judged(1.0, 1000, ALONE) is settled
 
@@ -190,8 +191,8 @@ def test_photographs_of_the_room_are_alike(monkeypatch: pytest.MonkeyPatch) -> N
     scene = wn.load_scene("builtin:room-sparse", downscale=4)
     grid = wn.GridConfig(voxels=100_000)
     config = replace(wn.PRESETS["fast"], model="rgb", coarse_steps=0, grid=grid, threads=2)
-    trainer = Trainer(scene, replace(config, steps=700))
-    while trainer.steps_done < 60:  # more than 8 % of them
+    trainer = Trainer(scene, replace(config, steps=900))
+    while trainer.steps_done < 80:  # more than 8 % of them
         trainer.update()
     assert trainer.exposures is not None and not trainer.exposures.settled
     while trainer.steps_done < 330:

@@ -93,6 +93,7 @@ def what_limits(
     psnr_of_test = reached if test is None else test["cc_psnr" if exposed else "psnr"]
     gap = reached - psnr_of_test
     gain = 0.0 if test is None else test["cc_psnr"] - psnr_of_test
+    corrected = " with their colours corrected" if exposed else ""
     of_exposures = max(gain - USUAL_CORRECTION, 0.0)
     wide = "" if width is None else f"voxels are {width:.2g} pixels wide, "
     pixels = SHARP if width is None else max(width, SHARP)
@@ -107,7 +108,7 @@ def what_limits(
             name="photographs",
             cost=gap - of_exposures - USUAL_GAP,
             sentence=f"limited by photographs: training views reach {reached:.1f} dB, test views "
-            f"{reached - gap:.1f}; try photographs from more places, or fewer --voxels",
+            f"{reached - gap:.1f}{corrected}; try photographs from more places, or fewer --voxels",
         ),
         Limit(
             name="time",

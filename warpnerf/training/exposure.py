@@ -27,11 +27,14 @@ from warpnerf.training.peers import Peers
 BEGIN, FIRST_RAYS = 0.05, 200_000
 """Share of the training, and rays, before the first fit: a field that shows nothing yet has the
 mean colour of each photograph explained by its exposure."""
-LATEST = 0.1
-"""Share of the training after which auto no longer begins: too few rays are left to judge by."""
+LATEST = 0.06
+"""Share of the training after which auto no longer begins: the training is too short to judge in,
+and to recover where photographs turn out to be alike."""
 JUDGED, JUDGED_RAYS = 0.08, 1_300_000
 """Share of the training, and rays, after which auto judges whether photographs differ: a field that
 is still blurred shows differences between photographs of one exposure."""
+JUDGED_BY = 0.4
+"""Share of the training after which it judges, however few rays a time limit leaves for."""
 DIFFERENT = 0.06
 """Deviation of the logarithm of their brightness from which they do. Single channels deviate more,
 also of photographs of one exposure, where colours depend on the direction of view."""
@@ -139,7 +142,7 @@ class Exposures:
             return self
         if not self.used:
             return None if fraction > LATEST else self
-        if fraction < JUDGED or drawn < JUDGED_RAYS:
+        if fraction < JUDGED or (drawn < JUDGED_RAYS and fraction < JUDGED_BY):
             return self
         self.settled = peers.from_first(self._differ)
         if self.settled:
@@ -225,10 +228,10 @@ def brightness(gains: np.ndarray, offsets: np.ndarray) -> np.ndarray:
 
 
 def are_sums(sums: np.ndarray) -> bool:
-    """Whether numbers can be sums over rays: finite, counts and variances not below 0.
+    """Whether numbers can be sums over rays: finite, counts and variances not below 0, to rounding.
 
     Args:
         sums: [n_views * NUMBERS], in any shape.
     """
     n, x, _, xx, _ = sums.reshape(-1, kernels.MOMENTS).T.astype(np.float64)
-    return bool(np.isfinite(sums).all() and (n >= 0).all() and (n * xx - x * x >= -1e-3 * n).all())
+    return bool(np.isfinite(sums).all() and (n >= 0).all() and (n * xx - x * x >= -n).all())
