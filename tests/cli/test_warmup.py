@@ -51,7 +51,7 @@ def test_a_training_loads_no_other_kernels(
     where = trainer.workers.device
     drawn = config.sampler_in(SPACES[contraction])
     given = contraction, scaling, "none", where, config.loss
-    needed = training_kernels(model, *given, sampler=drawn)
+    needed = training_kernels(model, *given, sampler=drawn, exposes=True)
     trainer.update()
     assert trainer.workers._loaded == set(needed)
     trainer.run()
