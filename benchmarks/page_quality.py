@@ -10,6 +10,9 @@ from typing import Any
 import numpy as np
 from page_parts import Records, below, of, place, seeds, table, text, values
 
+USED = ("none", "auto")
+"""Values of ``--appearance`` that are compared."""
+
 MARCHED_TODAY = ", today with `fast sampler=march` for `fast`"
 """What commands need since rays of unbounded captures are resampled by default."""
 
@@ -171,32 +174,19 @@ def calibration(records: Records) -> str:
         moved = float(np.median([row["moved"] for row in found]))
         parts.append(f"{place(scene)} {posed:+.2f} and {coloured:+.2f} dB ({moved:.1f} pixels)")
     exposed = records["exposures"]
-    rows = [
-        [
-            place(row["scene"]) if row["appearance"] == "none" else "",
-            f"{row['stops']:.1f}" if row["appearance"] == "none" else "",
-            row["appearance"] + (", used" if row["used"] and row["appearance"] == "auto" else ""),
-            f"{row['psnr']:.2f}",
-            f"{row['cc_psnr']:.2f}",
-            f"{row['ssim']:.3f}",
-            f"{row['near_mass']:.4f}",
-        ]
-        for row in exposed["rows"]
-    ]
-    head = ["scene", "stops", "`--appearance`", "PSNR [dB]", "cc-PSNR [dB]", "SSIM", "near mass"]
-    return below(
-        text(
-            f"""After {record["steps"]} steps of `fast` with {record["voxels"]:,} voxels, the pose
-            of each test view, or its colours, is fitted to its photograph. Mean gain there, and by
-            how many pixels poses move, as median: {"; ".join(parts)}.""",
-            records.source("calibration"),
-        ),
-        text(
-            f"""Photographs of different exposure: that of each training view is changed by so many
-            stops, as standard deviation, and its white balance by a quarter of that; test views
-            stay as they are. After {exposed["steps"]} steps of `fast` on {exposed["voxels"]:,}
-            voxels; `auto` drops early what it has fitted, unless it says used.""",
-            records.source("exposures"),
-        ),
-        table(head, rows),
+    most = max(values(exposed["rows"], "stops"))
+    found = []
+    for scene in values(exposed["rows"], "scene"):
+        pair = [of(exposed["rows"], scene=scene, stops=most, appearance=how)[0] for how in USED]
+        psnrs = " and ".join(f"{row['cc_psnr']:.2f}" for row in pair)
+        masses = " and ".join(f"{row['near_mass']:.4f}" for row in pair)
+        found.append(f"{place(scene)} {psnrs} dB ({masses})")
+    return text(
+        f"""After {record["steps"]} steps of `fast` with {record["voxels"]:,} voxels, the pose of
+        each test view, or its colours, is fitted to its photograph. Mean gain there, and by how
+        many pixels poses move, as median: {"; ".join(parts)}. With training views whose exposure
+        is changed by {most:.1f} stops, as standard deviation, cc-PSNR (and near mass) without
+        fitted exposures and with: {"; ".join(found)}.""",
+        records.source("calibration"),
+        records.source("exposures"),
     )
