@@ -40,7 +40,7 @@ def test_a_killed_worker_s_block_is_taken_over(tmp_path: Path) -> None:
     pytest.importorskip("ray")
     blocks = BlockFolder.read(cut(tmp_path / "room"))
     ray = ("--engine", "ray", "--workers", "2", "--threads", "1")
-    steps = ("--steps", "300", "--checkpoint-every", "0.3", *OPTIONS)
+    steps = ("--steps", "600", "--checkpoint-every", "0.3", *OPTIONS)
     first, second = blocks.run(0), blocks.run(1)
     code, _, err = run("train-blocks", blocks.folder, *ray[:2], "--threads", "9999")
     assert code == 2 and "no machine of the cluster has so many cores" in err
