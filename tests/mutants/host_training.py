@@ -123,6 +123,7 @@ PLANNED, GROWN = "training/plan.py", "training/growth.py"
 OPTIM, STATE, COARSE = (f"training/{name}.py" for name in ("optim", "state", "coarse"))
 SPACE_PLAN = "scenes/extent/space_plan.py"
 SCHEDULE, CHECKPOINT = "training/schedule.py", "runs/checkpoint.py"
+KEPT = "runs/optimiser_tensors.py"
 RAYS, RENDER, JOINED = (f"rendering/{name}.py" for name in ("rays", "render", "losses"))
 MARCH = "rendering/steps.py"
 
@@ -324,8 +325,8 @@ MUTANTS = [
     of_host("exposures: judged again where resumed", "training/exposure.py", "self.sums, self.settled = state[\"sums\"], bool(state[\"settled\"].numpy()[0])", "self.sums = state[\"sums\"]", JUDGES_ONCE),
     of_host("exposures: without those of other processes", TRAINER, "            accumulated.append(self.exposures.accumulated)\n", "            pass\n", PROCESSES),
     of_host("exposures: of any number of photographs", "training/exposure.py", "if self.sums.size != n_views * NUMBERS:", "if False:", EXPOSED_REFUSED),
-    of_host("exposures: no number", CHECKPOINT, "or not are_sums(sums):", "or False:", EXPOSED_REFUSED),
-    of_host("exposures: affine, but not settled", CHECKPOINT, "(1.0,) if config.appearance", "(0.0, 1.0) if config.appearance", EXPOSED_REFUSED),
+    of_host("exposures: no number", KEPT, "or not are_sums(sums):", "or False:", EXPOSED_REFUSED),
+    of_host("exposures: affine, but not settled", KEPT, "(1.0,) if config.appearance", "(0.0, 1.0) if config.appearance", EXPOSED_REFUSED),
     of_host("exposures: in the short training", COARSE, '        appearance="none",\n', "", SHORT_USES),
     of_host("corrected by the whole picture", "evaluation/metrics.py", "(a, b) if mask is None else (a[mask], b[mask])", "(a, b)", CORRECTED),
     of_host("corrected beyond white", "evaluation/metrics.py", "np.clip(mean_y + gain * (a - mean_x), 0.0, 1.0)", "mean_y + gain * (a - mean_x)", CORRECTED),
@@ -384,7 +385,7 @@ MUTANTS = [
     # checkpoint.py
     of_host("grown is forgotten", CHECKPOINT, "        grown=grown,\n", "        grown=0,\n", COMES_BACK),
     of_host("no shift", CHECKPOINT, "density_shift=header.density_shift,", "density_shift=0.0,", COMES_BACK),
-    of_host("moments are not looked at", CHECKPOINT, "            if not fits:\n", "            if False:\n", FORGED),
+    of_host("moments are not looked at", KEPT, "            if not fits:\n", "            if False:\n", FORGED),
     of_host("more growths than there are", CHECKPOINT, "if not 0 <= grown <= most:", "if grown < 0:", FORGED),
     of_host("any optimiser", CHECKPOINT, "if not 0 <= training.restarted <= training.updates:", "if False:", FORGED),
     # presets.py

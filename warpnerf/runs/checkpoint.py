@@ -21,7 +21,6 @@ from warpnerf.config import TrainConfig
 from warpnerf.config_json import config_to_json
 from warpnerf.fields.lattice import Lattice
 from warpnerf.fields.occupancy import FreeCells
-from warpnerf.fields.parameters import head_parameters
 from warpnerf.fields.storages import class_of
 from warpnerf.grid_config import GROW_AT, Contraction
 from warpnerf.model.interface import Model, n_weights
@@ -34,14 +33,14 @@ from warpnerf.rendering.field import Field
 from warpnerf.rendering.proposal import PARAMETER
 from warpnerf.rendering.steps import Steps
 from warpnerf.runs.compact import COMPACT, Precision, compact, expanded
+from warpnerf.runs.optimiser_tensors import optimiser_tensors, read_optimiser
 from warpnerf.runs.stored_proposal import StoredProposal, proposal_header
 from warpnerf.runs.tensor_file import read_tensors, refuse, write_tensors
 from warpnerf.runtime.parallel import Workers
 from warpnerf.scenes.extent.frustum import Frustum
 from warpnerf.scenes.extent.space import grid_size
-from warpnerf.training.exposure import NUMBERS, are_sums
 from warpnerf.training.exposure import STATE as EXPOSURES
-from warpnerf.training.optim import OPTIMISERS, first_states
+from warpnerf.training.optim import OPTIMISERS
 from warpnerf.training.plan import OlderPlan, TrainingPlan
 from warpnerf.training.plan_json import decode, plan_to_json, prepared
 from warpnerf.training.state import Progress, TrainingState
@@ -106,7 +105,7 @@ def save_checkpoint(path: str | Path, state: TrainingState) -> None:
         kind, config = WITHOUT_PLAN, config_to_json(state.config)
         training |= asdict(state.plan) | {"config": config}
     header = {"format": kind, "training": training} | field_header(state.field)
-    write_tensors(path, header, _optimiser_tensors(state) | field_tensors(state.field))
+    write_tensors(path, header, optimiser_tensors(state) | field_tensors(state.field))
 
 
 @checked_arguments
@@ -187,7 +186,7 @@ def load_checkpoint(path: str | Path) -> TrainingState:
         restarted=training.restarted,
         progress=training.progress,
         field=field,
-        optimiser=_optimiser(plan.config, field, tensors, path, workers),
+        optimiser=read_optimiser(plan.config, field, tensors, path, workers),
     )
 
 
@@ -279,55 +278,6 @@ def field_tensors(field: Field) -> dict[str, np.ndarray]:
     tensors |= {} if proposal is None else {PARAMETER: proposal.grid.tensors()["values"]}
     tensors["free_distance"] = field.free.distance.numpy().reshape(field.free.size)
     return tensors | ({"weights": field.weights.numpy()} if field.weights.size else {})
-
-
-def _optimiser_tensors(state: TrainingState) -> dict[str, np.ndarray]:
-    """What the optimiser keeps, by the parameter's name and its own."""
-    return {
-        f"{parameter}.{name}": array.numpy()
-        for parameter, arrays in state.optimiser.items()
-        for name, array in arrays.items()
-    }
-
-
-def _optimiser(
-    config: TrainConfig,
-    field: Field,
-    tensors: dict[str, np.ndarray],
-    path: Path,
-    workers: Workers,
-) -> dict[str, dict[str, wp.array]]:
-    """What was written by ``_optimiser_tensors``, where it fits the model's parameters."""
-    parameters = field.storage.parameters(field.model, config.optim)
-    parameters += head_parameters(field.model, field.weights)
-    if field.proposal is not None:
-        parameters += field.proposal.parameters(config.optim)
-    states = first_states(parameters, workers)
-    for parameter, arrays in states.items():
-        for name, array in arrays.items():
-            tensor, expected = tensors[f"{parameter}.{name}"], array.numpy()
-            tensor = tensor.reshape(expected.shape) if tensor.size == expected.size else tensor
-            fits = tensor.shape == expected.shape and tensor.dtype == expected.dtype
-            if fits and tensor.dtype == np.uint32:
-                # An exponent of ones is infinity or no number, in the upper half as in the lower.
-                fits = not any(((tensor >> place) & 0xFF == 0xFF).any() for place in (23, 8))
-            elif fits:
-                fits = bool(np.isfinite(tensor).all())
-            if not fits:
-                refuse(path, f"its tensor '{parameter}.{name}' does not fit its values")
-            arrays[name] = wp.array(tensor, dtype=array.dtype, device=workers.device)
-    if (name := f"{EXPOSURES}.sums") in tensors:
-        sums, settled = tensors[name], tensors[f"{EXPOSURES}.settled"]
-        if sums.dtype != np.float32 or sums.size % NUMBERS or not are_sums(sums):
-            refuse(path, f"its tensor '{name}' does not fit its photographs")
-        known = (1.0,) if config.appearance == "affine" else (0.0, 1.0)
-        if settled.size != 1 or settled.item() not in known:
-            refuse(path, f"its tensor '{EXPOSURES}.settled' does not fit its appearance")
-        states[EXPOSURES] = {
-            name: wp.array(tensor.ravel(), dtype=wp.float32, device=workers.device)
-            for name, tensor in (("sums", sums), ("settled", settled))
-        }
-    return states
 
 
 def _field(header: _Header, tensors: dict[str, np.ndarray], path: Path, workers: Workers) -> Field:
