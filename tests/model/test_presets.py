@@ -104,6 +104,8 @@ def test_the_command_knows_all() -> None:
 
 def test_there_are_those_of_others_and_the_everyday_ones() -> None:
     assert set(PRESETS) == {*DEFAULT_PRESETS, *PUBLISHED, "tensorf", "ngp", "mip360"}
+    for name, preset in PRESETS.items():  # published figures are of photographs as they are
+        assert preset.appearance == ("auto" if name in DEFAULT_PRESETS else "none")
 
 
 PUBLISHED: dict[str, dict[str, Any]] = {

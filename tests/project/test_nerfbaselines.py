@@ -179,6 +179,8 @@ def test_options(method: Any) -> None:
     assert config.background == (1.0, 0.0, 0.2)
     assert config.march == wn.PRESETS["quality"].march
     assert method.configured({"content_distance": "auto"}, None).content_distance == "auto"
+    assert config.appearance == "none"
+    assert method.configured({"appearance": "affine"}, None).appearance == "affine"
     other = method.configured({"field": "hash", "sampler": "resampled"}, None)
     assert (other.field, other.sampler) == (wn.Hash(), Resampled())
     factors = method.configured({"preset": "tensorf", "field": "vm"}, None)

@@ -46,6 +46,7 @@ def train_to_the_end(
 ) -> int:
     """Train to the end, or until asked to stop; look at the test views."""
     from warpnerf.reports.limits import voxel_pixels, what_limits
+    from warpnerf.training.exposure import in_use
     from warpnerf.training.held_out import HeldOut
 
     keep = run.read_config().keep
@@ -97,8 +98,8 @@ def train_to_the_end(
         if trainer.fraction >= 1.0:
             run.save_field(trainer.field(), keep == "checkpoint")
             run.draw_curves(scene.name)
-            if trainer.exposures is not None and trainer.exposures.used:
-                print(trainer.exposures.in_words(scene.training_names))
+            if (exposures := in_use(trainer.exposures)) is not None:
+                print(exposures.in_words(scene.training_names))
         exit_code = processes.exit_code_of(stop, trainer)
     if session is not None:
         session.notify("The training has ended", f"warpnerf view {run.folder} shows what it left.")
@@ -113,7 +114,7 @@ def train_to_the_end(
         print(f"wrote {run.folder}: field.safetensors, log.jsonl and config.json")
         return 0
     device, threads, pixels = trainer.config.device, trainer.config.threads, voxel_pixels(trainer)
-    exposed = trainer.exposures is not None and trainer.exposures.used
+    exposed = in_use(trainer.exposures) is not None
     del trainer  # its grid, and what its optimiser keeps
 
     def at_end(metrics: Mapping[str, float], split: str) -> None:

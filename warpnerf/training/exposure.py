@@ -18,10 +18,12 @@ from warpnerf_kernels.base.types import vec3
 from warpnerf_kernels.optim import exposure as kernels
 
 from warpnerf.checks import InputError
+from warpnerf.config import Appearance
 from warpnerf.fields.gradients import Gradients
 from warpnerf.fields.parameters import Parameter
 from warpnerf.rendering.rays import RayBatch
 from warpnerf.runtime.parallel import RAYS, LaunchCache, Workers
+from warpnerf.scenes.scene import Scene
 from warpnerf.training.peers import Peers
 
 BEGIN, FIRST_RAYS = 0.05, 200_000
@@ -212,6 +214,36 @@ class Exposures:
         pairs = zip(self.gains.numpy().tolist(), self.offsets.numpy().tolist(), strict=True)
         found = (Exposure(gain=tuple(gain), offset=tuple(offset)) for gain, offset in pairs)
         return dict(zip(names, found, strict=True))
+
+
+def exposures_of(
+    scene: Scene, appearance: Appearance, workers: Workers, kept: dict[str, wp.array] | None
+) -> Exposures | None:
+    """The exposures of a training's photographs, where it is to fit them.
+
+    Args:
+        scene: What is trained on.
+        appearance: ``TrainConfig.appearance``.
+        workers: Where to work.
+        kept: By a checkpoint, of a training to be resumed.
+
+    Raises:
+        InputError: There is one photograph, or they are not those of the checkpoint.
+    """
+    if appearance == "none":
+        return None
+    n_views = len(scene.splits["train"])
+    if appearance == "affine" and n_views == 1:
+        raise InputError(
+            f"appearance is affine, but {scene.name} has one training photograph, and none that it "
+            "could differ from; leave --appearance out."
+        )
+    return Exposures(n_views, workers, appearance == "affine", kept)
+
+
+def in_use(exposures: Exposures | None) -> Exposures | None:
+    """Those by which photographs have been drawn; None: these were taken as they are."""
+    return None if exposures is None or not exposures.used else exposures
 
 
 def brightness(gains: np.ndarray, offsets: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from warpnerf.rendering.field import Field
 from warpnerf.runtime.progress import ProgressBar, has_bar
 from warpnerf.scenes.scene import Scene
 from warpnerf.training.coarse import prepare_trainer
-from warpnerf.training.exposure import Exposure
+from warpnerf.training.exposure import Exposure, in_use
 from warpnerf.training.held_out import HeldOut, require_eval
 from warpnerf.training.state import Progress, TrainingState
 
@@ -96,12 +96,11 @@ def train(
         held_out = None if eval_every is None else HeldOut(trainer, eval_every)
         between = None if held_out is None else held_out.after_update
         end = trainer.run(report, on_checkpoint, between=between)
+    exposures = in_use(trainer.exposures)
     return TrainResult(
         field=trainer.field(),
         content_distance=trainer.plan.content_distance,
         progress=last or end,
         scene=trainer.scene,
-        exposures=None
-        if trainer.exposures is None or not trainer.exposures.used
-        else trainer.exposures.by_name(scene.training_names),
+        exposures=None if exposures is None else exposures.by_name(scene.training_names),
     )

@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 import warp as wp
 
-from warpnerf.checks import InputError
 from warpnerf.config import TrainConfig
 from warpnerf.fields.lattice import Lattice
 from warpnerf.fields.occupancy import FreeCells
@@ -28,7 +27,7 @@ from warpnerf.runtime.memory import release_free_memory
 from warpnerf.runtime.parallel import Workers
 from warpnerf.scenes.extent.points import ObservedExtent, with_extent
 from warpnerf.scenes.scene import Scene
-from warpnerf.training.exposure import STATE, Exposures
+from warpnerf.training.exposure import STATE, Exposures, exposures_of
 from warpnerf.training.extent import march_steps, require_samples
 from warpnerf.training.growth import (
     first_storage,
@@ -144,15 +143,10 @@ class Trainer:
             self._restore(resume)
         self.exposures: Exposures | None = None
         """Those of the training views, where it fits them."""
-        exposed = self.optimiser.pop(STATE, None)
-        if config.appearance != "none" and (exposed is not None or resume is None):
-            n_views = len(scene.splits["train"])
-            if (always := config.appearance == "affine") and n_views == 1:
-                raise InputError(
-                    f"appearance is affine, but {scene.name} has one training photograph, and none "
-                    "that it could differ from; leave --appearance out."
-                )
-            self.exposures = Exposures(n_views, self.workers, always, exposed)
+        if resume is None or STATE in self.optimiser:  # else they were dropped
+            kept = self.optimiser.pop(STATE, None)
+            self.exposures = exposures_of(scene, config.appearance, self.workers, kept)
+        if self.exposures is not None:
             self._sampler.take_out_exposures(self.exposures.gains, self.exposures.offsets)
         self._occupied = self.free.share()
         self._seen = 1.0
