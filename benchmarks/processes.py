@@ -5,8 +5,9 @@
 Both sides train the scene alike, so that their grids grow at the same updates; blocks of updates
 take turns, and each block of one side is paired with the same block of the other. Prints how fast
 the processes are against the threads, by updates done, with 95 % intervals over blocks, and how
-much of the grid an update touches. `--exchange tiles` sends touched tiles by gloo, as where
-processes share no memory, `--exchange dense` all of the gradient. Where other programs keep the
+much of the grid an update touches. `--exchange messages` copies touched tiles into shared memory
+and their sums back, `tiles` sends them by gloo, as where processes share no memory, `dense` all of
+the gradient. Where other programs keep the
 cores busy, only the processor time of an exchange tells anything, that of one process. Writes
 benchmarks/results/processes_cpu.json.
 """
@@ -17,18 +18,21 @@ import multiprocessing
 import os
 import socket
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
 import torch
+import warp as wp
 from measuring import machine, median_interval, options, show, write_record
 from training import path_of
+from warpnerf_kernels.base.tiles import TILE
 
 import warpnerf as wn
 from warpnerf.config import TrainConfig
 from warpnerf.presets import PRESETS
+from warpnerf.runtime.parallel import Workers, zero_bytes
 from warpnerf.torch.processes import Processes
 from warpnerf.training.peers import Peers, Signals
 from warpnerf.training.trainer import Trainer
@@ -43,12 +47,24 @@ class Touched(Processes):
         self.exchanged_bytes += sum(touched.nbytes for touched in flags)
         super()._add_flags(flags)
 
-    def _sum(self, room: torch.Tensor) -> None:
+    def _sum(self, room: torch.Tensor, shares: Sequence[Callable[[], None]]) -> None:
         self.exchanged_bytes += room[0].nbytes
-        super()._sum(room)
+        super()._sum(room, shares)
+
+    def _add_shared(self, values: wp.array, touched: wp.array, workers: Workers) -> None:
+        n_tiles = np.count_nonzero(touched.numpy().view(bool))
+        self.exchanged_bytes += n_tiles * TILE * 4 * values.dtype._length_
+        super()._add_shared(values, touched, workers)
 
 
-class Tiles(Touched):
+class Messages(Touched):
+    """Copies touched tiles into shared memory, and sums back."""
+
+    def zeros(self, n_bytes: int) -> np.ndarray:
+        return zero_bytes(n_bytes)
+
+
+class Tiles(Messages):
     """Shares no memory: all goes by gloo."""
 
     def _shared(self, n_bytes: int) -> None:
@@ -63,7 +79,7 @@ class Dense(Tiles):
             touched.fill_(1)
 
 
-EXCHANGES = {"shared": Touched, "tiles": Tiles, "dense": Dense}
+EXCHANGES = {"shared": Touched, "messages": Messages, "tiles": Tiles, "dense": Dense}
 
 
 class Side:

@@ -6,11 +6,30 @@ TILES = "kernels/test_tiles.py"
 VARIATION = "kernels/test_total_variation.py"
 ADAM, NEAR_DECAY = "kernels/test_adam.py", "fields/test_near_decay.py"
 EXPOSURE = "kernels/test_exposure.py"
+REDUCTION = "kernels/test_reduction.py"
 EXPOSED = (
     "kernels/test_camera_rays.py::test_exposures_are_taken_out_of_pixels_before_their_background"
 )
 
 MUTANTS = [
+    # reduction.py
+    Mutant("reduction: not the tile after", "optim/reduction.py", "if (here | before)", "if (here)", REDUCTION),
+    Mutant("reduction: every tile", "optim/reduction.py", "if (here | before)", "if (true)", REDUCTION),
+    Mutant("reduction: group before forgotten", "optim/reduction.py",
+           "wp::uint8 before = flag(group - 1);", "wp::uint8 before = 0;", REDUCTION),
+    Mutant("reduction: flags of one", "optim/reduction.py",
+           "any |= flags(k)[tile]", "any |= flags(0)[tile]", REDUCTION),
+    Mutant("reduction: groups of one", "optim/reduction.py",
+           "memcpy(&all, flags(k) + group, GROUP)", "memcpy(&all, flags(0) + group, GROUP)", REDUCTION),
+    Mutant("reduction: flags stay", "optim/reduction.py", "flags(k)[tile] = here;", "flags(0)[tile] = here;", REDUCTION),
+    Mutant("reduction: sums for the first", "optim/reduction.py",
+           "memcpy(row(k) + from, sum, sizeof(float) * n);", "", REDUCTION),
+    Mutant("reduction: beyond the last entry", "optim/reduction.py",
+           "left < floats ? left : floats", "floats", REDUCTION),
+    Mutant("reduction: all blocks alike", "optim/reduction.py",
+           "* touched.shape[0] + process", "* touched.shape[0]", REDUCTION),
+    Mutant("reduction: beyond the last tile", "optim/reduction.py",
+           "wp.min(begin + wp.static(BLOCK), n_tiles)", "begin + wp.static(BLOCK)", REDUCTION),
     # tiles.py
     Mutant("touched_tiles: not the tile after", "base/tiles.py",
            "    tiles |= tiles << 8;", "    //", TILES),

@@ -229,7 +229,7 @@ class Adding(Peers):
     def __init__(self, change: Callable[[Any], None]) -> None:
         self.change = change
 
-    def add(self, accumulated: Any) -> None:
+    def add(self, accumulated: Any, workers: Any) -> None:
         self.change(accumulated[0][0])
 
 

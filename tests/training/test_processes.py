@@ -20,6 +20,7 @@ from tests.support.tiny_trainings import early_growth as early_growth
 from warpnerf.checks import InputError
 from warpnerf.cli.main import main
 from warpnerf.cli.processes import share_of_machine
+from warpnerf.runtime.parallel import zero_bytes
 from warpnerf.training import exposure
 from warpnerf.training.peers import Peers
 from warpnerf.training.trainer import Trainer
@@ -39,8 +40,8 @@ def recorded(peers: Peers) -> list[dict[str, np.ndarray]]:
     found: list[dict[str, np.ndarray]] = []
     add = peers.add
 
-    def adding(accumulated: Any) -> None:
-        add(accumulated)
+    def adding(accumulated: Any, workers: Any) -> None:
+        add(accumulated, workers)
         gradients, _ = accumulated[0]
         arrays = {name: array.numpy().copy() for name, array in gradients.arrays.items()}
         arrays["weights"] = arrays["weights"].sum(axis=0)
@@ -67,24 +68,27 @@ def test_processes_with_a_share_of_the_rays_are_one_with_all(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """To rounding, which Adam blows up after the first update; and to the bit each other, and when
-    done again, where one cannot reach the memory of the first."""
+    done again, where gradients are copied to shared memory, or one cannot reach the first's."""
     for name, value in (("FIRST_RAYS", 0), ("JUDGED_RAYS", 9), ("DIFFERENT", 0.0)):
         monkeypatch.setattr(exposure, name, value)
     alone = tmp_path / "alone.npz"
     trained(Peers(), alone)
-    for turn in range(2):
+    for turn, (rows, launched) in enumerate([(2, STEPS), (2, 0), (1, 0)]):
 
         def one_of_two(rank: int, turn: int = turn) -> int:
-            if turn == rank == 1:
+            if turn == 2 and rank == 1:
                 processes.opened = lambda place, n_bytes: None
-            peers = processes.Processes()
+            peers, shares = processes.Processes(), []
+            add_share = peers._add_shared
+            peers._add_shared = lambda *given: shares.append(add_share(*given))
+            if turn == 1:
+                peers.zeros = zero_bytes  # type: ignore[method-assign]
             trained(peers, tmp_path / f"{turn}{rank}.npz")
-            return len(peers._room)
+            return 100 * len(peers._room) + len(shares)
 
-        rows = 2 if turn == 0 else 1
         done = several(one_of_two, tmp_path)
-        assert [ended.code for ended in done] == [rows, rows], done
-    one, *others = (np.load(tmp_path / f"{turn}{rank}.npz") for turn in "01" for rank in "01")
+        assert [ended.code for ended in done] == 2 * [100 * rows + launched], done
+    one, *others = (np.load(tmp_path / f"{turn}{rank}.npz") for turn in "012" for rank in "01")
     for other in others:
         assert all(np.array_equal(one[name], other[name]) for name in one.files if name != "loss")
     with np.load(alone) as expected:
@@ -99,6 +103,22 @@ def test_processes_with_a_share_of_the_rays_are_one_with_all(
         assert counts[0].min() > 0.0
         assert one["field.values"].shape == expected["field.values"].shape  # it has grown alike
         assert np.abs(one["field.values"] - expected["field.values"]).mean() < 0.05
+
+
+def test_a_field_that_is_all_in_shared_memory(tmp_path: Path) -> None:
+    """Without a head, no weights are sent."""
+
+    def one_of_two(rank: int) -> int:
+        peers = processes.Processes()
+        trainer = Trainer(ball(), tiny_config(model="rgb", steps=3, appearance="none"), peers=peers)
+        trainer.run()
+        np.save(tmp_path / f"{rank}.npy", trainer.storage.tensors()["values"])
+        return 0 if peers._room is None else 1
+
+    done = several(one_of_two, tmp_path)
+    assert [ended.code for ended in done] == [0, 0], done
+    one, other = (np.load(tmp_path / f"{rank}.npy") for rank in range(2))
+    assert np.array_equal(one, other)
 
 
 # --- The command --------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from warpnerf_kernels.base.types import real
 
 from warpnerf.model.interface import Model, n_weights
 from warpnerf.runtime.memory import prefer_large_pages
-from warpnerf.runtime.parallel import LaunchCache, Workers
+from warpnerf.runtime.parallel import LaunchCache, Workers, zero_bytes
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -82,15 +82,19 @@ def zero_entries(
     device = workers.device
     if device.is_cuda:
         values = wp.zeros(n, dtype=dtype, device=device)
+        touched = wp.zeros(n_tiles(n), dtype=wp.uint8, device=device)
     else:  # pages that take no memory until a gradient is added to them
         width = dtype._length_
-        room = np.zeros(n * width + LANES, np.float32)
+        n_bytes = 4 * (n * width + LANES)
+        room = (zero_bytes if large_pages else workers.zeros)(n_bytes).view(np.float32)
         if large_pages:
             prefer_large_pages(room.ctypes.data, room.nbytes)
         begin = -room.ctypes.data // 4 % LANES  # of a cache line: entries lie in as few as can be
         zeros = room[begin : begin + n * width].reshape(n, width)
         values = wp.array(zeros, dtype=dtype, device=device, copy=False)
-    return {"values": values, "touched": wp.zeros(n_tiles(n), dtype=wp.uint8, device=device)}
+        flags = workers.zeros(n_tiles(n))
+        touched = wp.array(flags, dtype=wp.uint8, device=device, copy=False)
+    return {"values": values, "touched": touched}
 
 
 def zero_weights(n: int, workers: Workers) -> wp.array:

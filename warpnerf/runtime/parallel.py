@@ -15,6 +15,7 @@ from functools import partial
 from queue import SimpleQueue
 from typing import Any
 
+import numpy as np
 import warp as wp
 from warpnerf_kernels.cpu import barrier
 
@@ -26,6 +27,11 @@ NODES = 1 << 20
 RAYS = 1 << 13
 """Items per launch on the CPU, of little and of much work each: a fraction of a second, because
 signals such as Ctrl-C wait for a launch to end."""
+
+
+def zero_bytes(n_bytes: int) -> np.ndarray:
+    """[n_bytes] uint8 of pages that take no memory until something is written to them."""
+    return np.zeros(n_bytes, np.uint8)
 
 
 class LaunchCache:
@@ -105,12 +111,18 @@ def _end(threads: list[Thread]) -> None:
 class Workers:
     """The threads that launch kernels on one device. A CUDA device needs, and gets, just one."""
 
-    def __init__(self, device: str = "cpu", threads: int | None = None) -> None:
+    def __init__(
+        self,
+        device: str = "cpu",
+        threads: int | None = None,
+        zeros: Callable[[int], np.ndarray] = zero_bytes,
+    ) -> None:
         """Open a device.
 
         Args:
             device: As Warp names it: cpu, cuda, cuda:1.
             threads: CPU threads; None: one per core that this process may use.
+            zeros: Gives memory of so many bytes to gradients on the CPU, [n] uint8.
 
         Raises:
             InputError: The device does not exist on this machine, or Warp's cache cannot be made.
@@ -129,6 +141,7 @@ class Workers:
                 "use --device cpu."
             ) from error
         self.count = 1 if self.device.is_cuda else (threads or usable_cores())
+        self.zeros = zeros
         self._others: list[Thread] = []
         weakref.finalize(self, _end, self._others)
         self._begin()

@@ -6,17 +6,22 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from datetime import timedelta
-from mmap import mmap
+from functools import partial
+from mmap import PAGESIZE, mmap
 from typing import Any, NamedTuple, TypeVar
+from weakref import WeakValueDictionary
 
+import numpy as np
 import torch
 import torch.distributed as dist
 import warp as wp
 from warpnerf_kernels.base.tiles import TILE
+from warpnerf_kernels.optim.reduction import BLOCK, add_tiles
 
 from warpnerf.checks import InputError
 from warpnerf.fields.gradients import Gradients
 from warpnerf.fields.parameters import Parameter
+from warpnerf.runtime.parallel import Workers
 from warpnerf.runtime.shared_memory import opened, share
 from warpnerf.training.peers import PeerLostError, Peers, Signals
 
@@ -35,7 +40,7 @@ T = TypeVar("T")
 class Processes(Peers):
     """The processes of this training, by gloo between CPUs and by NCCL between CUDA devices.
 
-    Where all can reach the same memory, on the CPU, gradients go through that.
+    Where all can reach the same memory, on the CPU, gradients lie there, or go through that.
     """
 
     def __init__(self) -> None:
@@ -45,6 +50,8 @@ class Processes(Peers):
             InputError: They cannot be met.
         """
         self._room: torch.Tensor | None = None
+        self._rows: WeakValueDictionary[int, np.ndarray] = WeakValueDictionary()
+        self._has_begun = False
         try:
             self._store, self.rank, self.count = next(dist.rendezvous("env://", timeout=MEETING))
             dist.init_process_group(
@@ -109,6 +116,7 @@ class Processes(Peers):
     def agree(self, signals: Signals) -> Signals:
         """The seconds of the first process; one that stops, whose loss is not finite, or the first
         that saves, is enough."""
+        self._has_begun = True
         first = self.rank == 0
         seconds, save = signals.seconds if first else 0.0, first and signals.save
         mine = (seconds, signals.stop, save, not signals.finite)
@@ -117,27 +125,52 @@ class Processes(Peers):
         seconds, stop, save, failed = all_of.tolist()
         return Signals(seconds=seconds, stop=bool(stop), save=bool(save), finite=not failed)
 
-    def add(self, accumulated: Sequence[tuple[Gradients, Parameter]]) -> None:
+    @property
+    def kernels(self) -> tuple[wp.Kernel, ...]:
+        """The one that adds up what lies in shared memory."""
+        return (add_tiles,)
+
+    def zeros(self, n_bytes: int) -> np.ndarray:
+        """In shared memory, where all can reach it: a row for each process, of which all know."""
+        size = -(-n_bytes // PAGESIZE) * PAGESIZE
+        shared = self._shared(self.count * size)
+        if shared is None:
+            return super().zeros(n_bytes)
+        rows = np.frombuffer(shared, np.uint8)  # lives as long as any part of it is in use
+        own = rows[self.rank * size :][:n_bytes]
+        self._rows[own.ctypes.data] = rows
+        return own
+
+    def add(self, accumulated: Sequence[tuple[Gradients, Parameter]], workers: Workers) -> None:
         """Sums of touched tiles and of weights; the order of summands depends on ranks alone.
 
-        First all flags, then all sums: each message waits for the slowest process. So no process
-        writes a message before all have read the sums of the update before.
+        Where gradients do not lie in shared memory themselves, all flags come first, then all sums:
+        each message waits for the slowest process. So no process writes a message before all have
+        read the sums of the update before.
         """
         device = accumulated[0][0].arrays["weights"].device
         if device.is_cuda:
             self._use(device)
             wp.synchronize_device(device)
+        shared: list[tuple[wp.array, wp.array]] = []
         tiled: list[tuple[torch.Tensor, torch.Tensor]] = []
         rows: list[torch.Tensor] = []
         for gradients, parameter in accumulated:
             arrays = [gradients.arrays[name] for name in parameter.gradient]
             tensors = [wp.to_torch(array, requires_grad=False) for array in arrays]
-            if len(tensors) == 2:
+            if all(array.ptr in self._rows for array in arrays):
+                shared.append((arrays[0], arrays[1]))
+            elif len(tensors) == 2:
                 tiled.append((tensors[0], tensors[1]))
             else:
                 rows.append(tensors[0])
-        self._add_flags([touched for _, touched in tiled])
-        self._add_values([_tiles(*of) for of in tiled], rows)
+        if tiled:
+            self._add_flags([touched for _, touched in tiled])
+        shares = [partial(self._add_shared, *of, workers) for of in shared]
+        if tiled or rows:
+            self._add_values([_tiles(*of) for of in tiled], rows, shares)
+        else:
+            self._in_shares(shares)
         if device.is_cuda:
             torch.cuda.synchronize(device.ordinal)
 
@@ -155,9 +188,27 @@ class Processes(Peers):
         for own, of_all in zip(flags, everything.split([len(f) for f in flags]), strict=True):
             own.copy_(of_all)
 
-    def _add_values(self, tiled: list[Tiles], rows: list[torch.Tensor]) -> None:
+    def _add_shared(self, values: wp.array, touched: wp.array, workers: Workers) -> None:
+        """This process's share of the tiles of gradients in shared memory, for all processes."""
+        of_all = [self._rows[array.ptr].reshape(self.count, -1) for array in (values, touched)]
+        n_tiles, width = touched.shape[0], values.dtype._length_
+        n_blocks = -(-n_tiles // BLOCK)
+        workers.launch(
+            add_tiles,
+            -(-(n_blocks - self.rank) // self.count),
+            self.rank,
+            n_tiles,
+            width,
+            values.shape[0] * width,
+            wp.array(of_all[0].view(np.float32), dtype=wp.float32, device="cpu", copy=False),
+            wp.array(of_all[1], dtype=wp.uint8, device="cpu", copy=False),
+        )
+
+    def _add_values(
+        self, tiled: list[Tiles], rows: list[torch.Tensor], shares: Sequence[Callable[[], None]]
+    ) -> None:
         """Values of tiles that may hold any, and weights: rows of the threads, of which processes
-        may have different numbers."""
+        may have different numbers. Meanwhile, shares of what else there is are added."""
         pieces = [(len(t.chosen), t.tiles.shape[1]) for t in tiled]
         sizes = [n * width for n, width in pieces] + [len(t.rest) for t in tiled]
         sizes += [row.shape[1] for row in rows]
@@ -169,7 +220,7 @@ class Processes(Peers):
             rest.copy_(t.rest)
         for row, part in zip(rows, parts[2 * n :], strict=True):
             torch.sum(row, dim=0, out=part)
-        self._sum(room)
+        self._sum(room, shares)
         parts = room[0].split(sizes)
         for t, piece, part, rest in zip(tiled, pieces, parts, parts[n:], strict=False):
             t.tiles.index_copy_(0, t.chosen, part.view(piece))
@@ -195,23 +246,30 @@ class Processes(Peers):
         first = self.rank == 0
         with share(n_bytes) if first else nullcontext((None, None)) as (memory, place):
             places = [place]
+            group = self._training if self._has_begun else self._saving
             with _lost():
-                dist.broadcast_object_list(places, group=self._training)
+                dist.broadcast_object_list(places, group=group)
             if not first:
                 memory = opened(places[0], n_bytes)
             all_have = torch.tensor([memory is not None], dtype=torch.uint8)
-            self._reduce(all_have, dist.ReduceOp.MIN)
+            with _lost():
+                dist.all_reduce(all_have, dist.ReduceOp.MIN, group)
         return memory if all_have else None
 
-    def _sum(self, room: torch.Tensor) -> None:
+    def _sum(self, room: torch.Tensor, shares: Sequence[Callable[[], None]]) -> None:
         """The sum of all messages, into the first row; of rows, each process sums a share."""
         if len(room) == 1:
             self._reduce(room[0], dist.ReduceOp.SUM)
-            return
+        else:
+            shares = [partial(_add_rows, *room.tensor_split(self.count, dim=1)[self.rank]), *shares]
+        if shares:
+            self._in_shares(shares)
+
+    def _in_shares(self, shares: Sequence[Callable[[], None]]) -> None:
+        """Do this process's share of each, once all have written, and before any reads on."""
         self._meet()
-        first, *others = room.tensor_split(self.count, dim=1)[self.rank]
-        for other in others:
-            first += other
+        for add in shares:
+            add()
         self._meet()
 
     def _meet(self) -> None:
@@ -233,6 +291,11 @@ class Tiles(NamedTuple):
     """Which of them may hold any."""
     rest: torch.Tensor
     """What is no whole tile."""
+
+
+def _add_rows(first: torch.Tensor, *others: torch.Tensor) -> None:
+    for other in others:
+        first += other
 
 
 def _tiles(values: torch.Tensor, touched: torch.Tensor) -> Tiles:

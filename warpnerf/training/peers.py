@@ -6,6 +6,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
+import numpy as np
+import warp as wp
+
+from warpnerf.runtime.parallel import Workers, zero_bytes
+
 if TYPE_CHECKING:
     from warpnerf.fields.gradients import Gradients
     from warpnerf.fields.parameters import Parameter
@@ -87,13 +92,29 @@ class Peers:
         """
         return signals
 
-    def add(self, accumulated: Sequence[tuple[Gradients, Parameter]]) -> None:
+    @property
+    def kernels(self) -> tuple[wp.Kernel, ...]:
+        """What ``add`` launches."""
+        return ()
+
+    def zeros(self, n_bytes: int) -> np.ndarray:
+        """Memory for gradients on the CPU, [n_bytes] uint8, in whole pages where others reach it.
+
+        All processes ask for the same, in the same order.
+
+        Raises:
+            PeerLostError: One has ended.
+        """
+        return zero_bytes(n_bytes)
+
+    def add(self, accumulated: Sequence[tuple[Gradients, Parameter]], workers: Workers) -> None:
         """Replace gradients by their sums over all processes, and flags by those of all tiles that
         hold any.
 
         Args:
             accumulated: Parameters, and where their gradients of an update are, once all of its
                 rays are through.
+            workers: Where to work.
 
         Raises:
             PeerLostError: One has ended, or does not come.

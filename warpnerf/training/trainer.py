@@ -108,7 +108,7 @@ class Trainer:
         self.plan = plan
         """What it goes by; nothing is resolved after it."""
         self.config = config = plan.config
-        self.workers = Workers(config.device, config.threads)
+        self.workers = Workers(config.device, config.threads, peers.zeros)
         require_room(plan, self.workers.device)
         if resume is None:
             require_samples(scene, plan.space, config.march)
@@ -272,7 +272,7 @@ class Trainer:
             accumulated += [(gradients, parameter) for parameter in parameters]
         if self.exposures is not None:
             accumulated.append(self.exposures.accumulated)
-        self.peers.add(accumulated)
+        self.peers.add(accumulated, self.workers)
 
     def _regularise(self, fraction: float, n_steps: int) -> None:
         """Add the gradient of the storage's regulariser, where it has one."""
@@ -406,7 +406,8 @@ class Trainer:
 
     def _load_kernels(self) -> None:
         """Compile what is not yet in the cache."""
-        for kernel in kernels_of(self.plan, self.lattice.contraction, self.workers.device):
+        of_training = kernels_of(self.plan, self.lattice.contraction, self.workers.device)
+        for kernel in (*of_training, *self.peers.kernels):
             self.workers.load(kernel)
 
     def _grow(self, fraction: float) -> None:
