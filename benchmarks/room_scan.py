@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from warpnerf.exporting.quaternions import quaternions
 from warpnerf.scenes.builtin.room import first_hit, photograph
 from warpnerf.scenes.cameras.camera import Camera
+from warpnerf.scenes.cameras.quaternions import quaternions
 from warpnerf.scenes.cameras.undistort import directions
 
 NOISE = 0.005

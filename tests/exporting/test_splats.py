@@ -11,12 +11,12 @@ from tests.reference.splats import draw_splats, read_splats, rotations
 from tests.support.solid_fields import ball_field, camera_at, cameras_around
 from warpnerf.checks import InputError
 from warpnerf.exporting import splats
-from warpnerf.exporting.quaternions import quaternions
 from warpnerf.exporting.splats import Splats, splats_of, splats_ply
 from warpnerf.exporting.visibility import visibility
 from warpnerf.fields.nodes import points_of
 from warpnerf.rendering.field import Field
 from warpnerf.scenes.cameras.camera import Camera
+from warpnerf.scenes.cameras.quaternions import quaternions
 
 FIELDS = (
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),

@@ -14,9 +14,9 @@ from tests.reference.spz import read_spz
 from tests.support.solid_fields import ball_field, cameras_around
 from warpnerf.checks import InputError
 from warpnerf.exporting.export import export
-from warpnerf.exporting.quaternions import to_y
 from warpnerf.exporting.splats import Splats, splats_ply
 from warpnerf.exporting.spz import splats_spz
+from warpnerf.scenes.cameras.quaternions import to_y
 
 
 def some_splats(n: int = 300) -> Splats:

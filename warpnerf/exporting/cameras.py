@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from warpnerf.exporting.mesh import points_ply
-from warpnerf.exporting.quaternions import quaternions
 from warpnerf.exporting.surface import Surface
 from warpnerf.media.pictures import picture_files
 from warpnerf.scenes.cameras.camera import Camera
+from warpnerf.scenes.cameras.quaternions import quaternions
 from warpnerf.scenes.formats.transforms_text import PosedFile, transforms_text
 from warpnerf.scenes.scene import Scene
 

@@ -20,7 +20,6 @@ import numpy as np
 from warpnerf.checked import checked_arguments
 from warpnerf.exporting.colour import colours
 from warpnerf.exporting.ply import ply
-from warpnerf.exporting.quaternions import quaternions
 from warpnerf.exporting.surface import (
     Crop,
     NothingThereError,
@@ -34,6 +33,7 @@ from warpnerf.exporting.visibility import Visibility
 from warpnerf.fields.nodes import points_of
 from warpnerf.renamed import renamed_argument
 from warpnerf.rendering.field import Field
+from warpnerf.scenes.cameras.quaternions import quaternions
 
 SPREAD = 0.5
 """Standard deviation of a splat, in voxel edges."""

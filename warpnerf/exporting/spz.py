@@ -16,8 +16,8 @@ import struct
 import numpy as np
 
 from warpnerf.checks import InputError
-from warpnerf.exporting.quaternions import quaternions, to_y
 from warpnerf.exporting.splats import FIRST_HARMONIC, Splats
+from warpnerf.scenes.cameras.quaternions import quaternions, to_y
 
 log = logging.getLogger(__name__)
 
