@@ -1,4 +1,4 @@
-"""Gradients of several processes, added up tile by tile in memory that all of them reach."""
+"""Gradients of several processes, summed tile by tile in memory that all of them reach."""
 
 from typing import Any
 

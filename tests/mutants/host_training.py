@@ -267,7 +267,7 @@ MUTANTS = [
     of_host("a share of the rows stays as it is", "torch/processes.py", "dim=1)[self.rank]", "dim=1)[0]", PROCESSES),
     of_host("a share of the shared tiles stays as it is", "torch/processes.py", "            self.rank,\n            n_tiles,", "            0,\n            n_tiles,", PROCESSES),
     of_host("no gradient lies in shared memory", TRAINER, "config.threads, peers.zeros)", "config.threads)", PROCESSES),
-    of_host("the shared are not added up", "torch/processes.py", "            add()\n", "            pass\n", PROCESSES),
+    of_host("the shared are not summed", "torch/processes.py", "            add()\n", "            pass\n", PROCESSES),
     of_host("each process's mean is over its own rays", TRAINER,
             "self._seen * (batch.count / self._sampler.count(n_steps))", "self._seen", PROCESSES),
     of_host("an older reach is the distance", PLANNED, "one, distances, self.reach)", "one, distances, one)", WITHOUT_PLAN),

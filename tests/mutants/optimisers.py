@@ -23,7 +23,7 @@ MUTANTS = [
            "memcpy(&all, flags(k) + group, GROUP)", "memcpy(&all, flags(0) + group, GROUP)", REDUCTION),
     Mutant("reduction: flags stay", "optim/reduction.py", "flags(k)[tile] = here;", "flags(0)[tile] = here;", REDUCTION),
     Mutant("reduction: sums for the first", "optim/reduction.py",
-           "memcpy(row(k) + from, sum, sizeof(float) * n);", "", REDUCTION),
+           "memcpy(row(k) + from, sum, sizeof(float) * n);", ";", REDUCTION),
     Mutant("reduction: beyond the last entry", "optim/reduction.py",
            "left < floats ? left : floats", "floats", REDUCTION),
     Mutant("reduction: all blocks alike", "optim/reduction.py",

@@ -127,7 +127,7 @@ class Processes(Peers):
 
     @property
     def kernels(self) -> tuple[wp.Kernel, ...]:
-        """The one that adds up what lies in shared memory."""
+        """The one that sums what lies in shared memory."""
         return (add_tiles,)
 
     def zeros(self, n_bytes: int) -> np.ndarray:

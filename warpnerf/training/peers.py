@@ -100,7 +100,7 @@ class Peers:
     def zeros(self, n_bytes: int) -> np.ndarray:
         """Memory for gradients on the CPU, [n_bytes] uint8, in whole pages where others reach it.
 
-        All processes ask for the same, in the same order.
+        All processes request the same, in the same order.
 
         Raises:
             PeerLostError: One has ended.

@@ -1,6 +1,6 @@
 """Reduction: the gradients of several processes, each in memory that all of them can reach.
 
-Each process adds up a share of the tiles and writes the sums into the gradients of all. Shares are
+Each process sums a share of the tiles and writes the sums into the gradients of all. Shares are
 blocks of tiles in turns, as what rays have touched lies close together.
 """
 
@@ -14,7 +14,7 @@ BLOCK = 32 * GROUP
 """Tiles that a thread works on."""
 
 AHEAD = 8
-"""Tiles from the one that is added up to the one whose memory is fetched meanwhile."""
+"""Tiles from the one that is summed to the one whose memory is fetched meanwhile."""
 
 
 @wp.func_native(
@@ -71,7 +71,7 @@ def add_group(
     values: wp.array2d(dtype=wp.float32),
     touched: wp.array2d(dtype=wp.uint8),
 ):
-    """Add up tiles begin to end - 1 of all processes, in the order of these."""
+    """Sum tiles begin to end - 1 of all processes, in the order of these."""
     ...
 
 
@@ -79,14 +79,14 @@ def add_group(
 def add_tiles(
     # launch
     first: int,
-    # what
+    # choices
     process: int,  # this one
     n_tiles: int,
     width: int,  # floats of an entry
     n_floats: wp.int64,  # of all entries
-    # in and out
-    values: wp.array2d(dtype=wp.float32),  # [n_processes, n_floats or more] gradients
-    touched: wp.array2d(dtype=wp.uint8),  # [n_processes, n_tiles and zeros] their flags
+    # out
+    values: wp.array2d(dtype=wp.float32),  # [n_processes, n_floats or more] gradients, replaced
+    touched: wp.array2d(dtype=wp.uint8),  # [n_processes, n_tiles and zeros] their flags, likewise
 ):
     """Replace gradients by their sums over processes, and flags by those of any, in this process's
     blocks of tiles."""
