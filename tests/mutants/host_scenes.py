@@ -43,7 +43,29 @@ SPACE, SPACE_PLAN, OBSERVATIONS = (
     f"scenes/{name}.py" for name in ("extent/space", "extent/space_plan", "cameras/observations")
 )
 
+DOUBTS = "scenes/extent/doubts.py"
+ANY_FOCAL, FOCAL, HARDLY, OTHER_POSES = (
+    f"scenes/test_doubts.py::test_{name}"
+    for name in (
+        "focal_lengths_that_cameras_do_not_tell_are_believed",
+        "focal_lengths_of_another_size_are_named",
+        "photographs_that_hardly_overlap_refute_nothing",
+        "photographs_of_other_poses_are_named",
+    )
+)
+READ_AS = "scenes/test_conventions.py::test_poses_in_other_axes_are_read_as_the_photographs_show"
+
 MUTANTS = [
+    # doubts.py and conventions.py
+    of_host("doubts: focal lengths that fit about as well", DOUBTS, "return zoom if sharp else None", "return zoom", ANY_FOCAL),
+    of_host("doubts: focal lengths as they stand only", DOUBTS, "for steps in (ZOOMS, FINER):", "for steps in (FINER,):", FOCAL),
+    of_host("doubts: the inverse factor", DOUBTS, "photographs.zoomed(middle * step)", "photographs.zoomed(1.0 / (middle * step))", FOCAL),
+    of_host("doubts: of cameras far apart", DOUBTS, " and photographs.apart(poses) <= CLOSE", "", HARDLY),
+    of_host("doubts: of few references", DOUBTS, "len(gain) < ENOUGH or ", "", HARDLY),
+    of_host("doubts: none of poses", DOUBTS, "if gain.mean() < REFUTED and", "if False and", OTHER_POSES),
+    of_host("doubts: not asked", "scenes/extent/conventions.py", "        warnings += doubts(photographs, poses, agreement)\n", "        pass\n", OTHER_POSES),
+    of_host("w last: w second", "scenes/extent/conventions.py", "np.roll(quaternions(to_camera), 1, axis=1)", "np.roll(quaternions(to_camera), 2, axis=1)", READ_AS),
+    of_host("w last: positions as they were", "scenes/extent/conventions.py", "-turned @ moved], axis=2)", "poses[:, :, 3:]], axis=2)", READ_AS),
     of_host("widths: no bend", SPACES, "k = np.where(n > 1.0, (ahead - s) / (n * ahead), 0.0)", "k = 0.0 * n", WIDTHS),
     of_host("widths: across as ahead", SPACES, "s, ahead = self.shrink(n, placed.border),", "s, ahead = self.ahead(n, placed.border),", WIDTHS),
     of_host("widths: depth counts whole", SPACE, "(1.0 - depth_share * depth_share)", "0.0", WIDTHS),

@@ -16,6 +16,7 @@ from tests.scenes.test_points import write_ply
 from tests.support.tiny_scenes import DATA, camera_at, look_at, needs_capture, picture, ring
 from warpnerf.scenes.builtin.room import first_hit, photograph
 from warpnerf.scenes.cameras.camera import Camera
+from warpnerf.scenes.cameras.quaternions import quaternions, rotations
 from warpnerf.scenes.extent import photo_consistency
 from warpnerf.scenes.extent.conventions import check_against_photographs
 from warpnerf.scenes.extent.photo_consistency import FEWEST, PhotoConsistency, neighbours
@@ -95,6 +96,14 @@ def held(views: list[View], points: Points | None = None) -> tuple[list[View], P
     return found, left, "; ".join(said)
 
 
+def with_w_first(m: np.ndarray) -> np.ndarray:
+    """World to camera in OpenCV axes, its quaternion x, y, z, w read as w, x, y, z."""
+    to_camera = np.linalg.inv(m @ FLIP)
+    x_first = np.roll(quaternions(to_camera[None, :3, :3]), -1, axis=1)
+    to_camera[:3, :3] = rotations(x_first)[0]
+    return np.asarray(np.linalg.inv(to_camera) @ FLIP)
+
+
 WRITTEN = {
     "camera to world in OpenCV": lambda m: m @ FLIP,
     "world to camera in OpenCV": lambda m: np.linalg.inv(m @ FLIP),
@@ -103,6 +112,8 @@ WRITTEN = {
     "x left, y down, looking along -z": lambda m: m @ np.diag([-1.0, -1.0, 1.0, 1.0]),
     "LLFF's": lambda m: m[:, [1, 0, 2, 3]] * [-1.0, 1.0, 1.0, 1.0],
     "x up, y left": lambda m: m[:, [1, 0, 2, 3]] * [1.0, -1.0, 1.0, 1.0],
+    "in OpenCV axes, in place of LLFF's": lambda m: m[:, [1, 0, 2, 3]] * [-1.0, -1.0, -1.0, 1.0],
+    "quaternions that end with w": with_w_first,
 }
 
 

@@ -1,4 +1,4 @@
-"""Rotation matrices to unit quaternions, which is how files of splats and of cameras hold them."""
+"""Rotation matrices and unit quaternions, which is how files of splats and of cameras hold them."""
 
 from __future__ import annotations
 
@@ -39,6 +39,17 @@ def quaternions(rotations: np.ndarray) -> np.ndarray:
     )
     quaternion = rows[diagonal.argmax(axis=1), np.arange(len(m))]
     return quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
+
+
+def rotations(quaternions: np.ndarray) -> np.ndarray:
+    """Rotation matrices [n, 3, 3] of unit quaternions w, x, y, z [n, 4]."""
+    w, x, y, z = quaternions.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), 2, 0)
 
 
 def to_y(up: np.ndarray | None) -> np.ndarray:

@@ -16,19 +16,11 @@ from warpnerf.checks import InputError
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.cameras.focus import find_focus
 from warpnerf.scenes.cameras.overlap import in_picture
-from warpnerf.scenes.extent.photo_consistency import Agreement, PhotoConsistency
+from warpnerf.scenes.cameras.quaternions import quaternions, rotations
+from warpnerf.scenes.extent.doubts import doubts
+from warpnerf.scenes.extent.photo_consistency import ALMOST_ALL, Agreement, PhotoConsistency
 from warpnerf.scenes.extent.points import Points
 from warpnerf.scenes.scene import View
-
-TELLING = 0.1
-"""Mean gain of photographs that fit their poses, at least; captures have 0.15 to 0.4."""
-MOST = 0.7
-"""Share of references that must be found better than by chance by NOTABLY."""
-NOTABLY = 0.05
-CLEARLY = 0.02
-"""By how much a reading of the poses must be better than another, in mean gain and found."""
-ALMOST_ALL = 0.8
-"""Share of references for which it must be."""
 
 SUPPORTED = 0.7
 """Support of points that are believed, at least; those of captures have 0.78 to 1.26."""
@@ -72,6 +64,14 @@ def _columns(*order: int) -> Poses:
     return lambda poses: np.concatenate([poses[:, :, at] * signs, poses[:, :, 3:]], axis=2)
 
 
+def _w_last(poses: np.ndarray) -> np.ndarray:
+    """Of quaternions read as w, x, y, z that are x, y, z, w, and translations to the camera."""
+    to_camera = (poses[:, :, :3] * FLIP[:3]).transpose(0, 2, 1)
+    moved = -to_camera @ poses[:, :, 3:]
+    turned = rotations(np.roll(quaternions(to_camera), 1, axis=1)).transpose(0, 2, 1)
+    return np.concatenate([turned * FLIP[:3], -turned @ moved], axis=2)
+
+
 OPENCV = "camera to world in OpenCV axes (x right, y down, looking along +z)"
 READINGS: dict[str, Poses] = {
     OPENCV: lambda poses: poses * FLIP,
@@ -81,6 +81,8 @@ READINGS: dict[str, Poses] = {
     "camera to world in axes x left, y down, looking along -z": _columns(-1, -2, 3),
     "camera to world in LLFF's axes (x down, y right, looking along -z)": _columns(2, -1, 3),
     "camera to world in axes x up, y left, looking along -z": _columns(-2, 1, 3),
+    "camera to world in OpenCV axes, in place of LLFF's": _columns(-2, -1, -3),
+    "world to camera in OpenCV axes, with quaternions that end with w": _w_last,
 }
 """Other ways to read poses, by their names; OpenCV's is by far the commonest."""
 
@@ -123,8 +125,10 @@ def check_against_photographs(
             "world in OpenGL axes; convert them, if other programs shall read them"
         )
         agreement = None if agreement is None else photographs.agreement(poses)
+    if agreement is not None:
+        warnings += doubts(photographs, poses, agreement)
     if points is not None:
-        told = photographs if agreement is not None and _fits(agreement) else None
+        told = photographs if agreement is not None and agreement.fits else None
         points, why = _believed(told, poses, _posed(photographs.cameras, poses), points)
         warnings += why
     return list(views), points, warnings
@@ -158,28 +162,12 @@ def _reading(
         told = bool(shares) and shares[""] < UNSEEN and shares[found] > SEEN
         return found if told else None
     better = {}
-    for name in (OPENCV,) if _fits(agreement) else READINGS:
+    for name in (OPENCV,) if agreement.fits else READINGS:
         other = photographs.agreement(READINGS[name](poses))
         refuted = bool(shares) and shares[name] < 0.5 * shares[""]
-        if not refuted and _is_better(other, agreement):
+        if not refuted and other.is_better(agreement):
             better[name] = float(other.gain.mean())
     return max(better, key=lambda name: better[name]) if better else None
-
-
-def _fits(agreement: Agreement) -> bool:
-    """Whether photographs fit poses."""
-    gain = agreement.gain
-    if len(gain) < 2:
-        return False
-    return bool(gain.mean() >= TELLING and np.mean(gain > NOTABLY) >= MOST)
-
-
-def _is_better(other: Agreement, given: Agreement) -> bool:
-    """Whether photographs fit another reading of their poses, and that beyond doubt better."""
-    found = other.found - given.found
-    gain = other.gain - given.gain
-    better = min(found.mean(), gain.mean()) >= CLEARLY
-    return _fits(other) and bool(better and np.mean(found > 0.0) >= ALMOST_ALL)
 
 
 def _believed(

@@ -9,7 +9,8 @@ distortion.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -58,6 +59,16 @@ MOST_POINTS = 60
 FEWEST_POINTS = 4
 """That tell something of a reference."""
 
+TELLING = 0.1
+"""Mean gain of photographs that fit their poses, at least; captures have 0.15 to 0.4."""
+MOST = 0.7
+"""Share of references that must be found better than by chance by NOTABLY."""
+NOTABLY = 0.05
+CLEARLY = 0.02
+"""By how much an agreement must be better than another, in mean gain and found."""
+ALMOST_ALL = 0.8
+"""Share of references for which it must be."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Agreement:
@@ -72,6 +83,23 @@ class Agreement:
     def gain(self) -> np.ndarray:
         """[n], by how much they are found better than by chance."""
         return self.found - self.by_chance
+
+    @property
+    def fits(self) -> bool:
+        """Whether photographs fit their poses."""
+        gain = self.gain
+        if len(gain) < 2:
+            return False
+        return bool(gain.mean() >= TELLING and np.mean(gain > NOTABLY) >= MOST)
+
+    def is_better(self, given: Agreement) -> bool:
+        """Whether photographs fit, and that beyond doubt better than as given."""
+        if not self.fits:
+            return False
+        found = self.found - given.found
+        gain = self.gain - given.gain
+        better = min(found.mean(), gain.mean()) >= CLEARLY
+        return bool(better and np.mean(found > 0.0) >= ALMOST_ALL)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -97,6 +125,7 @@ class PhotoConsistency:
         """
         self._views = list(views[:: max(1, -(-len(views) // VIEWS))])
         self._pictures: dict[int, _Picture] = {}
+        self._zoom = 1.0
         every = max(1, -(-len(self._views) // REFERENCES))
         self.references = range(0, len(self._views), every)
         """Indices of the chosen views whose patches are looked for."""
@@ -116,6 +145,18 @@ class PhotoConsistency:
         """Whether there are photographs enough, and large enough."""
         sides = [min(camera.width, camera.height) for camera in self.cameras]
         return len(sides) >= FEWEST and min(sides) >= LEAST_SIDE
+
+    def zoomed(self, factor: float) -> PhotoConsistency:
+        """The same photographs, had their lenses so many times the focal length."""
+        other = copy(self)
+        other._zoom *= factor
+        return other
+
+    def apart(self, poses: np.ndarray) -> float:
+        """How far off the neighbours of a reference are, by the median; see ``neighbours``."""
+        return float(
+            np.median([_apart(poses, i)[neighbours(poses, i)].mean() for i in self.references])
+        )
 
     def agreement(self, poses: np.ndarray) -> Agreement:
         """How well patches of all references are found again, had the cameras other poses.
@@ -245,7 +286,8 @@ class PhotoConsistency:
     def _picture(self, i: int) -> _Picture:
         if i not in self._pictures:
             self._pictures[i] = _reduced(self._views[i])
-        return self._pictures[i]
+        picture = self._pictures[i]
+        return picture if self._zoom == 1.0 else replace(picture, focal=self._zoom * picture.focal)
 
 
 def neighbours(poses: np.ndarray, i: int, least: float = APART) -> list[int]:
@@ -259,14 +301,21 @@ def neighbours(poses: np.ndarray, i: int, least: float = APART) -> list[int]:
     Returns:
         NEIGHBOURS indices.
     """
+    off = _apart(poses, i)
+    order = [int(k) for k in np.argsort(off, kind="stable") if k != i]
+    apart = [k for k in order if off[k] >= least]
+    return (apart if len(apart) >= NEIGHBOURS else order[::-1])[:NEIGHBOURS]
+
+
+def _apart(poses: np.ndarray, i: int) -> np.ndarray:
+    """How far off a camera each is, [n]: in spreads of all, plus its rotation in ANGLE."""
     turned = np.einsum("nij,ij->n", poses[:, :, :3], poses[i][:, :3])
     angle = np.arccos(np.clip(0.5 * (turned - 1.0), -1.0, 1.0))
     centres = poses[:, :, 3]
     spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean())
-    off = angle / ANGLE + np.linalg.norm(centres - centres[i], axis=1) / max(spread, 1e-12)
-    order = [int(k) for k in np.argsort(off, kind="stable") if k != i]
-    apart = [k for k in order if off[k] >= least]
-    return (apart if len(apart) >= NEIGHBOURS else order[::-1])[:NEIGHBOURS]
+    return np.asarray(
+        angle / ANGLE + np.linalg.norm(centres - centres[i], axis=1) / max(spread, 1e-12)
+    )
 
 
 def _inverse_depths(poses: np.ndarray, i: int, near: Sequence[int]) -> np.ndarray:

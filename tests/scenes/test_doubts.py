@@ -1,0 +1,75 @@
+"""Poses and lenses that photographs of a room refute."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.scenes.test_conventions import along_a_wall, held, outward, photographed
+from tests.support.tiny_scenes import DATA, needs_capture
+from warpnerf.scenes.formats.load import load_scene
+from warpnerf.scenes.scene import View
+
+REFUTED = "photographs do not fit their poses"
+
+
+@pytest.fixture(scope="module")
+def room() -> list[View]:
+    return photographed(outward(20))
+
+
+def with_focal(views: list[View], factor: float) -> list[View]:
+    cameras = [replace(v.camera, fx=factor * v.camera.fx, fy=factor * v.camera.fy) for v in views]
+    return [replace(view, camera=camera) for view, camera in zip(views, cameras, strict=True)]
+
+
+def shuffled(views: list[View]) -> list[View]:
+    """Each pose with the photograph of another."""
+    order = np.random.default_rng(0).permutation(len(views))
+    return [replace(view, image=views[k].image) for view, k in zip(views, order, strict=True)]
+
+
+@pytest.mark.parametrize("factor", [0.5, 0.7, 2.0, 4.0])
+def test_focal_lengths_of_another_size_are_named(factor: float, room: list[View]) -> None:
+    found, _, warning = held(with_focal(room, factor))
+    assert warning.startswith("focal lengths do not fit the photographs")
+    low, high = map(float, re.findall(r"about ([\d.]+) to ([\d.]+) times", warning)[0])
+    assert low <= 1.0 / factor <= high
+    assert all(a.camera.fx == factor * b.camera.fx for a, b in zip(found, room, strict=True))
+
+
+def test_focal_lengths_that_cameras_do_not_tell_are_believed() -> None:
+    """Along a wall nearly parallel cameras fit with any."""
+    wall = photographed(along_a_wall(24))
+    for factor in (0.35, 0.5, 2.0, 2.8):
+        assert "focal" not in held(with_focal(wall, factor))[2]
+
+
+def test_photographs_of_other_poses_are_named(room: list[View]) -> None:
+    assert held(shuffled(room))[2].startswith(REFUTED)
+    same = [replace(view, image=room[0].image) for view in room]
+    assert held(same)[2].startswith(REFUTED)
+
+
+def test_photographs_that_hardly_overlap_refute_nothing(room: list[View]) -> None:
+    """Nor do few, or such without texture."""
+    far = room[::3]
+    assert held(far)[2] == held(shuffled(far))[2] == ""
+    wall = photographed(along_a_wall(5))
+    assert held(shuffled(wall))[2] == ""
+    bare = [replace(view, image=np.full_like(view.image, 128)) for view in room]
+    assert held(bare)[2] == ""
+
+
+CAPTURES = ["fox_q", "stitch", "cup_colmap", "fern_llff", "lund_door"]
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=needs_capture(n)) for n in CAPTURES])
+@pytest.mark.parametrize("every", [1, 3, 6])
+def test_captures_fit_also_of_few_of_their_photographs(name: str, every: int) -> None:
+    scene = load_scene(DATA / name)
+    _, _, warning = held([scene.views[k] for k in scene.splits["train"][::every]])
+    assert "fit" not in warning

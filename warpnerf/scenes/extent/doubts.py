@@ -1,0 +1,67 @@
+"""Doubts about poses and lenses: what photographs refute, whatever is meant by the files."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from warpnerf.scenes.extent.photo_consistency import Agreement, PhotoConsistency
+
+REFUTED = 0.08
+"""Mean gain below which photographs do not fit their poses: captures of cameras that are CLOSE have
+0.11 and more, photographs in another order up to 0.06."""
+CLOSE = 2.0
+"""How far apart neighbours may be for that, as in ``photo_consistency.neighbours``."""
+ENOUGH = 6
+"""References, at least, that tell."""
+
+UNSURE = 0.2
+"""Mean gain from which on focal lengths are believed."""
+ZOOMS = 2.0 ** (np.array([-6, -5, -4, -3, -2, -1, 1, 2, 3, 4, 5, 6]) / 2.0)
+"""Focal lengths that are tried, in those of the files."""
+FINER = 2.0 ** np.array([-0.25, 0.25])
+"""Those about the best of them."""
+PEAK = 0.85
+"""Share of the best one's mean gain that half and twice of it have, at most. Where cameras hardly
+turn, any focal length fits: depths make up for it."""
+
+
+def doubts(photographs: PhotoConsistency, poses: np.ndarray, agreement: Agreement) -> list[str]:
+    """Warnings of focal lengths, or else poses, that photographs refute.
+
+    Args:
+        photographs: Some of the training.
+        poses: [n, 3, 4] of these, as they are used, camera to world in OpenGL axes.
+        agreement: With these.
+    """
+    gain = agreement.gain
+    if len(gain) < ENOUGH or gain.mean() >= UNSURE:
+        return []
+    zoom = _zoom(photographs, poses, agreement)
+    if zoom is not None:
+        return [
+            "focal lengths do not fit the photographs, which fit each other with about "
+            f"{zoom * FINER[0]:.2g} to {zoom * FINER[1]:.2g} times as much; correct them: they may "
+            "be those of photographs of another size, or in millimetres"
+        ]
+    if gain.mean() < REFUTED and photographs.apart(poses) <= CLOSE:
+        return [
+            "photographs do not fit their poses: what one shows is not found in its neighbours, at "
+            "any depth; poses, focal lengths or the order of the photographs are likely wrong"
+        ]
+    return []
+
+
+def _zoom(photographs: PhotoConsistency, poses: np.ndarray, agreement: Agreement) -> float | None:
+    """How many times the focal length photographs prove; None: they do not."""
+    zoom, best = 1.0, agreement
+    for steps in (ZOOMS, FINER):
+        middle = zoom
+        for step in steps:
+            other = photographs.zoomed(middle * step).agreement(poses)
+            if other.is_better(agreement) and other.gain.mean() > best.gain.mean():
+                zoom, best = float(middle * step), other
+    if zoom == 1.0:
+        return None
+    beside = [photographs.zoomed(zoom * factor).agreement(poses) for factor in (0.5, 2.0)]
+    sharp = max(other.gain.mean() for other in beside) <= PEAK * best.gain.mean()
+    return zoom if sharp else None
