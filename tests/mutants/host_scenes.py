@@ -16,6 +16,8 @@ OBJECT_BOX = "scenes/test_focus.py::test_box_of_an_object_is_what_the_larger_fie
 OUTWARD = "scenes/test_focus.py::test_cameras_that_look_outward_fall_back_to_their_spread"
 PARALLEL = "scenes/test_focus.py::test_nearly_parallel_axes_have_no_focus"
 MEETING = "scenes/test_focus.py::test_axes_that_point_anywhere_far_from_the_origin_have_no_focus"
+LOST = "scenes/test_focus.py::test_a_few_cameras_far_away_from_all_others_do_not_count"
+PLACES = "scenes/test_focus.py::test_cameras_far_away_count_where_they_are_many_or_the_others_are_in_one_place"
 UP = "scenes/test_focus.py::test_up_is_found_in_upright_photographs_that_all_look_down"
 AIMED = "scenes/test_focus.py::test_share_of_cameras_aimed_at_a_point"
 NDC = "scenes/test_frustum.py::test_coordinates_and_back"
@@ -98,6 +100,9 @@ MUTANTS = [
     of_host("focus: nearly parallel", FOCUS, "least < NEARLY_PARALLEL", "least < 0.0", PARALLEL),
     of_host("focus: spread", FOCUS, "centres - centres.mean(axis=0), mean", "centres, mean", MEETING),
     of_host("focus: behind cameras", FOCUS, "if np.mean(depths > 0.0) >= MIN_SHARE_IN_FRONT:", "if True:", OUTWARD),
+    of_host("focus: far cameras count", FOCUS, "FAR_OFF = 10.0", "FAR_OFF = 1e9", LOST),
+    of_host("focus: far cameras never count", FOCUS, "MAX_SHARE_FAR_OFF = 0.25", "MAX_SHARE_FAR_OFF = 0.9", PLACES),
+    of_host("focus: nearly all in one place", FOCUS, " and np.ptp(centres[near], axis=0).any()", "", PLACES),
     of_host("box: the smaller field of view", FOCUS, "max(camera.width / camera.fx, camera.height / camera.fy) / 2",
             "min(camera.width / camera.fx, camera.height / camera.fy) / 2", OBJECT_BOX),
     of_host("up: level", FOCUS, "directions[:, 0] * np.sign(directions[:, 0] @ mean)",

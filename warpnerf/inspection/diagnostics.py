@@ -12,15 +12,12 @@ from warpnerf.checks import InputError
 from warpnerf.evaluation.evaluate import require_measurable
 from warpnerf.runtime.memory import usable_cores
 from warpnerf.scenes.cameras.camera import Camera
-from warpnerf.scenes.cameras.focus import find_focus, share_aimed_at, up_direction
+from warpnerf.scenes.cameras.focus import far_off, find_focus, share_aimed_at, up_direction
 from warpnerf.scenes.formats.survey import Survey
 from warpnerf.scenes.scene import Scene, View
 
 MANY_TIMES = 20.0
 """A content distance so many times the estimate, or as small a part of it, is likely a mistake."""
-
-FAR_OFF = 10.0
-"""A camera this many times the median distance away from the median place is likely a mistake."""
 
 OFF_CENTRE = 0.3
 """Of the image's width or height, from the middle to the principal point: no lens is so far off."""
@@ -160,13 +157,10 @@ def _odd_places(scene: Scene) -> list[str]:
             f"upside down against the others: {len(rolled)} of {len(scene.views)} cameras (first: "
             f"{rolled[0]})"
         )
-    places = np.array([camera.position for camera in scene.cameras])
-    away = np.linalg.norm(places - np.median(places, axis=0), axis=1)
-    limit = FAR_OFF * float(np.median(away))
-    lost = [view.name for view, far in zip(scene.views, away, strict=True) if far > limit]
+    lost = [v.name for v, far in zip(scene.views, far_off(scene.cameras), strict=True) if far]
     if lost:
         odd.append(
-            f"far away from all others: {len(lost)} of {len(places)} cameras (first: {lost[0]}), "
+            f"far away from all others: {len(lost)} of {len(scene.views)} cameras (first: {lost[0]}), "
             "which may be wrongly posed"
         )
     return odd
