@@ -155,6 +155,8 @@ LARGE = {"w": 320, "h": 180, "fl_x": 333.0, "fl_y": 333.0}
         ({"cx": 2.67, "cy": 2.0}, "are pixels of a picture 0.334 times as wide"),
         ({"cx": 12.8, "cy": 9.6}, "are pixels of a picture 1.6 times as wide"),
         ({"cx": 7.2, "cy": 6.6}, None),
+        ({"fl_x": 10.0, "fl_y": 16.0}, "as if pixels were not square; width and height may be"),
+        ({"fl_x": 10.0, "fl_y": 11.8}, None),
         ({"fl_x": 0.9, "fl_y": 1.2}, "focal length below 0.15 of the image's width: 9 of 9"),
         ({}, None),
     ],

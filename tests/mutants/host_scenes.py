@@ -16,6 +16,11 @@ OBJECT_BOX = "scenes/test_focus.py::test_box_of_an_object_is_what_the_larger_fie
 OUTWARD = "scenes/test_focus.py::test_cameras_that_look_outward_fall_back_to_their_spread"
 PARALLEL = "scenes/test_focus.py::test_nearly_parallel_axes_have_no_focus"
 MEETING = "scenes/test_focus.py::test_axes_that_point_anywhere_far_from_the_origin_have_no_focus"
+CONTRADICTS = (
+    "scenes/test_lens.py::test_a_focal_length_and_an_angle_that_contradict_each_other_are_told"
+)
+KIND = "scenes/test_lens.py::test_of_two_kinds_of_lenses_the_model_is_used"
+SIZES = "scenes/test_transforms.py::test_one_lens_for_images_of_other_sizes_is_told"
 LOST = "scenes/test_focus.py::test_a_few_cameras_far_away_from_all_others_do_not_count"
 PLACES = "scenes/test_focus.py::test_cameras_far_away_count_where_they_are_many_or_the_others_are_in_one_place"
 UP = "scenes/test_focus.py::test_up_is_found_in_upright_photographs_that_all_look_down"
@@ -40,6 +45,7 @@ POINTS, FOCUS, OVERLAP, FISHEYE = (
     *(f"scenes/cameras/{name}.py" for name in ("focus", "overlap", "fisheye")),
 )
 
+LENS, FRAME = "scenes/cameras/lens.py", "scenes/formats/frame.py"
 SPACES = "model/spaces.py"
 SPACE, SPACE_PLAN, OBSERVATIONS = (
     f"scenes/{name}.py" for name in ("extent/space", "extent/space_plan", "cameras/observations")
@@ -109,6 +115,14 @@ MUTANTS = [
             "directions[:, 2] * np.sign(directions[:, 2] @ mean)", UP),
     of_host("up: the cameras' own", FOCUS, "return normal if level and normal @ mean > 0.5 else mean", "return mean", UP),
     of_host("aimed: the whole picture", FOCUS, "u < -0.25 * camera.width * z", "u < -0.5 * camera.width * z", AIMED),
+    of_host("lens: any angle is right", LENS, "MAX_DIFFERENCE = 0.01", "MAX_DIFFERENCE = 10.0", CONTRADICTS),
+    of_host("lens: an angle of another level", LENS, "angles |= {name", "angles |= {} and {name", CONTRADICTS),
+    of_host("lens: is_fisheye decides", LENS, "            fisheye = level.camera_model == FISHEYE\n",
+            "            fisheye = bool(level.is_fisheye)\n", KIND),
+    of_host("lens: an angle of all shapes", FRAME, "SAME_LENS = 0.01", "SAME_LENS = 10.0", SIZES),
+    of_host("lens: an angle of no other shape", FRAME, "shape or (fx and fy)", "shape", SIZES),
+    of_host("lens: oblong pixels", "inspection/diagnostics.py", "SQUARE = 1.2", "SQUARE = 2.0",
+            "inspection/test_inspection.py::test_lenses_in_other_units_are_said"),
     of_host("ndc: depth as it is", "scenes/extent/frustum.py", "self.depth * (1.0 - self.near / w)", "1.0 - self.near / w", NDC),
     of_host("depth: along the axis", "scenes/images/depths.py", "np.divide(along, cosine,", "np.divide(along, np.ones_like(cosine),",
             DEPTHS),

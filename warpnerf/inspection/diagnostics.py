@@ -31,6 +31,8 @@ LEAST = 0.05
 """Share of a picture's sides: a principal point that is nearer to the corner is in other units."""
 SHORT = 0.15
 """Focal length as a share of the image's width: 147 degrees, which no lens but a fisheye sees."""
+SQUARE = 1.2
+"""One focal length in the other: pixels are square, of hardly any camera they are not."""
 
 ESTIMATES_FIRST = (
     "training of 500 steps or more looks for better ones first, but with DVGO's presets"
@@ -160,8 +162,8 @@ def _odd_places(scene: Scene) -> list[str]:
     lost = [v.name for v, far in zip(scene.views, far_off(scene.cameras), strict=True) if far]
     if lost:
         odd.append(
-            f"far away from all others: {len(lost)} of {len(scene.views)} cameras (first: {lost[0]}), "
-            "which may be wrongly posed"
+            f"far away from all others: {len(lost)} of {len(scene.views)} cameras (first: "
+            f"{lost[0]}), which may be wrongly posed"
         )
     return odd
 
@@ -169,7 +171,7 @@ def _odd_places(scene: Scene) -> list[str]:
 def _odd_lenses(scene: Scene) -> list[str]:
     """Lenses as hardly any photograph has them: numbers in other units, perhaps."""
     odd = []
-    aside, turned, other_size, wide = [], [], [], []
+    aside, turned, other_size, wide, oblong = [], [], [], [], []
     for view in scene.views:
         camera = view.camera
         size = np.array([camera.width, camera.height])
@@ -184,6 +186,8 @@ def _odd_lenses(scene: Scene) -> list[str]:
             aside.append(view.name)
         if not camera.fisheye and min(camera.fx, camera.fy) < SHORT * camera.width:
             wide.append(view.name)
+        if max(camera.fx, camera.fy) > SQUARE * min(camera.fx, camera.fy):
+            oblong.append((view.name, camera))
     if turned:
         odd.append(
             f"the principal point is that of a picture turned by 90 degrees: {len(turned)} of "
@@ -207,6 +211,13 @@ def _odd_lenses(scene: Scene) -> list[str]:
         odd.append(
             f"focal length below {SHORT:g} of the image's width: {len(wide)} of {len(scene.views)} "
             f"cameras (first: {wide[0]}); it is given in pixels"
+        )
+    if oblong:
+        name, camera = oblong[0]
+        odd.append(
+            f"focal lengths along width and height differ much: {len(oblong)} of "
+            f"{len(scene.views)} cameras (first: {name}, {camera.fx:.4g} and {camera.fy:.4g} "
+            "pixels), as if pixels were not square; width and height may be exchanged"
         )
     return odd
 

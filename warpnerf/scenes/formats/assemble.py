@@ -19,7 +19,7 @@ from warpnerf.scenes.cameras.undistort import seen_pixels
 from warpnerf.scenes.extent.conventions import check_against_photographs
 from warpnerf.scenes.extent.points import Points, extent_by_points
 from warpnerf.scenes.files import by_number, exists
-from warpnerf.scenes.formats.frame import Frame, lens_notes, with_masks_beside
+from warpnerf.scenes.formats.frame import Frame, lens_notes, lens_warnings, with_masks_beside
 from warpnerf.scenes.formats.georeference import centred, in_words
 from warpnerf.scenes.formats.reduced import with_reduced
 from warpnerf.scenes.images.depths import Depth, read_depth
@@ -119,7 +119,8 @@ def assemble(
     complete, mask_warnings = _without_masked(file, frames, left, complete)
     notes += _mask_notes(left)
     notes += lens_notes([(entry.frame, entry.whole, entry.photograph.resampling) for entry in left])
-    warnings = [*warnings, *_transparency_warning(left)]
+    warnings = [*warnings, *lens_warnings([(entry.frame, entry.whole) for entry in left])]
+    warnings += _transparency_warning(left)
     kept = keep([entry.photograph for entry in left], keeping, file=file, downscale=downscale)
     views = [
         View(
@@ -333,13 +334,6 @@ def _diagnostics(
         warnings.append(
             f"used for training and for testing: {len(shared)} of {len(views)} images (first: "
             f"{min(shared)}), so test scores are too good"
-        )
-    sizes = {(view.camera.width, view.camera.height): view.name for view in reversed(views)}
-    if len(sizes) > 1:
-        shown = ", ".join(f"{name} {w}x{h}" for (w, h), name in sorted(sizes.items())[:2])
-        warnings.append(
-            f"images of {len(sizes)} sizes (first: {shown}): each frame needs a lens of its own "
-            "if the lens is given in pixels"
         )
     copies = _copies(views)
     if copies:
