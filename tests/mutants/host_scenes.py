@@ -21,6 +21,7 @@ CONTRADICTS = (
 )
 KIND = "scenes/test_lens.py::test_of_two_kinds_of_lenses_the_model_is_used"
 SIZES = "scenes/test_transforms.py::test_one_lens_for_images_of_other_sizes_is_told"
+LEFT = "scenes/test_masks.py::test_masks_that_leave_less_than_half_are_told_but_where_they_leave_the_focus"
 LOST = "scenes/test_focus.py::test_a_few_cameras_far_away_from_all_others_do_not_count"
 PLACES = "scenes/test_focus.py::test_cameras_far_away_count_where_they_are_many_or_the_others_are_in_one_place"
 UP = "scenes/test_focus.py::test_up_is_found_in_upright_photographs_that_all_look_down"
@@ -46,6 +47,7 @@ POINTS, FOCUS, OVERLAP, FISHEYE = (
 )
 
 LENS, FRAME = "scenes/cameras/lens.py", "scenes/formats/frame.py"
+MASKED = "scenes/extent/masked.py"
 SPACES = "model/spaces.py"
 SPACE, SPACE_PLAN, OBSERVATIONS = (
     f"scenes/{name}.py" for name in ("extent/space", "extent/space_plan", "cameras/observations")
@@ -128,6 +130,10 @@ MUTANTS = [
             DEPTHS),
     of_host("depth: no unit", "scenes/images/depths.py", ".astype(np.float64) * self.unit", ".astype(np.float64)", DEPTHS),
     of_host("depth: none is none", "scenes/images/depths.py", " & (along > 0.0)", "", UNKNOWN),
+    of_host("masks: half is little", MASKED, "HALF = 0.5", "HALF = 0.7", LEFT),
+    of_host("masks: a third is enough", MASKED, "share >= HALF or", "share >= 0.3 or", LEFT),
+    of_host("masks: any focus", MASKED, "not focus.guessed and ", "", LEFT),
+    of_host("masks: the focus upside down", MASKED, "camera.cx - camera.fx * x / z", "camera.cx + 2.0 + camera.fx * x / z", LEFT),
     of_host("masks: any of a block", "scenes/images/masks.py", "blocks.all(axis=(1, 3))", "blocks.any(axis=(1, 3))", BLOCKS),
     of_host("masks: transparent counts", "scenes/images/masks.py", "        white &= image[..., 3] > 127\n", "        pass\n",
             "scenes/test_masks.py::test_every_kind_of_image_is_a_mask"),
