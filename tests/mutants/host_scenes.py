@@ -22,6 +22,8 @@ CONTRADICTS = (
 KIND = "scenes/test_lens.py::test_of_two_kinds_of_lenses_the_model_is_used"
 SIZES = "scenes/test_transforms.py::test_one_lens_for_images_of_other_sizes_is_told"
 LEFT = "scenes/test_masks.py::test_masks_that_leave_less_than_half_are_told_but_where_they_leave_the_focus"
+BOUNDS = "scenes/test_given_depths.py::test_bounds_in_other_units_are_not_used"
+UNIT = "scenes/test_given_depths.py::test_depth_maps_in_other_units_are_told"
 LOST = "scenes/test_focus.py::test_a_few_cameras_far_away_from_all_others_do_not_count"
 PLACES = "scenes/test_focus.py::test_cameras_far_away_count_where_they_are_many_or_the_others_are_in_one_place"
 UP = "scenes/test_focus.py::test_up_is_found_in_upright_photographs_that_all_look_down"
@@ -47,6 +49,7 @@ POINTS, FOCUS, OVERLAP, FISHEYE = (
 )
 
 LENS, FRAME = "scenes/cameras/lens.py", "scenes/formats/frame.py"
+GIVEN = "scenes/extent/given_depths.py"
 MASKED = "scenes/extent/masked.py"
 SPACES = "model/spaces.py"
 SPACE, SPACE_PLAN, OBSERVATIONS = (
@@ -130,6 +133,18 @@ MUTANTS = [
             DEPTHS),
     of_host("depth: no unit", "scenes/images/depths.py", ".astype(np.float64) * self.unit", ".astype(np.float64)", DEPTHS),
     of_host("depth: none is none", "scenes/images/depths.py", " & (along > 0.0)", "", UNKNOWN),
+    of_host("bounds: any are right", GIVEN, "support >= SUPPORTED:\n        return bounds", "support >= 0.0:\n        return bounds", BOUNDS),
+    of_host("bounds: never right", GIVEN, "SUPPORTED = 0.7", "SUPPORTED = 1.5",
+            "scenes/test_given_depths.py::test_bounds_that_hold_what_photographs_show_are_used"),
+    of_host("bounds: photographs that fit nothing", GIVEN, "FITTING = 0.1", "FITTING = -1.0",
+            "scenes/test_given_depths.py::test_photographs_that_fit_nothing_refute_no_depths"),
+    of_host("depth maps: the other way", GIVEN, "1.0 / (unit * sampled", "unit / (1.0 * sampled", UNIT),
+    of_host("depth maps: no inverse ones", GIVEN, "REFUTED = 0.5", "REFUTED = 0.0",
+            "scenes/test_given_depths.py::test_inverse_depths_and_depths_of_others_are_told"),
+    of_host("depth maps: of a pinhole", GIVEN, "camera.distort((middles * size - centre) / focal)[0]", "((middles * size - centre) / focal)",
+            "scenes/test_given_depths.py::test_a_map_is_read_where_the_lens_shows_what_a_pinhole_does"),
+    of_host("sweep: the far end is tried alone", "scenes/extent/photo_consistency.py", "found[DEPTHS:].max(axis=0)", "found[DEPTHS]",
+            "scenes/test_given_depths.py::test_bounds_that_hold_what_photographs_show_are_used"),
     of_host("masks: half is little", MASKED, "HALF = 0.5", "HALF = 0.7", LEFT),
     of_host("masks: a third is enough", MASKED, "share >= HALF or", "share >= 0.3 or", LEFT),
     of_host("masks: any focus", MASKED, "not focus.guessed and ", "", LEFT),

@@ -17,6 +17,7 @@ from warpnerf.scenes.cameras.focus import estimate_extent
 from warpnerf.scenes.cameras.tracks import Tracks
 from warpnerf.scenes.cameras.undistort import seen_pixels
 from warpnerf.scenes.extent.conventions import check_against_photographs
+from warpnerf.scenes.extent.given_depths import believed_bounds, doubted_depths
 from warpnerf.scenes.extent.masked import inverted_masks, mask_notes
 from warpnerf.scenes.extent.points import Points, extent_by_points
 from warpnerf.scenes.files import by_number, exists
@@ -139,6 +140,9 @@ def assemble(
     masks_left, cameras = [entry.mask for entry in left], [view.camera for view in views]
     notes += mask_notes(masks_left, cameras)
     mask_warnings += inverted_masks(masks_left, cameras, indices["train"])
+    bounds, refuted = believed_bounds(views, indices["train"], _bounds(frames, views))
+    warnings += refuted
+    warnings += doubted_depths([views[i] for i in indices["train"] if left[i].depth is not None])
     training = [views[i] for i in indices["train"]]
     unbounded = not is_object
     transparent = {view.name for view, see in zip(views, kept.see_through, strict=True) if see}
@@ -166,7 +170,7 @@ def assemble(
         observations=None if observed is None else observed.observations,
         tracks=tracks,
         points=None if observed is None or points is None else points.sample,
-        bounds=_bounds(frames, views),
+        bounds=bounds,
         offset=offset,
         notes=(*notes, *kept.notes, *extent.notes),
         warnings=(

@@ -98,9 +98,7 @@ def load_metashape(file: Path, reading: Reading) -> Scene:
     chunk, notes = _chunk(file)
     aligned, more = _aligned(file, chunk)
     sensors = {sensor.get("id", ""): sensor for sensor in chunk.iterfind("sensors/sensor")}
-    poses, turned = _poses(file, chunk, aligned), []
-    if not chunk.findtext("reference", "").strip().startswith(LOCAL):
-        poses, turned = _on_the_ground(poses)
+    poses, turned = _on_the_ground(_poses(file, chunk, aligned), chunk.findtext("reference", ""))
 
     def entry(camera: ElementTree.Element, pose: np.ndarray) -> Entry:
         place = f"{file}: {_place(camera)}"
@@ -232,11 +230,11 @@ def _transform(file: Path, place: str, element: ElementTree.Element | None) -> T
     return Transform(rotation, parts.get("translation", np.zeros(3)), scale)
 
 
-def _on_the_ground(poses: np.ndarray) -> tuple[np.ndarray, list[str]]:
+def _on_the_ground(poses: np.ndarray, reference: str) -> tuple[np.ndarray, list[str]]:
     """Poses in geocentric coordinates, turned to east, north and up around their middle."""
     middle = np.median(poses[:, :, 3], axis=0)
     height = (float(np.linalg.norm(middle / AXES)) - 1.0) * AXES[0]  # but for a hundredth of it
-    if not GROUND[0] < height < GROUND[1]:
+    if not GROUND[0] < height < GROUND[1] or reference.strip().startswith(LOCAL):
         return poses, []
     up = middle / AXES**2
     up /= np.linalg.norm(up)
