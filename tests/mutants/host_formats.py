@@ -13,6 +13,7 @@ NEAREST = f"{FOREIGN}the_nearest_lens_is_off_by_what_it_says"
 METASHAPE_LENS = f"{METASHAPE_TESTS}metashape_tangential_is_the_other_way_round"
 TRANSFORMS = f"{METASHAPE_TESTS}metashape_transforms_lead_to_the_projects_coordinates"
 GEOCENTRIC = f"{METASHAPE_TESTS}metashape_coordinates_are_geocentric_near_the_ellipsoid"
+APPLIED = "scenes/test_points.py::test_points_are_turned_as_the_cameras_of_their_model_were"
 EARTH = f"{METASHAPE_TESTS}metashape_geocentric_coordinates_are_turned_up"
 REALITY_LENS = f"{PROGRAMS}reality_lens"
 USED = "scenes/test_reduced.py::test_reduced_photographs_are_used"
@@ -177,6 +178,20 @@ MUTANTS = [
         GEOCENTRIC,
     ),
     of_host("Metashape: local on the earth", METASHAPE, '"LOCAL_CS"', '"PROJCS"', GEOCENTRIC),
+    of_host(
+        "applied transform: not of points",
+        "scenes/formats/colmap.py",
+        'return replace(points, positions=positions), ""',
+        'return points, ""',
+        APPLIED,
+    ),
+    of_host(
+        "applied transform: turned only",
+        "scenes/formats/colmap.py",
+        "moved[:, :, -1] += applied[:, 3]",
+        "pass",
+        APPLIED,
+    ),
     of_host("Metashape: a round earth", METASHAPE, "middle / AXES**2", "middle", EARTH),
     of_host(
         "Brown: p1 and p2 as OpenCV",
