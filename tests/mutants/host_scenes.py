@@ -24,6 +24,8 @@ SIZES = "scenes/test_transforms.py::test_one_lens_for_images_of_other_sizes_is_t
 LEFT = "scenes/test_masks.py::test_masks_that_leave_less_than_half_are_told_but_where_they_leave_the_focus"
 BOUNDS = "scenes/test_given_depths.py::test_bounds_in_other_units_are_not_used"
 UNIT = "scenes/test_given_depths.py::test_depth_maps_in_other_units_are_told"
+FROZEN = "inspection/test_inspection.py::test_the_same_photograph_at_other_poses_is_said"
+NEARLY_BLACK = "inspection/test_inspection.py::test_photographs_that_are_nearly_black_are_said"
 LOST = "scenes/test_focus.py::test_a_few_cameras_far_away_from_all_others_do_not_count"
 PLACES = "scenes/test_focus.py::test_cameras_far_away_count_where_they_are_many_or_the_others_are_in_one_place"
 UP = "scenes/test_focus.py::test_up_is_found_in_upright_photographs_that_all_look_down"
@@ -49,6 +51,7 @@ POINTS, FOCUS, OVERLAP, FISHEYE = (
 )
 
 LENS, FRAME = "scenes/cameras/lens.py", "scenes/formats/frame.py"
+DIAGNOSTICS = "inspection/diagnostics.py"
 GIVEN = "scenes/extent/given_depths.py"
 MASKED = "scenes/extent/masked.py"
 SPACES = "model/spaces.py"
@@ -126,7 +129,7 @@ MUTANTS = [
             "            fisheye = bool(level.is_fisheye)\n", KIND),
     of_host("lens: an angle of all shapes", FRAME, "SAME_LENS = 0.01", "SAME_LENS = 10.0", SIZES),
     of_host("lens: an angle of no other shape", FRAME, "shape or (fx and fy)", "shape", SIZES),
-    of_host("lens: oblong pixels", "inspection/diagnostics.py", "SQUARE = 1.2", "SQUARE = 2.0",
+    of_host("lens: oblong pixels", DIAGNOSTICS, "SQUARE = 1.2", "SQUARE = 2.0",
             "inspection/test_inspection.py::test_lenses_in_other_units_are_said"),
     of_host("ndc: depth as it is", "scenes/extent/frustum.py", "self.depth * (1.0 - self.near / w)", "1.0 - self.near / w", NDC),
     of_host("depth: along the axis", "scenes/images/depths.py", "np.divide(along, cosine,", "np.divide(along, np.ones_like(cosine),",
@@ -145,6 +148,11 @@ MUTANTS = [
             "scenes/test_given_depths.py::test_a_map_is_read_where_the_lens_shows_what_a_pinhole_does"),
     of_host("sweep: the far end is tried alone", "scenes/extent/photo_consistency.py", "found[DEPTHS:].max(axis=0)", "found[DEPTHS]",
             "scenes/test_given_depths.py::test_bounds_that_hold_what_photographs_show_are_used"),
+    of_host("photographs: alike is the same", DIAGNOSTICS, "if moved and np.array_equal(other.image, view.image):", "if moved:", FROZEN),
+    of_host("photographs: at any poses", DIAGNOSTICS, "if moved and np.", "if np.", FROZEN),
+    of_host("photographs: one colour is the same", DIAGNOSTICS, " if not look.is_of_one_colour}\n", "}\n", FROZEN),
+    of_host("photographs: dark", DIAGNOSTICS, "DARK = 16", "DARK = 17", NEARLY_BLACK),
+    of_host("photographs: some are dark", DIAGNOSTICS, "> 0.5 * len(scene.views)", "> 0.3 * len(scene.views)", NEARLY_BLACK),
     of_host("masks: half is little", MASKED, "HALF = 0.5", "HALF = 0.7", LEFT),
     of_host("masks: a third is enough", MASKED, "share >= HALF or", "share >= 0.3 or", LEFT),
     of_host("masks: any focus", MASKED, "not focus.guessed and ", "", LEFT),
