@@ -182,7 +182,10 @@ def test_one_lens_for_images_of_other_sizes_is_told(tmp_path: Path) -> None:
 
 def test_a_lens_that_contradicts_itself_is_told_once(tmp_path: Path) -> None:
     (told,) = with_sizes(tmp_path, (8, 6), camera_angle_x=np.pi / 2, fl_x=8.0)
-    assert told.startswith("transforms.json: for 4 of 4 images (first: images/000.png) $.fl_x is 8")
+    assert told.startswith(
+        "transforms.json: the lens of 4 of 4 images (first: images/000.png) contradicts itself: "
+        "$.fl_x is 8 pixels"
+    )
 
 
 def test_downscale_averages_blocks_and_scales_the_lens(tmp_path: Path) -> None:

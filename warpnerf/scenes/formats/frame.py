@@ -95,8 +95,8 @@ def lens_warnings(used: Sequence[tuple[Frame, Camera]]) -> list[str]:
     if doubted:
         frame, text = doubted[0]
         warnings.append(
-            f"{frame.lens.file.name}: for {len(doubted)} of {len(used)} images (first: "
-            f"{frame.name}) {text}"
+            f"{frame.lens.file.name}: the lens of {len(doubted)} of {len(used)} images (first: "
+            f"{frame.name}) contradicts itself: {text}"
         )
     shared: dict[tuple[tuple[str, float], ...], dict[tuple[int, int], tuple[Frame, Camera]]] = {}
     for frame, camera in used:
