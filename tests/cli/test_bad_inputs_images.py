@@ -204,7 +204,8 @@ def test_read_as_what_it_shows(tmp_path: Path, edit: Callable[[Path], np.ndarray
         """An object, as most training images have it, makes the background white."""
         alpha = np.where(np.arange(WIDTH) < WIDTH // 2, 0, 255) + np.zeros_like(GRAY, np.int64)
         for number in (2, 3):
-            image = Image.fromarray(np.dstack([RGB, alpha.astype(np.uint8)]))
+            turned = np.roll(RGB, number, axis=0)
+            image = Image.fromarray(np.dstack([turned, alpha.astype(np.uint8)]))
             image.save(tmp_path / f"scene/images/{number:03}.png")
 
     scene = edited(tmp_path, lambda path: shown.append(edit(path)), white_behind)
