@@ -12,7 +12,14 @@ import pytest
 from PIL import Image
 
 import warpnerf as wn
-from tests.support.tiny_scenes import look_at, ring, save, write_blender, write_transforms
+from tests.support.tiny_scenes import (
+    look_at,
+    picture,
+    ring,
+    save,
+    write_blender,
+    write_transforms,
+)
 from warpnerf.checks import InputError
 from warpnerf.config import GridConfig, TrainConfig
 from warpnerf.inspection import inspection
@@ -75,6 +82,41 @@ def test_photographs_that_show_nothing_or_too_little_are_odd(tmp_path: Path) -> 
     write_transforms(tmp_path / "tiny", 9)
     found = odd(inspect(tmp_path / "tiny"))
     assert "images/000.png is 8 x 6 pixels, but SSIM needs 11 x 11" in found
+
+
+def test_the_same_photograph_at_other_poses_is_said(tmp_path: Path) -> None:
+    """As of a video that stood still; one that differs in a pixel is another."""
+    content = write_transforms(tmp_path, 9, scale=16)
+    content["frames"][5]["transform_matrix"] = content["frames"][3]["transform_matrix"]
+    save(tmp_path / "transforms.json", content)
+    pixels = np.array(Image.open(tmp_path / "images/003.png"))
+    for k in (4, 5):
+        Image.fromarray(pixels).save(tmp_path / f"images/{k:03d}.png")
+    pixels[5, 7, 0] ^= 1
+    Image.fromarray(pixels).save(tmp_path / "images/006.png")
+    for k in (7, 8):  # are said to be of one colour
+        Image.fromarray(np.zeros_like(pixels)).save(tmp_path / f"images/{k:03d}.png")
+    found = odd(inspect(tmp_path))
+    assert (
+        "the same photograph at different poses: 1 of 9 images (first: images/004.png is "
+        "images/003.png again)"
+    ) in found
+
+
+@pytest.mark.parametrize(
+    ("brightest", "n", "says"), [(16, 5, True), (16, 4, False), (17, 9, False)]
+)
+def test_photographs_that_are_nearly_black_are_said(
+    tmp_path: Path, brightest: int, n: int, says: bool
+) -> None:
+    """As 12 bits in files of 16 are."""
+    scene_with(tmp_path, ring(9))
+    for k in range(n):
+        dark = (picture(k, width=16, height=12) / 255.0 * brightest).round().astype(np.uint8)
+        dark[0, 0] = brightest
+        Image.fromarray(dark).save(tmp_path / f"images/{k:03d}.png")
+    found = odd(inspect(tmp_path))
+    assert (f"nearly black: {n} of 9 images (first: images/000.png)" in found) == says
 
 
 def test_alpha_in_only_some_images_is_said(tmp_path: Path) -> None:
@@ -155,6 +197,8 @@ LARGE = {"w": 320, "h": 180, "fl_x": 333.0, "fl_y": 333.0}
         ({"cx": 2.67, "cy": 2.0}, "are pixels of a picture 0.334 times as wide"),
         ({"cx": 12.8, "cy": 9.6}, "are pixels of a picture 1.6 times as wide"),
         ({"cx": 7.2, "cy": 6.6}, None),
+        ({"fl_x": 10.0, "fl_y": 16.0}, "as if pixels were not square; width and height may be"),
+        ({"fl_x": 10.0, "fl_y": 11.8}, None),
         ({"fl_x": 0.9, "fl_y": 1.2}, "focal length below 0.15 of the image's width: 9 of 9"),
         ({}, None),
     ],

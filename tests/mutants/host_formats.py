@@ -12,6 +12,8 @@ MASKS = f"{FOREIGN}masks_and_alpha_and_reduction_follow"
 NEAREST = f"{FOREIGN}the_nearest_lens_is_off_by_what_it_says"
 METASHAPE_LENS = f"{METASHAPE_TESTS}metashape_tangential_is_the_other_way_round"
 TRANSFORMS = f"{METASHAPE_TESTS}metashape_transforms_lead_to_the_projects_coordinates"
+GEOCENTRIC = f"{METASHAPE_TESTS}metashape_coordinates_are_geocentric_near_the_ellipsoid"
+APPLIED = "scenes/test_points.py::test_points_are_turned_as_the_cameras_of_their_model_were"
 EARTH = f"{METASHAPE_TESTS}metashape_geocentric_coordinates_are_turned_up"
 REALITY_LENS = f"{PROGRAMS}reality_lens"
 USED = "scenes/test_reduced.py::test_reduced_photographs_are_used"
@@ -160,6 +162,35 @@ MUTANTS = [
         "[to.rotation @ pose[:, :3], position",
         "[pose[:, :3], position",
         TRANSFORMS,
+    ),
+    of_host(
+        "Metashape: far below the ground",
+        METASHAPE,
+        "GROUND = (-2e3, 2e4)",
+        "GROUND = (-1e5, 2e4)",
+        GEOCENTRIC,
+    ),
+    of_host(
+        "Metashape: far above the ground",
+        METASHAPE,
+        "GROUND = (-2e3, 2e4)",
+        "GROUND = (-2e3, 1e5)",
+        GEOCENTRIC,
+    ),
+    of_host("Metashape: local on the earth", METASHAPE, '"LOCAL_CS"', '"PROJCS"', GEOCENTRIC),
+    of_host(
+        "applied transform: not of points",
+        "scenes/formats/colmap.py",
+        'return replace(points, positions=positions), ""',
+        'return points, ""',
+        APPLIED,
+    ),
+    of_host(
+        "applied transform: turned only",
+        "scenes/formats/colmap.py",
+        "moved[:, :, -1] += applied[:, 3]",
+        "pass",
+        APPLIED,
     ),
     of_host("Metashape: a round earth", METASHAPE, "middle / AXES**2", "middle", EARTH),
     of_host(

@@ -16,6 +16,18 @@ OBJECT_BOX = "scenes/test_focus.py::test_box_of_an_object_is_what_the_larger_fie
 OUTWARD = "scenes/test_focus.py::test_cameras_that_look_outward_fall_back_to_their_spread"
 PARALLEL = "scenes/test_focus.py::test_nearly_parallel_axes_have_no_focus"
 MEETING = "scenes/test_focus.py::test_axes_that_point_anywhere_far_from_the_origin_have_no_focus"
+CONTRADICTS = (
+    "scenes/test_lens.py::test_a_focal_length_and_an_angle_that_contradict_each_other_are_told"
+)
+KIND = "scenes/test_lens.py::test_of_two_kinds_of_lenses_the_model_is_used"
+SIZES = "scenes/test_transforms.py::test_one_lens_for_images_of_other_sizes_is_told"
+LEFT = "scenes/test_masks.py::test_masks_that_leave_less_than_half_are_told_but_where_they_leave_the_focus"
+BOUNDS = "scenes/test_given_depths.py::test_bounds_in_other_units_are_not_used"
+UNIT = "scenes/test_given_depths.py::test_depth_maps_in_other_units_are_told"
+FROZEN = "inspection/test_inspection.py::test_the_same_photograph_at_other_poses_is_said"
+NEARLY_BLACK = "inspection/test_inspection.py::test_photographs_that_are_nearly_black_are_said"
+LOST = "scenes/test_focus.py::test_a_few_cameras_far_away_from_all_others_do_not_count"
+PLACES = "scenes/test_focus.py::test_cameras_far_away_count_where_they_are_many_or_the_others_are_in_one_place"
 UP = "scenes/test_focus.py::test_up_is_found_in_upright_photographs_that_all_look_down"
 AIMED = "scenes/test_focus.py::test_share_of_cameras_aimed_at_a_point"
 NDC = "scenes/test_frustum.py::test_coordinates_and_back"
@@ -38,6 +50,10 @@ POINTS, FOCUS, OVERLAP, FISHEYE = (
     *(f"scenes/cameras/{name}.py" for name in ("focus", "overlap", "fisheye")),
 )
 
+LENS, FRAME = "scenes/cameras/lens.py", "scenes/formats/frame.py"
+DIAGNOSTICS = "inspection/diagnostics.py"
+GIVEN = "scenes/extent/given_depths.py"
+MASKED = "scenes/extent/masked.py"
 SPACES = "model/spaces.py"
 SPACE, SPACE_PLAN, OBSERVATIONS = (
     f"scenes/{name}.py" for name in ("extent/space", "extent/space_plan", "cameras/observations")
@@ -120,17 +136,49 @@ MUTANTS = [
     of_host("focus: nearly parallel", FOCUS, "least < NEARLY_PARALLEL", "least < 0.0", PARALLEL),
     of_host("focus: spread", FOCUS, "centres - centres.mean(axis=0), mean", "centres, mean", MEETING),
     of_host("focus: behind cameras", FOCUS, "if np.mean(depths > 0.0) >= MIN_SHARE_IN_FRONT:", "if True:", OUTWARD),
+    of_host("focus: far cameras count", FOCUS, "FAR_OFF = 10.0", "FAR_OFF = 1e9", LOST),
+    of_host("focus: far cameras never count", FOCUS, "MAX_SHARE_FAR_OFF = 0.25", "MAX_SHARE_FAR_OFF = 0.9", PLACES),
+    of_host("focus: nearly all in one place", FOCUS, " and np.ptp(centres[near], axis=0).any()", "", PLACES),
     of_host("box: the smaller field of view", FOCUS, "max(camera.width / camera.fx, camera.height / camera.fy) / 2",
             "min(camera.width / camera.fx, camera.height / camera.fy) / 2", OBJECT_BOX),
     of_host("up: level", FOCUS, "directions[:, 0] * np.sign(directions[:, 0] @ mean)",
             "directions[:, 2] * np.sign(directions[:, 2] @ mean)", UP),
     of_host("up: the cameras' own", FOCUS, "return normal if level and normal @ mean > 0.5 else mean", "return mean", UP),
     of_host("aimed: the whole picture", FOCUS, "u < -0.25 * camera.width * z", "u < -0.5 * camera.width * z", AIMED),
+    of_host("lens: any angle is right", LENS, "MAX_DIFFERENCE = 0.01", "MAX_DIFFERENCE = 10.0", CONTRADICTS),
+    of_host("lens: an angle of another level", LENS, "angles |= {name", "angles |= {} and {name", CONTRADICTS),
+    of_host("lens: is_fisheye decides", LENS, "            fisheye = level.camera_model == FISHEYE\n",
+            "            fisheye = bool(level.is_fisheye)\n", KIND),
+    of_host("lens: an angle of all shapes", FRAME, "SAME_LENS = 0.01", "SAME_LENS = 10.0", SIZES),
+    of_host("lens: an angle of no other shape", FRAME, "shape or (fx and fy)", "shape", SIZES),
+    of_host("lens: oblong pixels", DIAGNOSTICS, "SQUARE = 1.2", "SQUARE = 2.0",
+            "inspection/test_inspection.py::test_lenses_in_other_units_are_said"),
     of_host("ndc: depth as it is", "scenes/extent/frustum.py", "self.depth * (1.0 - self.near / w)", "1.0 - self.near / w", NDC),
     of_host("depth: along the axis", "scenes/images/depths.py", "np.divide(along, cosine,", "np.divide(along, np.ones_like(cosine),",
             DEPTHS),
     of_host("depth: no unit", "scenes/images/depths.py", ".astype(np.float64) * self.unit", ".astype(np.float64)", DEPTHS),
     of_host("depth: none is none", "scenes/images/depths.py", " & (along > 0.0)", "", UNKNOWN),
+    of_host("bounds: any are right", GIVEN, "support >= SUPPORTED:\n        return bounds", "support >= 0.0:\n        return bounds", BOUNDS),
+    of_host("bounds: never right", GIVEN, "SUPPORTED = 0.7", "SUPPORTED = 1.5",
+            "scenes/test_given_depths.py::test_bounds_that_hold_what_photographs_show_are_used"),
+    of_host("bounds: photographs that fit nothing", GIVEN, " and photographs.agreement(photographs.poses).fits", "",
+            "scenes/test_given_depths.py::test_photographs_that_fit_nothing_refute_no_depths"),
+    of_host("depth maps: the other way", GIVEN, "1.0 / (unit * sampled", "unit / (1.0 * sampled", UNIT),
+    of_host("depth maps: no inverse ones", GIVEN, "REFUTED = 0.5", "REFUTED = 0.0",
+            "scenes/test_given_depths.py::test_inverse_depths_and_depths_of_others_are_told"),
+    of_host("depth maps: of a pinhole", GIVEN, "camera.distort((middles * size - centre) / focal)[0]", "((middles * size - centre) / focal)",
+            "scenes/test_given_depths.py::test_a_map_is_read_where_the_lens_shows_what_a_pinhole_does"),
+    of_host("sweep: the far end is tried alone", "scenes/extent/photo_consistency.py", "found[DEPTHS:].max(axis=0)", "found[DEPTHS]",
+            "scenes/test_given_depths.py::test_bounds_that_hold_what_photographs_show_are_used"),
+    of_host("photographs: alike is the same", DIAGNOSTICS, "if moved and np.array_equal(other.image, view.image):", "if moved:", FROZEN),
+    of_host("photographs: at any poses", DIAGNOSTICS, "if moved and np.", "if np.", FROZEN),
+    of_host("photographs: one colour is the same", DIAGNOSTICS, " if not look.is_of_one_colour}\n", "}\n", FROZEN),
+    of_host("photographs: dark", DIAGNOSTICS, "DARK = 16", "DARK = 17", NEARLY_BLACK),
+    of_host("photographs: some are dark", DIAGNOSTICS, "> 0.5 * len(scene.views)", "> 0.3 * len(scene.views)", NEARLY_BLACK),
+    of_host("masks: half is little", MASKED, "HALF = 0.5", "HALF = 0.7", LEFT),
+    of_host("masks: a third is enough", MASKED, "share >= HALF or", "share >= 0.3 or", LEFT),
+    of_host("masks: any focus", MASKED, "not focus.guessed and ", "", LEFT),
+    of_host("masks: the focus upside down", MASKED, "camera.cx - camera.fx * x / z", "camera.cx + 2.0 + camera.fx * x / z", LEFT),
     of_host("masks: any of a block", "scenes/images/masks.py", "blocks.all(axis=(1, 3))", "blocks.any(axis=(1, 3))", BLOCKS),
     of_host("masks: transparent counts", "scenes/images/masks.py", "        white &= image[..., 3] > 127\n", "        pass\n",
             "scenes/test_masks.py::test_every_kind_of_image_is_a_mask"),

@@ -13,6 +13,7 @@ from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.cameras.focus import (
     UNBOUNDED_BOX_SHARE,
     estimate_extent,
+    far_off,
     find_focus,
     share_aimed_at,
     up_direction,
@@ -174,6 +175,27 @@ def test_axes_that_do_meet_are_believed_at_small_angles(away: float) -> None:
     focus = find_focus(cameras_at(poses))
     assert not focus.guessed
     assert focus.distance == pytest.approx(away, rel=0.1)
+
+
+@pytest.mark.parametrize("place", [(120.0, 0.0, 1.0), (-4e5, -5e6, 0.0)])
+def test_a_few_cameras_far_away_from_all_others_do_not_count(place: tuple[float, ...]) -> None:
+    """As one that was posed wrongly, or not at all among georeferenced ones."""
+    inward = cameras_at(ring(9))
+    lost = camera_at(look_at((3.0, 1.0, 2.0), (0.0, 0.0, 0.0)))
+    lost.c2w[:, 3] = place
+    assert far_off([lost, *inward]).tolist() == [True, *9 * [False]]
+    for cameras in (inward, cameras_at(outward(ring(9)))):
+        alone, found = find_focus(cameras), find_focus([lost, *cameras])
+        np.testing.assert_array_equal(found.point, alone.point)
+        assert (found.distance, found.how) == (alone.distance, alone.how)
+
+
+def test_cameras_far_away_count_where_they_are_many_or_the_others_are_in_one_place() -> None:
+    """Two places, and a tripod with some photographs from elsewhere."""
+    elsewhere = cameras_at(outward(ring(2, radius=90.0)))
+    several = cameras_at(outward(ring(5, radius=0.1, height=0.0)))
+    assert find_focus([*elsewhere, *several]).distance > 1.0
+    assert find_focus([*elsewhere, *8 * several[:1]]).distance > 1.0
 
 
 def test_notes_say_how() -> None:

@@ -48,6 +48,35 @@ def test_focal_length_wins_over_angle_and_frame_over_file() -> None:
     assert (result.fx, result.cx) == (pytest.approx(4.0), 5.0)
 
 
+def test_a_focal_length_and_an_angle_that_contradict_each_other_are_told() -> None:
+    def told(frame: LensFields, whole: LensFields) -> str:
+        lens = read_lens(FILE, [("$.frames[0]", frame), ("$", whole)])
+        return lens.contradiction(8, 6)
+
+    none = LensFields()
+    right = {"camera_angle_x": np.pi / 2, "camera_angle_y": 2.0 * np.arctan(0.75)}
+    assert told(none, LensFields(fl_x=4.03, fl_y=3.97, **right)) == ""
+    assert told(none, LensFields(fl_x=8.0, **right)) == (
+        "$.fl_x is 8 pixels, which is used, but by $.camera_angle_x, 90 degrees of 8 pixels, it "
+        "is 4; remove the wrong one"
+    )
+    assert "$.fl_y is 3 pixels" in told(none, LensFields(fl_x=4.0, fl_y=3.0, **right))
+    # What a frame says is what holds of it, whatever the file says of others.
+    assert told(LensFields(fl_x=8.0), LensFields(**right)) == ""
+    assert told(LensFields(camera_angle_x=1.0), LensFields(fl_x=4.0)) == ""
+    assert told(none, LensFields(fl_x=8.0, fl_y=8.0, is_fisheye=True, **right)) == ""
+
+
+@pytest.mark.parametrize(("model", "flag"), [("PINHOLE", True), ("OPENCV_FISHEYE", False)])
+def test_of_two_kinds_of_lenses_the_model_is_used(model: str, flag: bool) -> None:
+    lens = read_lens(FILE, [("$", LensFields(camera_model=model, is_fisheye=flag, fl_x=9.0))])
+    assert lens.fisheye == (not flag)
+    assert lens.contradiction(8, 6) == (
+        f"$.camera_model is {model}, which is used, but $.is_fisheye is {str(flag).lower()}; "
+        "correct the wrong one"
+    )
+
+
 @pytest.mark.parametrize(
     "model", ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"]
 )

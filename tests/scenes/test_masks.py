@@ -276,6 +276,28 @@ def test_masks_that_leave_nothing_or_little_are_told(tmp_path: Path) -> None:
     assert warning.startswith("masks leave 4.2% of the pixels: white ones count")
 
 
+def test_masks_that_leave_less_than_half_are_told_but_where_they_leave_the_focus(
+    tmp_path: Path,
+) -> None:
+    """Masks of an object leave little, and people who walk by are as large."""
+    content = write_transforms(tmp_path)
+    save(tmp_path / "transforms.json", {**content, "mask_path": "all.png"})
+
+    def told(kept: slice) -> list[str]:
+        save_mask(tmp_path / "all.png", np.broadcast_to(np.eye(8, dtype=bool)[kept].any(0), (6, 8)))
+        return [text for text in load_scene(tmp_path).warnings if "masks leave" in text]
+
+    assert told(slice(3, 6)) == []
+    assert told(slice(0, 4)) == []
+    said = "masks leave 37.5% of the pixels, and in few images a point that most cameras look at: "
+    assert [text.startswith(said) for text in told(slice(0, 3))] == [True]
+    for i, frame in enumerate(content["frames"]):  # behind each other, to look at no point
+        frame["transform_matrix"] = np.eye(4).tolist()
+        frame["transform_matrix"][2][3] = -1.0 * i
+    save(tmp_path / "transforms.json", {**content, "mask_path": "all.png"})
+    assert [text.startswith(said) for text in told(slice(3, 6))] == [True]
+
+
 def test_views_refuse_masks_that_are_not_theirs() -> None:
     view = tiny_scene(ring(3)).views[0]
     for mask, says in (

@@ -99,6 +99,28 @@ def test_metashape_geocentric_coordinates_are_turned_up(tmp_path: Path) -> None:
     assert any("turned to east, north and up" in note for note in scene.notes)
 
 
+@pytest.mark.parametrize(
+    ("middle", "reference", "turned"),
+    [
+        ((560000.0, 6300000.0, 20.0), "", False),  # UTM in Denmark
+        ((560000.0, 6355000.0, 20.0), 'LOCAL_CS["Local Coordinates (m)"]', False),
+        ((0.0, 6380000.0, 0.0), 'GEOGCS["WGS 84"]', True),
+        ((0.0, 6395000.0, 0.0), "", True),
+        ((0.0, 0.0, 6356000.0), "", True),
+        ((0.0, 0.0, 6380000.0), "", False),
+        ((0.0, 0.0, 0.0), "", False),
+    ],
+)
+def test_metashape_coordinates_are_geocentric_near_the_ellipsoid(
+    tmp_path: Path, middle: tuple[float, ...], reference: str, turned: bool
+) -> None:
+    """Northings of UTM are as far from the origin as the ground from the centre of the earth."""
+    rest = f"<transform><translation>{' '.join(map(str, middle))}</translation></transform>"
+    write_metashape(tmp_path, rest=f"{rest}<reference>{reference}</reference>")
+    notes = load_scene(tmp_path).notes
+    assert any("turned to east, north and up" in note for note in notes) == turned
+
+
 def test_metashape_components_without_transforms_are_not_mixed(tmp_path: Path) -> None:
     file = write_metashape(tmp_path, component='component_id="0"')
     text = file.read_text()

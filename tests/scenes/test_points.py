@@ -6,6 +6,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -246,6 +247,31 @@ def test_points_beside_a_transforms_json_need_its_cameras(tmp_path: Path, what: 
         assert "the points of sparse/0 are not used: " in scene.warnings[0]
     else:
         assert scene.warnings == ("the points of sparse/0 are not used: its cameras are others",)
+
+
+TURN = np.array([[0.0, 0.0, 1.0, 0.5], [1.0, 0.0, 0.0, -2.0], [0.0, 1.0, 0.0, 0.0]])
+
+
+@pytest.mark.parametrize("applied", [TURN, None, TURN * 2.0, "TURN", [[1.0], "a"]])
+def test_points_are_turned_as_the_cameras_of_their_model_were(tmp_path: Path, applied: Any) -> None:
+    """As of ns-process-data: a turn, written as applied_transform, but not of the model."""
+    write_transforms(tmp_path)
+    write_points(write_model(tmp_path, text=True), ball())
+    straight = load_scene(tmp_path)
+    content = transforms_content(4)
+    for frame in content["frames"]:
+        pose = TURN[:, :3] @ np.array(frame["transform_matrix"])[:3]
+        pose[:, 3] += TURN[:, 3]
+        frame["transform_matrix"] = pose.tolist()
+    content["applied_transform"] = applied.tolist() if hasattr(applied, "tolist") else applied
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    scene = load_scene(tmp_path)
+    assert by_points(scene) == (applied is TURN)
+    if applied is TURN:
+        assert not scene.warnings
+        assert scene.content_distance == pytest.approx(straight.content_distance)
+        low, high = (TURN[:, :3] @ c + TURN[:, 3] for c in (straight.box_min, straight.box_max))
+        np.testing.assert_allclose([scene.box_min, scene.box_max], [low, high], atol=1e-6)
 
 
 def test_a_missing_ply_is_a_warning_and_a_wrong_one_an_error(tmp_path: Path) -> None:

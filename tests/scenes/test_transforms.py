@@ -154,6 +154,40 @@ def test_lens_of_a_frame_goes_before_that_of_the_file(tmp_path: Path) -> None:
     assert [view.camera.k1 for view in scene.views] == [0.0, 0.01, 0.0, 0.0]
 
 
+def with_sizes(folder: Path, other: tuple[int, int], **lens: float) -> list[str]:
+    """Warnings of lenses, where one of four images of 8x6 pixels has another size."""
+    content = write_transforms(folder)
+    for key in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
+        del content[key]
+    save(folder / "transforms.json", content | lens)
+    width, height = other
+    Image.fromarray(picture(1, width=width, height=height)).save(folder / "images/001.png")
+    warnings = load_scene(folder).warnings
+    return [warning for warning in warnings if "sizes" in warning or "is used" in warning]
+
+
+def test_one_lens_for_images_of_other_sizes_is_told(tmp_path: Path) -> None:
+    """An angle holds for reduced images, and across its own direction for cropped ones."""
+    first = "images of 2 sizes (first: images/001.png 6x8, images/000.png 8x6) have one "
+    assert with_sizes(tmp_path / "pixels", (6, 8), fl_x=10.0) == [
+        f"{first}lens in pixels: give each frame a lens of its own"
+    ]
+    assert with_sizes(tmp_path / "angle", (6, 8), camera_angle_x=np.pi / 2) == [
+        f"{first}field of view, and so focal lengths of 3 and 4 pixels: if one camera took them, "
+        "turned or cropped, give each frame its fl_x"
+    ]
+    assert with_sizes(tmp_path / "reduced", (4, 3), camera_angle_x=np.pi / 2) == []
+    assert with_sizes(tmp_path / "cropped", (8, 4), camera_angle_x=np.pi / 2) == []
+
+
+def test_a_lens_that_contradicts_itself_is_told_once(tmp_path: Path) -> None:
+    (told,) = with_sizes(tmp_path, (8, 6), camera_angle_x=np.pi / 2, fl_x=8.0)
+    assert told.startswith(
+        "transforms.json: the lens of 4 of 4 images (first: images/000.png) contradicts itself: "
+        "$.fl_x is 8 pixels"
+    )
+
+
 def test_downscale_averages_blocks_and_scales_the_lens(tmp_path: Path) -> None:
     write_transforms(tmp_path)
     view = load_scene(tmp_path, downscale=4).views[0]

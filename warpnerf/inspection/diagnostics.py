@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,15 +12,15 @@ from warpnerf.checks import InputError
 from warpnerf.evaluation.evaluate import require_measurable
 from warpnerf.runtime.memory import usable_cores
 from warpnerf.scenes.cameras.camera import Camera
-from warpnerf.scenes.cameras.focus import find_focus, share_aimed_at, up_direction
+from warpnerf.scenes.cameras.focus import far_off, find_focus, share_aimed_at, up_direction
 from warpnerf.scenes.formats.survey import Survey
 from warpnerf.scenes.scene import Scene, View
 
 MANY_TIMES = 20.0
 """A content distance so many times the estimate, or as small a part of it, is likely a mistake."""
 
-FAR_OFF = 10.0
-"""A camera this many times the median distance away from the median place is likely a mistake."""
+DARK = 16
+"""Of 255, which a photograph's brightest pixel does not exceed that fills 12 of 16 bits."""
 
 OFF_CENTRE = 0.3
 """Of the image's width or height, from the middle to the principal point: no lens is so far off."""
@@ -34,6 +34,8 @@ LEAST = 0.05
 """Share of a picture's sides: a principal point that is nearer to the corner is in other units."""
 SHORT = 0.15
 """Focal length as a share of the image's width: 147 degrees, which no lens but a fisheye sees."""
+SQUARE = 1.2
+"""One focal length in the other: pixels are square, of hardly any camera they are not."""
 
 ESTIMATES_FIRST = (
     "training of 500 steps or more looks for better ones first, but with DVGO's presets"
@@ -91,15 +93,30 @@ def diagnostics(
 
 
 def _odd_images(scene: Scene, threads: int | None) -> list[str]:
-    """Photographs that show nothing, or too little to be measured; each is looked at once."""
+    """Photographs that show nothing, the same, or too little; each is looked at once."""
     odd = []
     with ThreadPoolExecutor(threads or usable_cores()) as pool:
-        shows_nothing = pool.map(_is_of_one_colour, scene.views)
-        empty = [v.name for v, so in zip(scene.views, shows_nothing, strict=True) if so]
+        looks = dict(zip(scene.views, pool.map(_look, scene.views), strict=True))
+    empty = [view.name for view, look in looks.items() if look.is_of_one_colour]
     if empty:
         odd.append(
             f"of one colour throughout: {len(empty)} of {len(scene.views)} images (first: "
             f"{empty[0]}), which show nothing that could be trained on"
+        )
+    shown = {view: look for view, look in looks.items() if not look.is_of_one_colour}
+    dark = [view.name for view, look in shown.items() if look.brightest <= DARK]
+    if len(dark) > 0.5 * len(scene.views):
+        odd.append(
+            f"nearly black: {len(dark)} of {len(scene.views)} images (first: {dark[0]}), whose "
+            f"brightest pixel is at most {DARK} of 255; numbers of 12 bits in files of 16 bits are "
+            "to be multiplied by 16"
+        )
+    frozen = _frozen({view: look.sample for view, look in shown.items()})
+    if frozen:
+        odd.append(
+            f"the same photograph at different poses: {len(frozen)} of {len(scene.views)} images "
+            f"(first: {frozen[0][1]} is {frozen[0][0]} again), of which one at most can be right; "
+            "leave out the others"
         )
     if scene.splits.get("test"):
         try:
@@ -109,10 +126,37 @@ def _odd_images(scene: Scene, threads: int | None) -> list[str]:
     return odd
 
 
-def _is_of_one_colour(view: View) -> bool:
+@dataclass(frozen=True, kw_only=True)
+class _Look:
+    """What a photograph is like."""
+
+    is_of_one_colour: bool
+    brightest: int
+    """The largest value of a channel of colour."""
+    sample: bytes
+    """Some of its pixels."""
+
+
+def _look(view: View) -> _Look:
     image = view.image
     sample = image[:: max(1, len(image) // 32), :: max(1, image.shape[1] // 32)]
-    return bool((sample == image[0, 0]).all() and (image == image[0, 0]).all())
+    return _Look(
+        is_of_one_colour=bool((sample == image[0, 0]).all() and (image == image[0, 0]).all()),
+        brightest=int(image[..., :3].max()),
+        sample=sample.tobytes(),
+    )
+
+
+def _frozen(samples: Mapping[View, bytes]) -> list[tuple[str, str]]:
+    """Names of photographs of the same pixels at different poses, each with the first of these."""
+    pairs = []
+    first: dict[bytes, View] = {}
+    for view, sample in samples.items():
+        other = first.setdefault(sample, view)
+        moved = not np.array_equal(other.camera.c2w, view.camera.c2w)
+        if moved and np.array_equal(other.image, view.image):
+            pairs.append((other.name, view.name))
+    return pairs
 
 
 def common_focus(cameras: Sequence[Camera]) -> np.ndarray | None:
@@ -160,14 +204,11 @@ def _odd_places(scene: Scene) -> list[str]:
             f"upside down against the others: {len(rolled)} of {len(scene.views)} cameras (first: "
             f"{rolled[0]})"
         )
-    places = np.array([camera.position for camera in scene.cameras])
-    away = np.linalg.norm(places - np.median(places, axis=0), axis=1)
-    limit = FAR_OFF * float(np.median(away))
-    lost = [view.name for view, far in zip(scene.views, away, strict=True) if far > limit]
+    lost = [v.name for v, far in zip(scene.views, far_off(scene.cameras), strict=True) if far]
     if lost:
         odd.append(
-            f"far away from all others: {len(lost)} of {len(places)} cameras (first: {lost[0]}), "
-            "which may be wrongly posed"
+            f"far away from all others: {len(lost)} of {len(scene.views)} cameras (first: "
+            f"{lost[0]}), which may be wrongly posed"
         )
     return odd
 
@@ -175,7 +216,7 @@ def _odd_places(scene: Scene) -> list[str]:
 def _odd_lenses(scene: Scene) -> list[str]:
     """Lenses as hardly any photograph has them: numbers in other units, perhaps."""
     odd = []
-    aside, turned, other_size, wide = [], [], [], []
+    aside, turned, other_size, wide, oblong = [], [], [], [], []
     for view in scene.views:
         camera = view.camera
         size = np.array([camera.width, camera.height])
@@ -190,6 +231,8 @@ def _odd_lenses(scene: Scene) -> list[str]:
             aside.append(view.name)
         if not camera.fisheye and min(camera.fx, camera.fy) < SHORT * camera.width:
             wide.append(view.name)
+        if max(camera.fx, camera.fy) > SQUARE * min(camera.fx, camera.fy):
+            oblong.append((view.name, camera))
     if turned:
         odd.append(
             f"the principal point is that of a picture turned by 90 degrees: {len(turned)} of "
@@ -213,6 +256,13 @@ def _odd_lenses(scene: Scene) -> list[str]:
         odd.append(
             f"focal length below {SHORT:g} of the image's width: {len(wide)} of {len(scene.views)} "
             f"cameras (first: {wide[0]}); it is given in pixels"
+        )
+    if oblong:
+        name, camera = oblong[0]
+        odd.append(
+            f"focal lengths along width and height differ much: {len(oblong)} of "
+            f"{len(scene.views)} cameras (first: {name}, {camera.fx:.4g} and {camera.fy:.4g} "
+            "pixels), as if pixels were not square; width and height may be exchanged"
         )
     return odd
 

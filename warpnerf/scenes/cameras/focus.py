@@ -39,6 +39,13 @@ one."""
 MAX_HALF_ANGLE = math.radians(60.0)
 """Of a fisheye lens, for the box of what its images show: their rims are mostly background."""
 
+FAR_OFF = 10.0
+"""A camera this many times the median distance away from the median place is far from all others,
+and likely a mistake."""
+
+MAX_SHARE_FAR_OFF = 0.25
+"""Of the cameras: more that are far off are another place that was photographed, and count."""
+
 MAX_OFFSET = 1e4
 """Largest distance from the origin, in spreads of the cameras, that single precision resolves."""
 
@@ -73,6 +80,17 @@ class Extent:
     """As of ``Focus``."""
 
 
+def far_off(cameras: Sequence[Camera]) -> np.ndarray:
+    """Outliers of camera centres, [n] bool: those that are far away from all others.
+
+    Args:
+        cameras: At least one.
+    """
+    places = np.array([camera.position for camera in cameras])
+    away = np.linalg.norm(places - np.median(places, axis=0), axis=1)
+    return np.asarray(away > FAR_OFF * float(np.median(away)))
+
+
 def find_focus(cameras: Sequence[Camera]) -> Focus:
     """Find the point closest to all optical axes, and its median depth.
 
@@ -83,6 +101,8 @@ def find_focus(cameras: Sequence[Camera]) -> Focus:
     many cameras because they look outward, distance = mean_i |o_i - mean o| and
     point = mean o + distance * mean d, and ``how`` says so.
     Where they look in and out, few have the point in the middle of their image: see ``guessed``.
+
+    A few cameras that are far away from all others are left out: see ``far_off``.
 
     Args:
         cameras: The training cameras, at least two, not all in one place.
@@ -96,6 +116,10 @@ def find_focus(cameras: Sequence[Camera]) -> Focus:
             "those for testing; add photographs taken from other places."
         )
     centres = np.array([camera.position for camera in cameras])
+    near = ~far_off(cameras)
+    if near.mean() >= 1.0 - MAX_SHARE_FAR_OFF and np.ptp(centres[near], axis=0).any():
+        cameras = [camera for camera, kept in zip(cameras, near, strict=True) if kept]
+        centres = centres[near]
     axes = np.array([camera.forward for camera in cameras])
     middle = centres.mean(axis=0)
     spread = float(np.linalg.norm(centres - middle, axis=1).mean())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import msgspec
@@ -38,6 +38,8 @@ MIN_FOCAL = 0.02
 """Shortest focal length, in sizes of the image: a field of view of 178 degrees."""
 MAX_FOCAL = 1e6
 """Longest focal length, in sizes of the image."""
+MAX_DIFFERENCE = 0.01
+"""Of a focal length and a field of view that mean the same, as a share."""
 MIN_ANGLE = 1e-100
 """Smallest field of view whose focal length is a number at all, radians."""
 MAX_OFF_CENTRE = 50.0
@@ -92,6 +94,11 @@ class Lens:
     """Whether it is OpenCV's fisheye lens."""
     foreign: ForeignLens | None = None
     """Where it is none of OpenCV's lenses: its distortion, which ``values`` then do not hold."""
+    angles: Mapping[str, float] = field(default_factory=dict)
+    """Fields of view that stand beside focal lengths, which are used in their place: radians, by
+    their places in the file."""
+    doubt: str = ""
+    """What the file contradicts itself in, and which of it is used."""
 
     def camera(self, *, width: int, height: int, c2w: np.ndarray, image: str) -> Camera:
         """Complete the lens for an image of ``width`` by ``height`` pixels.
@@ -173,6 +180,19 @@ class Lens:
             )
         return plane, replace(found[0], c2w=camera.c2w), found[1]
 
+    def contradiction(self, width: int, height: int) -> str:
+        """In what the file contradicts itself, for an image of a size, and what is used; or ""."""
+        for place, angle in self.angles.items():
+            axis, size = ("x", width) if place.endswith("x") else ("y", height)
+            used, other = self.values[f"fl_{axis}"], _focal_length(angle, size)
+            if abs(other - used) > MAX_DIFFERENCE * used:
+                return (
+                    f"{self.fields[f'fl_{axis}']} is {used:.4g} pixels, which is used, but by "
+                    f"{place}, {math.degrees(angle):.4g} degrees of {size} pixels, it is "
+                    f"{other:.4g}; remove the wrong one"
+                )
+        return self.doubt
+
     def _focal_lengths(self, width: int, height: int) -> tuple[float, float]:
         """Focal lengths along u and v, pixels; one stands in for the other where it is missing."""
         lengths = {}
@@ -180,7 +200,7 @@ class Lens:
             if f"fl_{axis}" in self.values:
                 lengths[axis] = self.values[f"fl_{axis}"]
             elif f"camera_angle_{axis}" in self.values:
-                lengths[axis] = 0.5 * size / math.tan(0.5 * self.values[f"camera_angle_{axis}"])
+                lengths[axis] = _focal_length(self.values[f"camera_angle_{axis}"], size)
         (any_length, *_) = lengths.values()
         return lengths.get("x", any_length), lengths.get("y", any_length)
 
@@ -205,6 +225,11 @@ class Lens:
             )
 
 
+def _focal_length(angle: float, size: int) -> float:
+    """Of a field of view, radians, across so many pixels."""
+    return 0.5 * size / math.tan(0.5 * angle)
+
+
 def read_lens(file: Path, levels: Sequence[tuple[str, LensFields]]) -> Lens:
     """Gather a lens from the levels of a scene file.
 
@@ -217,15 +242,17 @@ def read_lens(file: Path, levels: Sequence[tuple[str, LensFields]]) -> Lens:
     """
     values: dict[str, float] = {}
     fields: dict[str, str] = {}
+    angles: dict[str, float] = {}
     for place, level in levels:
         _refuse_unsupported(file, place, level)
-    kinds = [_is_fisheye(level) for _, level in levels]
-    fisheye = next((kind for kind in kinds if kind is not None), False)
+    fisheye, doubt = _is_fisheye(levels)
     for group in KEY_GROUPS:
         for place, level in levels:
             key = next((key for key in group if getattr(level, key) is not None), None)
             if key is not None:
                 values[key], fields[key] = getattr(level, key), f"{place}.{key}"
+                others = {f"{place}.{name}": getattr(level, name) for name in group if name != key}
+                angles |= {name: value for name, value in others.items() if value is not None}
                 break
     for key, value in values.items():
         _check_value(file, fields[key], key, value)
@@ -238,14 +265,30 @@ def read_lens(file: Path, levels: Sequence[tuple[str, LensFields]]) -> Lens:
         _check_fisheye(file, values, fields)
     elif next((level.camera_model for _, level in levels if level.camera_model), "") != RATIONAL:
         _refuse_divisor(file, values, fields)
-    return Lens(file=file, values=values, fields=fields, fisheye=fisheye)
+    return Lens(
+        file=file,
+        values=values,
+        fields=fields,
+        fisheye=fisheye,
+        angles={} if fisheye else {k: v for k, v in angles.items() if MIN_ANGLE < v < math.pi},
+        doubt=doubt,
+    )
 
 
-def _is_fisheye(level: LensFields) -> bool | None:
-    """What one level says of the kind of lens; None: nothing."""
-    if level.camera_model is None:
-        return level.is_fisheye
-    return level.camera_model == FISHEYE or bool(level.is_fisheye)
+def _is_fisheye(levels: Sequence[tuple[str, LensFields]]) -> tuple[bool, str]:
+    """Whether it is a fisheye lens, by the first level that says it; and what contradicts that."""
+    for place, level in levels:
+        if level.camera_model is not None:
+            fisheye = level.camera_model == FISHEYE
+            if level.is_fisheye in (None, fisheye):
+                return fisheye, ""
+            return fisheye, (
+                f"{place}.camera_model is {level.camera_model}, which is used, but {place}."
+                f"is_fisheye is {str(level.is_fisheye).lower()}; correct the wrong one"
+            )
+        if level.is_fisheye is not None:
+            return level.is_fisheye, ""
+    return False, ""
 
 
 def _refuse_divisor(file: Path, values: Mapping[str, float], fields: Mapping[str, str]) -> None:

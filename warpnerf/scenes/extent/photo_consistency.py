@@ -8,7 +8,7 @@ distortion.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 
@@ -114,6 +114,11 @@ class _Picture:
     """[2] principal point, pixels."""
 
 
+Given = Callable[[View, np.ndarray, float], np.ndarray]
+"""From a view, the middles of its patches [m, 2] in [0, 1] of width and height, and the largest
+1 / distance of the sweep to those that are tried: [k, m] 1 / distance, NaN where not known."""
+
+
 class PhotoConsistency:
     """Photographs of a scene, checked against poses and against points."""
 
@@ -180,6 +185,36 @@ class PhotoConsistency:
             for match, means in zip(matches, (found, by_chance), strict=True):
                 means.append(float(np.maximum(match.max(axis=0), 0.0).mean()))
         return Agreement(found=np.array(found), by_chance=np.array(by_chance))
+
+    def support_of(self, poses: np.ndarray, given: Given) -> float | None:
+        """How well patches are found again at given depths, against the best depths of the sweep.
+
+        Args:
+            poses: [n, 3, 4] of the chosen views.
+            given: Tells the depths.
+
+        Returns:
+            As ``support``.
+        """
+        own, best = [], []
+        for i in self.references:
+            height, width = self._picture(i).gray.shape
+            middles = self._textured(i, _grid((height, width)))
+            near = neighbours(poses, i, FAR_APART)
+            inverse = _inverse_depths(poses, i, near)
+            tried = given(self._views[i], middles / [width, height], float(inverse[-1]))
+            known = np.isfinite(tried).all(axis=0)
+            if known.sum() < FEWEST_POINTS:
+                continue
+            sweep = np.tile(inverse[:, None], int(known.sum()))
+            both = np.concatenate([sweep, tried[:, known]])
+            (match,) = self._correlations(poses, i, near, [near], middles[known], both)
+            found = np.maximum(match, 0.0)
+            own.append(float(found[DEPTHS:].max(axis=0).mean()))
+            best.append(float(found[:DEPTHS].max(axis=0).mean()))
+        if len(own) < max(2, len(self.references) // 3) or np.mean(best) <= 0.0:
+            return None
+        return float(np.mean(own) / np.mean(best))
 
     def support(self, poses: np.ndarray, points: np.ndarray, every: int = 1) -> float | None:
         """How well patches around points are found again at these, against their best depths.

@@ -17,9 +17,11 @@ from warpnerf.scenes.cameras.focus import estimate_extent
 from warpnerf.scenes.cameras.tracks import Tracks
 from warpnerf.scenes.cameras.undistort import seen_pixels
 from warpnerf.scenes.extent.conventions import check_against_photographs
+from warpnerf.scenes.extent.given_depths import believed_bounds, doubted_depths
+from warpnerf.scenes.extent.masked import inverted_masks, mask_notes
 from warpnerf.scenes.extent.points import Points, extent_by_points
 from warpnerf.scenes.files import by_number, exists
-from warpnerf.scenes.formats.frame import Frame, lens_notes, with_masks_beside
+from warpnerf.scenes.formats.frame import Frame, lens_notes, lens_warnings, with_masks_beside
 from warpnerf.scenes.formats.georeference import centred, in_words
 from warpnerf.scenes.formats.reduced import with_reduced
 from warpnerf.scenes.images.depths import Depth, read_depth
@@ -34,9 +36,6 @@ from warpnerf.scenes.images.photographs import Keeping, Photograph, keep, stay_i
 from warpnerf.scenes.images.transparency import NO_ALPHA, outline, show_an_object, shows_nothing
 from warpnerf.scenes.scene import Scene, View
 from warpnerf.scenes.split import Split, withheld
-
-LITTLE = 0.1
-"""Share of the pixels that masks leave, below which they are likely to be inverted."""
 
 LOOKED_AT = 16
 """Training photographs, at most, whose transparent pixels tell what the scene is."""
@@ -117,9 +116,9 @@ def assemble(
         turned = list(pool.map(_may_lie, frames))
     left = [entry for entry in read if entry is not None]
     complete, mask_warnings = _without_masked(file, frames, left, complete)
-    notes += _mask_notes(left)
     notes += lens_notes([(entry.frame, entry.whole, entry.photograph.resampling) for entry in left])
-    warnings = [*warnings, *_transparency_warning(left)]
+    warnings = [*warnings, *lens_warnings([(entry.frame, entry.whole) for entry in left])]
+    warnings += _transparency_warning(left)
     kept = keep([entry.photograph for entry in left], keeping, file=file, downscale=downscale)
     views = [
         View(
@@ -138,6 +137,12 @@ def assemble(
     }
     views, points, told = check_against_photographs(views, indices["train"], points, is_object)
     warnings += told
+    masks_left, cameras = [entry.mask for entry in left], [view.camera for view in views]
+    notes += mask_notes(masks_left, cameras)
+    mask_warnings += inverted_masks(masks_left, cameras, indices["train"])
+    bounds, refuted = believed_bounds(views, indices["train"], _bounds(frames, views))
+    warnings += refuted
+    warnings += doubted_depths([views[i] for i in indices["train"] if left[i].depth is not None])
     training = [views[i] for i in indices["train"]]
     unbounded = not is_object
     transparent = {view.name for view, see in zip(views, kept.see_through, strict=True) if see}
@@ -165,7 +170,7 @@ def assemble(
         observations=None if observed is None else observed.observations,
         tracks=tracks,
         points=None if observed is None or points is None else points.sample,
-        bounds=_bounds(frames, views),
+        bounds=bounds,
         offset=offset,
         notes=(*notes, *kept.notes, *extent.notes),
         warnings=(
@@ -231,7 +236,7 @@ def _field(file: Path, field: str) -> str:
 def _without_masked(
     file: Path, frames: Sequence[Frame], read: Sequence[_Read], splits: dict[str, set[str]]
 ) -> tuple[dict[str, set[str]], list[str]]:
-    """The splits without images of which masks leave nothing, and warnings of what masks leave.
+    """The splits without images of which masks leave nothing, and a warning of these.
 
     Raises:
         InputError: No training image is left.
@@ -250,24 +255,7 @@ def _without_masked(
             f"left out {len(gone)} of {len(frames)} images of which masks leave no pixel (first: "
             f"{gone[0]})"
         )
-    share = _share_kept(read)
-    if share < LITTLE:
-        warnings.append(
-            f"masks leave {share:.1%} of the pixels: white ones count, black ones are ignored, so "
-            "invert the masks if they are the other way round"
-        )
     return splits, warnings
-
-
-def _mask_notes(read: Sequence[_Read]) -> list[str]:
-    """That there are masks, and what they leave."""
-    masked = sum(view.mask is not None for view in read)
-    if not masked:
-        return []
-    return [
-        f"{masked} of {len(read)} images have pixels that are ignored; {_share_kept(read):.1%} "
-        "of all pixels count"
-    ]
 
 
 def _transparency_warning(read: Sequence[_Read]) -> list[str]:
@@ -288,15 +276,6 @@ def _shape(frame: Frame) -> tuple[int, ...]:
 
 def _pixels(frame: Frame) -> np.ndarray:
     return read_image(frame.path) if frame.image is None else frame.image
-
-
-def _share_kept(read: Sequence[_Read]) -> float:
-    pixels = sum(view.camera.width * view.camera.height for view in read)
-    count = sum(
-        view.camera.width * view.camera.height if view.mask is None else view.mask.count
-        for view in read
-    )
-    return count / pixels
 
 
 def _may_lie(frame: Frame) -> bool:
@@ -333,13 +312,6 @@ def _diagnostics(
         warnings.append(
             f"used for training and for testing: {len(shared)} of {len(views)} images (first: "
             f"{min(shared)}), so test scores are too good"
-        )
-    sizes = {(view.camera.width, view.camera.height): view.name for view in reversed(views)}
-    if len(sizes) > 1:
-        shown = ", ".join(f"{name} {w}x{h}" for (w, h), name in sorted(sizes.items())[:2])
-        warnings.append(
-            f"images of {len(sizes)} sizes (first: {shown}): each frame needs a lens of its own "
-            "if the lens is given in pixels"
         )
     copies = _copies(views)
     if copies:

@@ -223,12 +223,16 @@ def load_colmap(
     return replace(scene, notes=(*notes, *scene.notes))
 
 
-def points_beside(folder: Path, frames: Sequence[Frame]) -> tuple[Points | None, str]:
+def points_beside(
+    folder: Path, frames: Sequence[Frame], applied: np.ndarray | None = None
+) -> tuple[Points | None, str]:
     """Points of a model that lies in the folder of a scene with cameras from elsewhere.
 
     Args:
         folder: The scene's.
         frames: Of the scene.
+        applied: [3, 4] that has turned the model's cameras to the scene's, unless they are the
+            same already; None: nothing has.
 
     Returns:
         The points, with tracks by names of frames, where the model's cameras are the scene's; else
@@ -236,14 +240,16 @@ def points_beside(folder: Path, frames: Sequence[Frame]) -> tuple[Points | None,
     """
     why_not = ""
     for model in find_models(folder):
-        points, why = _points_of(model, folder, frames)
+        points, why = _points_of(model, folder, frames, applied)
         if not why:
             return points, ""
         why_not = why_not or why
     return None, why_not
 
 
-def _points_of(model: Path, folder: Path, frames: Sequence[Frame]) -> tuple[Points | None, str]:
+def _points_of(
+    model: Path, folder: Path, frames: Sequence[Frame], applied: np.ndarray | None
+) -> tuple[Points | None, str]:
     """As ``points_beside``, of one model."""
     place = model.relative_to(folder).as_posix()
     try:
@@ -251,14 +257,27 @@ def _points_of(model: Path, folder: Path, frames: Sequence[Frame]) -> tuple[Poin
         by_name = {image.name.replace("\\", "/").rpartition("/")[2]: image for image in images}
         pairs = [(f, by_name[f.path.name]) for f in frames if f.path.name in by_name]
         poses = np.array([_pose(image, f"{model}: {image.name}") for _, image in pairs])
-        if len(pairs) < MIN_SAME * len(frames) or not _same_cameras(
-            np.array([frame.c2w for frame, _ in pairs]), poses
-        ):
-            return None, f"the points of {place} are not used: its cameras are others"
+        ours = np.array([frame.c2w for frame, _ in pairs])
+        enough = len(pairs) >= MIN_SAME * len(frames)
         names = {image.number: frame.name for frame, image in pairs}
-        return read_points(model, names, folder), ""
+        if enough and _same_cameras(ours, poses):
+            return read_points(model, names, folder), ""
+        if enough and applied is not None and _same_cameras(ours, _moved(poses, applied)):
+            points = read_points(model, names, folder)
+            if points is None:
+                return None, ""
+            positions = _moved(points.positions[:, :, None], applied)[:, :, 0]
+            return replace(points, positions=positions), ""
+        return None, f"the points of {place} are not used: its cameras are others"
     except InputError as error:
         return None, f"the points of {place} are not used: {error}"
+
+
+def _moved(poses: np.ndarray, applied: np.ndarray) -> np.ndarray:
+    """Poses [n, 3, 4], or positions [n, 3, 1], by a rotation and translation [3, 4]."""
+    moved = applied[:, :3] @ poses
+    moved[:, :, -1] += applied[:, 3]
+    return moved
 
 
 def _same_cameras(ours: np.ndarray, theirs: np.ndarray) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,6 +15,9 @@ from warpnerf.scenes.images.depths import DepthFile
 from warpnerf.scenes.images.images import image_shape
 from warpnerf.scenes.images.masks import Mask, fits, mask_beside, unfit_masks
 from warpnerf.scenes.images.resampling import Resampling
+
+SAME_LENS = 0.01
+"""By which focal lengths, or width / height, may differ, as a share, where sizes are rounded."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -76,6 +79,54 @@ def lens_notes(used: Sequence[tuple[Frame, Camera, Resampling | None]]) -> list[
         + ("so they are undistorted to it" if moved else "and is used in its place")
         for (model, moved), off in found.items()
     ]
+
+
+def lens_warnings(used: Sequence[tuple[Frame, Camera]]) -> list[str]:
+    """Where files contradict themselves or their photographs in what lenses are.
+
+    Args:
+        used: Frames, and the cameras of their whole photographs.
+    """
+    warnings = []
+    said = [
+        (frame, frame.lens.contradiction(camera.width, camera.height)) for frame, camera in used
+    ]
+    doubted = [(frame, text) for frame, text in said if text]
+    if doubted:
+        frame, text = doubted[0]
+        warnings.append(
+            f"{frame.lens.file.name}: the lens of {len(doubted)} of {len(used)} images (first: "
+            f"{frame.name}) contradicts itself: {text}"
+        )
+    shared: dict[tuple[tuple[str, float], ...], dict[tuple[int, int], tuple[Frame, Camera]]] = {}
+    for frame, camera in used:
+        sizes = shared.setdefault(tuple(frame.lens.values.items()), {})
+        sizes.setdefault((camera.width, camera.height), (frame, camera))
+    return warnings + [_one_lens(sizes) for sizes in shared.values() if not _go_together(sizes)]
+
+
+def _go_together(sizes: Mapping[tuple[int, int], tuple[Frame, Camera]]) -> bool:
+    """Whether one lens can be that of images of these sizes: reduced, or cropped by an angle."""
+    lenses = np.array([(c.fx, c.fy, c.width / c.height) for _, c in sizes.values()])
+    fx, fy, shape = lenses.max(axis=0) <= (1.0 + SAME_LENS) * lenses.min(axis=0)
+    (frame, _) = next(iter(sizes.values()))
+    by_angle = not frame.lens.values.keys() & {"fl_x", "fl_y"}
+    return len(sizes) == 1 or (by_angle and bool(shape or (fx and fy)))
+
+
+def _one_lens(sizes: Mapping[tuple[int, int], tuple[Frame, Camera]]) -> str:
+    """That images of these sizes have one lens."""
+    some = [sizes[size] for size in sorted(sizes)[:2]]
+    said = f"images of {len(sizes)} sizes (first: " + ", ".join(
+        f"{frame.name} {camera.width}x{camera.height}" for frame, camera in some
+    )
+    if some[0][0].lens.values.keys() & {"fl_x", "fl_y"}:
+        return f"{said}) have one lens in pixels: give each frame a lens of its own"
+    fx, other = (camera.fx for _, camera in some)
+    return (
+        f"{said}) have one field of view, and so focal lengths of {fx:.4g} and {other:.4g} pixels: "
+        "if one camera took them, turned or cropped, give each frame its fl_x"
+    )
 
 
 def with_masks_beside(frames: Sequence[Frame], downscale: int) -> tuple[list[Frame], list[str]]:

@@ -42,8 +42,11 @@ KINDS = {
 }
 """Lenses by Metashape's types of sensors."""
 
-EARTH = (6.2e6, 6.5e6)
-"""Metres from the centre of the earth within which cameras are taken to be on it."""
+GROUND = (-2e3, 2e4)
+"""Metres above the ellipsoid within which cameras are taken to be geocentric: UTM has northings
+as large, but hardly where its coordinates, taken for geocentric, are so near to the ellipsoid."""
+LOCAL = "LOCAL_CS"
+"""How a reference begins that is of no place on the earth, whatever its coordinates are."""
 AXES = np.array([6378137.0, 6378137.0, 6356752.314245])
 """Half axes of WGS 84, metres."""
 
@@ -95,7 +98,7 @@ def load_metashape(file: Path, reading: Reading) -> Scene:
     chunk, notes = _chunk(file)
     aligned, more = _aligned(file, chunk)
     sensors = {sensor.get("id", ""): sensor for sensor in chunk.iterfind("sensors/sensor")}
-    poses, turned = _on_the_ground(_poses(file, chunk, aligned))
+    poses, turned = _on_the_ground(_poses(file, chunk, aligned), chunk.findtext("reference", ""))
 
     def entry(camera: ElementTree.Element, pose: np.ndarray) -> Entry:
         place = f"{file}: {_place(camera)}"
@@ -227,10 +230,11 @@ def _transform(file: Path, place: str, element: ElementTree.Element | None) -> T
     return Transform(rotation, parts.get("translation", np.zeros(3)), scale)
 
 
-def _on_the_ground(poses: np.ndarray) -> tuple[np.ndarray, list[str]]:
+def _on_the_ground(poses: np.ndarray, reference: str) -> tuple[np.ndarray, list[str]]:
     """Poses in geocentric coordinates, turned to east, north and up around their middle."""
     middle = np.median(poses[:, :, 3], axis=0)
-    if not EARTH[0] < float(np.linalg.norm(middle)) < EARTH[1]:
+    height = (float(np.linalg.norm(middle / AXES)) - 1.0) * AXES[0]  # but for a hundredth of it
+    if not GROUND[0] < height < GROUND[1] or reference.strip().startswith(LOCAL):
         return poses, []
     up = middle / AXES**2
     up /= np.linalg.norm(up)

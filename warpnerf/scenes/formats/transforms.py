@@ -2,7 +2,8 @@
 
 ``transform_matrix`` is camera to world in OpenGL axes, as everywhere in this project; distances are
 used as the file has them. ``aabb_scale``, ``scale`` and ``offset`` place the scene in instant-ngp's
-own unit cube, ``applied_transform`` tells where the poses came from: neither changes the picture.
+own unit cube, which does not change the picture. ``applied_transform`` tells where the poses came
+from: it turns the points of a COLMAP model with the cameras that it was applied to.
 ``applied_scale`` says how many of the file's units a metre is, and so what depth files mean.
 """
 
@@ -11,6 +12,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
+
+import msgspec
+import numpy as np
 
 from warpnerf.checks import InputError
 from warpnerf.scenes.cameras.lens import LensFields, read_lens
@@ -60,6 +64,7 @@ class TransformsFile(PictureKeys, kw_only=True):
 
     frames: list[FrameEntry]
     ply_file_path: str | None = None
+    applied_transform: object = None
     mask_path: str | None = None
     depth_unit_scale_factor: float = DEFAULT_UNIT
     applied_scale: float = 1.0
@@ -116,7 +121,7 @@ def load_transforms(
                 f"{split}_filenames (first: {absent[0]})"
             )
         splits[split] = members
-    points, why_not = _points(file, data.ply_file_path, frames)
+    points, why_not = _points(file, data, frames)
     if why_not:
         warnings.append(why_not)
     return assemble(
@@ -133,9 +138,7 @@ def load_transforms(
     )
 
 
-def _points(
-    file: Path, ply_file_path: str | None, frames: Sequence[Frame]
-) -> tuple[Points | None, str]:
+def _points(file: Path, data: TransformsFile, frames: Sequence[Frame]) -> tuple[Points | None, str]:
     """The points of a COLMAP model with the same cameras, else those that the file names.
 
     The model comes first because its points have tracks: which photograph sees which.
@@ -143,7 +146,8 @@ def _points(
     Returns:
         The points, or None; and a warning if there are some that are not used.
     """
-    beside, why_not = points_beside(file.parent, frames)
+    ply_file_path = data.ply_file_path
+    beside, why_not = points_beside(file.parent, frames, _applied(data))
     if ply_file_path is None or (beside is not None and beside.tracks is not None):
         return beside, why_not
     path = resolve_inside(file.parent, ply_file_path, field=f"{file}: $.ply_file_path")
@@ -152,6 +156,15 @@ def _points(
     positions = read_ply(path)
     positions = positions[usable(positions)]
     return Points(positions=positions, tracks=None, source=ply_file_path), ""
+
+
+def _applied(data: TransformsFile) -> np.ndarray | None:
+    """The applied transform, [3, 4], where it is one."""
+    try:
+        matrix = msgspec.convert(data.applied_transform, list[list[float]])
+        return check_pose(matrix, field="applied_transform")
+    except (msgspec.ValidationError, InputError):
+        return None
 
 
 def read_frames(file: Path, required: bool = True) -> tuple[TransformsFile, list[Frame], list[str]]:

@@ -1,0 +1,89 @@
+"""What masks leave of photographs, and whether that is what the cameras look at."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from warpnerf.checks import InputError
+from warpnerf.scenes.cameras.camera import Camera
+from warpnerf.scenes.cameras.focus import find_focus
+from warpnerf.scenes.images.masks import PackedMask
+
+LITTLE = 0.1
+"""Share of the pixels that masks leave, below which they are likely to be inverted."""
+HALF = 0.5
+"""The same, where they ignore what the cameras look at: masks of an object leave that, if little
+else, and inverted ones of people who walk by do not."""
+
+Masks = Sequence[PackedMask | None]
+"""Of all views; None: all pixels count."""
+
+
+def mask_notes(masks: Masks, cameras: Sequence[Camera]) -> list[str]:
+    """That there are masks, and what they leave.
+
+    Args:
+        masks: Of these cameras' photographs.
+        cameras: Of all views.
+    """
+    masked = sum(mask is not None for mask in masks)
+    if not masked:
+        return []
+    return [
+        f"{masked} of {len(masks)} images have pixels that are ignored; "
+        f"{_share_kept(masks, cameras):.1%} of all pixels count"
+    ]
+
+
+def inverted_masks(masks: Masks, cameras: Sequence[Camera], training: Sequence[int]) -> list[str]:
+    """Detect inverted masks, by how much they leave and by whether the common focus is part of it.
+
+    Args:
+        masks: Of these cameras' photographs.
+        cameras: Of all views.
+        training: Indices of those that tell the focus.
+
+    Returns:
+        A warning, or none.
+    """
+    share = _share_kept(masks, cameras)
+    if share >= HALF or (share >= LITTLE and _keep_the_focus(masks, cameras, training)):
+        return []
+    return [
+        f"masks leave {share:.1%} of the pixels"
+        + ("" if share < LITTLE else ", and in few images a point that most cameras look at")
+        + ": white ones count, black ones are ignored, so invert the masks if they are the other "
+        "way round"
+    ]
+
+
+def _share_kept(masks: Masks, cameras: Sequence[Camera]) -> float:
+    pixels = [camera.width * camera.height for camera in cameras]
+    kept = (n if mask is None else mask.count for n, mask in zip(pixels, masks, strict=True))
+    return sum(kept) / sum(pixels)
+
+
+def _keep_the_focus(masks: Masks, cameras: Sequence[Camera], training: Sequence[int]) -> bool:
+    """Whether most masks leave the point that most cameras look at, if there is one."""
+    try:
+        focus = find_focus([cameras[i] for i in training])
+    except InputError:
+        return False
+    kept = [
+        _leaves(mask, camera, focus.point)
+        for mask, camera in zip(masks, cameras, strict=True)
+        if mask is not None
+    ]
+    return not focus.guessed and float(np.mean(kept)) > HALF
+
+
+def _leaves(mask: PackedMask, camera: Camera, point: np.ndarray) -> bool:
+    """Whether the pixel that shows a point [3] counts; distortion is left out of account."""
+    x, y, z = (point - camera.position) @ camera.c2w[:, :3]
+    if not z < 0.0:
+        return False
+    row, column = camera.cy + camera.fy * y / z, camera.cx - camera.fx * x / z
+    inside = 0.0 <= row < camera.height and 0.0 <= column < camera.width
+    return inside and bool(mask.read()[int(row), int(column)])
