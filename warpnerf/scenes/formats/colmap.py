@@ -173,7 +173,7 @@ def load_colmap(
     notes, larger = other_models(model, len(images), folder)
     few, many = unnamed_photographs(photographs, {frame.path for frame in frames}, "the model")
     there, of_model = {frame.name for frame in frames}, {image.name for image in images}
-    splits, listed, lost = read_split_lists(folder, there, of_model)
+    splits, listed, lost = read_split_lists(folder, there, of_model, model)
     notes = [*notes, *few, *listed]
     warnings = [*warnings, *larger, *many, *lost]
     points = None

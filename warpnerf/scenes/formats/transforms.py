@@ -26,6 +26,7 @@ from warpnerf.scenes.formats.colmap_models import find_model, size_of
 from warpnerf.scenes.formats.frame import Frame
 from warpnerf.scenes.formats.frame_images import find_images
 from warpnerf.scenes.formats.ply import read_ply
+from warpnerf.scenes.formats.split_lists import read_split_lists
 from warpnerf.scenes.formats.unnamed_photographs import unnamed_photographs
 from warpnerf.scenes.images.depths import DEFAULT_UNIT, DepthFile
 from warpnerf.scenes.images.masks import Mask
@@ -83,8 +84,8 @@ def load_transforms(
 ) -> Scene:
     """Load a scene from a transforms.json.
 
-    The split is the file's ``{train,val,test}_filenames``, else every 8th
-    image is for testing. Box and content distance are those of the points of a COLMAP model in
+    The split is the file's ``{train,val,test}_filenames``, else that of lists beside it, else every
+    8th image is for testing. Box and content distance are those of the points of a COLMAP model in
     the folder whose cameras are the same, or that ``ply_file_path`` names, or of the only .ply in
     the folder, where there are such.
 
@@ -118,6 +119,10 @@ def load_transforms(
                 f"{split}_filenames (first: {absent[0]})"
             )
         splits[split] = members
+    listed_in: list[str] = []
+    if withhold is None and not any(splits.values()):
+        splits, listed_in, lost = read_split_lists(folder, names, names)
+        warnings += lost
     points, why_not = _points(file, data.ply_file_path, frames)
     if why_not:
         warnings.append(why_not)
@@ -136,7 +141,7 @@ def load_transforms(
         withhold=withhold,
         points=points,
     )
-    return replace(scene, notes=(*few, *tried, *scene.notes))
+    return replace(scene, notes=(*few, *listed_in, *tried, *scene.notes))
 
 
 def _unnamed(file: Path, frames: Sequence[Frame]) -> tuple[list[str], list[str]]:
