@@ -25,6 +25,17 @@ def split_file(split: str) -> str:
     return f"transforms_{split}.json"
 
 
+def other_transforms(folder: Path) -> list[Path]:
+    """Files of frames in a folder that are read only where they are named, by name."""
+    names = {"transforms.json"}
+    if exists(folder / split_file("train")):
+        names.update(map(split_file, SPLITS))
+    try:
+        return sorted(path for path in folder.glob("transforms*.json") if path.name not in names)
+    except OSError:
+        return []
+
+
 def load_blender(
     folder: Path,
     *,
