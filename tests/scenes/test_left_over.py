@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from tests.scenes.test_llff import write_llff
 from tests.scenes.test_points import write_ply
 from tests.support.program_exports import write_metashape, write_polycam, write_reality
 from tests.support.tiny_scenes import picture, ring, save, write_blender, write_transforms
+from warpnerf.checks import InputError
 from warpnerf.scenes.formats.load import load_scene
 
 
@@ -178,3 +180,20 @@ def test_a_model_of_more_photographs_is_named(tmp_path: Path) -> None:
     assert warning.endswith(
         f"; name {tmp_path / 'sparse' / '0'} to read the COLMAP model, which has 4"
     )
+
+
+def test_a_model_beside_a_file_that_is_refused_is_named(tmp_path: Path) -> None:
+    write_transforms(tmp_path)
+    save(tmp_path / "transforms.json", {"frames": []})
+    with pytest.raises(InputError, match=r"a scene needs posed images\.$"):
+        load_scene(tmp_path)
+    model = write_model(tmp_path)
+    way_out = re.escape(f"; or name the COLMAP model beside it, {model}.") + "$"
+    with pytest.raises(InputError, match=rf"transforms\.json: .*{way_out}"):
+        load_scene(tmp_path)
+    write_model(tmp_path / "s")
+    write_transforms(tmp_path / "t")
+    (tmp_path / "t" / "images").rename(tmp_path / "s" / "images")
+    (tmp_path / "t" / "transforms.json").rename(tmp_path / "s" / "transforms.json")
+    with pytest.raises(InputError, match=r"is no folder; name the folder of the masks\.$"):
+        load_scene(tmp_path / "s", masks=tmp_path / "none")
