@@ -12,7 +12,7 @@ from warpnerf.checks import InputError
 from warpnerf.scenes.cameras.poses import check_pose
 from warpnerf.scenes.files import exists, printable, read_json
 from warpnerf.scenes.formats import llff
-from warpnerf.scenes.formats.blender import SPLITS, other_transforms, split_file
+from warpnerf.scenes.formats.blender import SPLITS, is_split, other_transforms, split_file
 from warpnerf.scenes.formats.colmap_models import find_model, model_kind
 from warpnerf.scenes.formats.npz import is_scene_file, single_npz
 from warpnerf.scenes.formats.part import ENDING, read_part
@@ -103,7 +103,7 @@ def _files(path: str | Path) -> tuple[str, list[Path]]:
         return "none", []
     if path.is_dir():
         return _files_of_folder(path)
-    if path.name in map(split_file, SPLITS):
+    if is_split(path):
         return _blender(path.parent)
     if path.name == llff.FILE:
         return f"LLFF ({llff.FILE})", []
