@@ -57,8 +57,8 @@ def test_masks_that_no_frame_has_are_said(tmp_path: Path, kind: str, folder: str
 def test_masks_may_lie_beside_the_folder_of_photographs(tmp_path: Path) -> None:
     write_polycam(tmp_path)
     gray(tmp_path / "keyframes" / "masks" / "100.png")
-    (warning,) = (w for w in load_scene(tmp_path).warnings if "mask" in w)
-    assert f"--masks {tmp_path / 'keyframes' / 'masks'} ignores" in warning
+    said = f"--masks {tmp_path / 'keyframes' / 'masks'} ignores"
+    assert any(said in warning for warning in load_scene(tmp_path).warnings)
 
 
 def test_masks_that_are_named_after_nothing_are_said(tmp_path: Path) -> None:
