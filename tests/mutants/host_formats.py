@@ -26,6 +26,18 @@ POLYCAM, RECORD3D, METASHAPE, REALITY, FOUND, REDUCED = (
     for name in ("polycam", "record3d", "metashape", "reality", "found_photographs", "reduced")
 )
 
+LEFT, UNNAMED, LISTS, MODELS, CONTENTS, TRANSFORMS_FILE = (
+    f"scenes/formats/{name}.py"
+    for name in (
+        *("left_over", "unnamed_photographs", "split_lists", "colmap_models", "contents"),
+        "transforms",
+    )
+)
+LEFT_TESTS = "scenes/test_left_over.py::test_"
+LISTS_TESTS = "scenes/test_split_lists.py::test_"
+MODELS_TESTS = "scenes/test_colmap_models.py::test_"
+FOLDERS = "scenes/test_contents.py::test_what_a_folder_without_a_scene_holds"
+
 MUTANTS = [
     of_host("FOV: half of the tangent", LENSES, "2.0 * r * math.tan", "r * math.tan", COLMAP),
     of_host(
@@ -232,5 +244,117 @@ MUTANTS = [
         "downscale if frame.reduced is None else 1",
         "downscale",
         USED,
+    ),
+    of_host(
+        "RealityCapture: a comma is a comma",
+        REALITY,
+        'word = word.replace(",", ".")',
+        "pass",
+        f"{PROGRAMS}reality_decimal_commas",
+    ),
+    of_host(
+        "left over: masks that are used, too",
+        LEFT,
+        "and path not in inside",
+        "",
+        f"{LEFT_TESTS}what_is_no_folder_of_masks_is_not_said",
+    ),
+    of_host(
+        "left over: masks in the scene's folder only",
+        LEFT,
+        "while folder in parent.parents",
+        "while False",
+        f"{LEFT_TESTS}masks_may_lie_beside_the_folder_of_photographs",
+    ),
+    of_host(
+        "left over: the first of several clouds",
+        LEFT,
+        "len(files) != 1",
+        "not files",
+        f"{LEFT_TESTS}a_single_ply_is_the_scene_s_points",
+    ),
+    of_host(
+        "left over: a link out of the folder",
+        LEFT,
+        "resolve_inside(folder, name, field=name)",
+        "folder / name",
+        f"{LEFT_TESTS}points_that_cannot_be_read_are_said",
+    ),
+    of_host(
+        "unnamed: always a note",
+        UNNAMED,
+        "> UNPOSED * len(there)",
+        "> len(there)",
+        f"{LEFT_TESTS}photographs_that_transforms_json_does_not_name_are_said",
+    ),
+    of_host(
+        "unnamed: what is called after a photograph, too",
+        UNNAMED,
+        "or not stems.intersection(_beginnings(path.stem))",
+        "or True",
+        f"{LEFT_TESTS}photographs_that_transforms_json_does_not_name_are_said",
+    ),
+    of_host(
+        "unnamed: any model",
+        TRANSFORMS_FILE,
+        "n > len(frames)",
+        "n > 4",
+        f"{LEFT_TESTS}a_model_of_more_photographs_is_named",
+    ),
+    of_host(
+        "lists: a short name of two",
+        LISTS,
+        "if len(of) == 1",
+        "if of",
+        f"{LISTS_TESTS}a_short_name_of_two_photographs_is_that_of_none",
+    ),
+    of_host(
+        "lists: over those of transforms.json",
+        TRANSFORMS_FILE,
+        "withhold is None and not any(splits.values())",
+        "withhold is None",
+        f"{LISTS_TESTS}lists_beside_transforms_json",
+    ),
+    of_host(
+        "lists: whatever is withheld",
+        TRANSFORMS_FILE,
+        "withhold is None and not any(splits.values())",
+        "not any(splits.values())",
+        f"{LISTS_TESTS}lists_beside_transforms_json",
+    ),
+    of_host(
+        "models: the smaller form",
+        MODELS,
+        "return max(kinds, key=",
+        "return min(kinds, key=",
+        f"{MODELS_TESTS}of_a_model_in_both_forms_the_larger_is_read",
+    ),
+    of_host(
+        "models: a copy is out of date",
+        MODELS,
+        "not in (0, n)",
+        "!= 0",
+        f"{MODELS_TESTS}a_copy_of_a_model_in_the_other_form_needs_no_word",
+    ),
+    of_host(
+        "contents: the folder of the fewest",
+        CONTENTS,
+        "largest = max(deeper",
+        "largest = min(deeper",
+        FOLDERS,
+    ),
+    of_host(
+        "contents: pictures on top, however few",
+        CONTENTS,
+        "and len(more) > n",
+        "and False",
+        FOLDERS,
+    ),
+    of_host(
+        "contents: any folder in a scene's is its images",
+        CONTENTS,
+        "if IMAGES.fullmatch(folder.name) and",
+        "if",
+        "scenes/test_contents.py::test_photographs_of_a_scene_lead_to_it",
     ),
 ]

@@ -12,6 +12,7 @@ from tests.support.tiny_scenes import write_transforms
 from warpnerf.checks import InputError
 from warpnerf.inspection.inspection import inspect
 from warpnerf.scenes.formats.colmap_models import find_model
+from warpnerf.scenes.formats.colmap_points import read_points
 from warpnerf.scenes.formats.contents import is_unposed, what_is_there
 from warpnerf.scenes.formats.load import load_scene
 
@@ -45,6 +46,53 @@ def test_a_model_that_is_named_is_read_and_a_larger_one_is_a_warning(tmp_path: P
     scene = load_scene(tmp_path / "sparse" / "0")
     assert len(scene.views) == 4
     assert "the model sparse/0 of 4 images is read; sparse/1 has 9" in scene.warnings
+
+
+def in_both_forms(folder: Path, n_binary: int, n_text: int) -> Path:
+    """Photographs, and sparse/0 as .bin and as .txt, each with points; returns its folder."""
+    write_transforms(folder, 9)
+    (folder / "transforms.json").unlink()
+    model = write_model(folder, n_binary)
+    (model / "points3D.bin").write_bytes(bytes(8))
+    for file in write_model(folder / "copy", n_text, text=True).iterdir():
+        file.rename(model / file.name)
+    shutil.rmtree(folder / "copy")
+    comment = f"# Number of images: {n_text}, mean observations per image: 0\n"
+    (model / "images.txt").write_text(comment + (model / "images.txt").read_text())
+    (model / "points3D.txt").write_text("1 0 0 0 9 9 9 0.5\n")
+    return model
+
+
+@pytest.mark.parametrize("larger", ["bin", "txt"])
+def test_of_a_model_in_both_forms_the_larger_is_read(tmp_path: Path, larger: str) -> None:
+    other, sizes = ("txt", (9, 4)) if larger == "bin" else ("bin", (4, 9))
+    model = in_both_forms(tmp_path, *sizes)
+    scene = load_scene(tmp_path)
+    assert len(scene.views) == 9
+    (warning,) = scene.warnings
+    assert warning.startswith(
+        f"sparse/0/images.{larger} of 9 images is read, and not images.{other}, which has 4; remove"
+    )
+    points = read_points(model, {}, tmp_path)
+    assert points is not None and points.source == f"sparse/0/points3D.{larger}"
+
+
+def test_a_copy_of_a_model_in_the_other_form_needs_no_word(tmp_path: Path) -> None:
+    in_both_forms(tmp_path, 9, 9)
+    found = inspect(tmp_path)
+    assert found.format == "COLMAP (sparse/0, binary)"
+    assert not any("is read" in said for said in found.diagnostics)
+
+
+def test_a_model_at_another_place_is_named(tmp_path: Path) -> None:
+    two_models(tmp_path, False)
+    (tmp_path / "colmap" / "sparse").mkdir(parents=True)
+    (tmp_path / "sparse" / "1").rename(tmp_path / "colmap" / "sparse" / "0")
+    scene = load_scene(tmp_path)
+    assert len(scene.views) == 4
+    assert "the model sparse/0 of 4 images is read; colmap/sparse/0 has 9" in scene.warnings
+    scene = load_scene(tmp_path / "colmap" / "sparse" / "0")
+    assert "the model colmap/sparse/0 of 9 images is read; sparse/0 has 4" in scene.notes
 
 
 def test_a_damaged_model_is_refused_and_not_replaced_by_a_fragment(tmp_path: Path) -> None:

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.support.tiny_scenes import picture, write_transforms
+from tests.scenes.test_colmap import scene_with_model
+from tests.support.tiny_scenes import picture, save, write_transforms
 from warpnerf.checks import InputError
 from warpnerf.scenes.formats import contents
 from warpnerf.scenes.formats.contents import is_unposed, photographs_in, what_is_there
 from warpnerf.scenes.formats.load import load_scene
+from warpnerf.scenes.formats.survey import survey
 
 
 def photographs(folder: Path, n: int = 4, ending: str = "jpg") -> None:
@@ -48,9 +50,74 @@ def two_scenes(folder: Path) -> None:
     write_transforms(folder / "b")
 
 
+def beside_photographs(name: str, content: str = "") -> Callable[[Path], None]:
+    def make(folder: Path) -> None:
+        photographs(folder / "images")
+        empty_file(name)(folder)
+        (folder / name).write_text(content)
+
+    return make
+
+
+def renamed(*names: str) -> Callable[[Path], None]:
+    """Files of frames of other names than those that are looked for."""
+
+    def make(folder: Path) -> None:
+        content = write_transforms(folder)
+        (folder / "transforms.json").unlink()
+        for name in names:
+            save(folder / name, content)
+        assert not is_unposed(folder)
+
+    return make
+
+
+def a_model_below_sparse(folder: Path) -> None:
+    scene_with_model(folder)
+    (folder / "sparse" / "0").rename(folder / "sparse" / "mine")
+    assert not is_unposed(folder)
+
+
+def two_npz(folder: Path) -> None:
+    for name in ("a", "b"):
+        np.savez(folder / f"{name}.npz", images=np.zeros(1), poses=np.zeros(1))
+    np.savez(folder / "other.npz", density=np.zeros(1))
+
+
+def photographs_and_heic(folder: Path) -> None:
+    photographs(folder)
+    empty_file("a.HEIC")(folder)
+
+
+def two_cameras(folder: Path) -> None:
+    photographs(folder / "left", 3)
+    photographs(folder / "right", 4)
+
+
+def few_above(folder: Path) -> None:
+    photographs(folder, 3)
+    photographs(folder / "images", 4)
+
+
+UNREAD = r"holds poses in a form that is not read \({}\); .*, or .* `warpnerf pose .*s --output"
+
+
 @pytest.mark.parametrize(
     ("make", "says"),
     [
+        (renamed("transforms_all.json"), "it holds transforms_all.json; use .*/transforms_all.js"),
+        (renamed("transforms_test.json", "transforms_val.json"), "test.json, transforms_val.json;"),
+        (a_model_below_sparse, "its COLMAP model is in sparse/mine; use .*/s/sparse/mine"),
+        (two_npz, r"it holds a\.npz, b\.npz; use .*/s/a\.npz"),
+        (beside_photographs("scene.nvm"), UNREAD.format(r"scene\.nvm")),
+        (beside_photographs("images/0.xmp", '<a xcr:Rotation="1">'), UNREAD.format(".*0.xmp")),
+        (beside_photographs("a.csv", "#name,x,y,heading,pitch,roll"), UNREAD.format(".*a.csv")),
+        (beside_photographs("a.txt", "# X, Y, Z, Omega, Phi, Kappa"), UNREAD.format(".*a.txt")),
+        (beside_photographs("images/0.xmp", "<crs:Exposure/>"), "it holds 4 photographs without"),
+        (empty_file("camera/0.json"), r"that is not read \(camera/0\.json\); export"),
+        (photographs_and_heic, "it holds 4 photographs without poses, and 1 as HEIC, to be conv"),
+        (two_cameras, "2 of its folders hold 7 photographs .* those of right alone by .*/s/right"),
+        (few_above, "it holds 3 photographs without poses, and 4 in images; .* pose .*/s/images"),
         (photographs, "holds 4 photographs without poses; .*`warpnerf pose .*s --output SCENE`"),
         (lambda f: photographs(f / "images"), "holds 4 photographs without poses"),
         (lambda f: photographs(f, 2), "holds 2 photographs, and poses need at least 3"),
@@ -77,6 +144,22 @@ def test_what_a_folder_without_a_scene_holds(
     make(folder)
     with pytest.raises(InputError, match=rf"s: no scene found: .*{says}"):
         load_scene(folder)
+
+
+def test_photographs_of_a_scene_lead_to_it(tmp_path: Path) -> None:
+    write_transforms(tmp_path / "s")
+    images = tmp_path / "s" / "images"
+    assert not is_unposed(images)
+    says = f"it is a folder of the scene s; use {tmp_path / 's'}, or estimate other poses by"
+    assert what_is_there(images).startswith(says)
+    assert is_unposed(images.rename(tmp_path / "s" / "others"))
+
+
+@pytest.mark.parametrize("name", ["transforms_all.json", "transforms_test.json"])
+def test_a_file_of_frames_of_any_name_is_read_where_it_is_named(tmp_path: Path, name: str) -> None:
+    renamed(name)(tmp_path)
+    assert len(load_scene(tmp_path / name).views) == 4
+    assert survey(tmp_path / name).format == f"instant-ngp / nerfstudio ({name})"
 
 
 def test_what_is_missing_is_installed_first(

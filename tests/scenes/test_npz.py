@@ -49,6 +49,17 @@ def test_the_scene_is_that_of_transforms_json(tmp_path: Path, kind: str, compres
         assert inspect(path).format == "npz (tiny.npz)"
 
 
+def test_other_arrays_are_named(tmp_path: Path) -> None:
+    assert load_scene(write(tmp_path / "a.npz")).warnings == ()
+    others = {f"array_{k}": np.zeros(1) for k in range(8)}
+    file = write(tmp_path / "a.npz", i_test=np.arange(2), **others)
+    (warning,) = load_scene(file).warnings
+    assert warning.startswith("a.npz: arrays that are not read: array_0, array_1, ")
+    assert "array_7, ...; save a transforms.json" in warning
+    (warning,) = load_scene(write(tmp_path / "a.npz", cx=4.0)).warnings
+    assert "not read: cx; save" in warning
+
+
 def test_alpha_and_masks_and_downscale(tmp_path: Path) -> None:
     rgba = np.stack([picture(number, channels=4) for number in range(N)])
     file = write(tmp_path / "a.npz", images=rgba)

@@ -206,10 +206,10 @@ def test_outward_cameras_get_the_room_that_they_see(tmp_path: Path) -> None:
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     angles = np.random.default_rng(0).uniform(0.0, 2.0 * np.pi, 3000)
     heights = np.random.default_rng(1).uniform(-1.0, 1.0, 3000)
+    guessed = load_scene(tmp_path)
     write_ply(
         tmp_path / "sparse.ply", np.stack([3 * np.cos(angles), 3 * np.sin(angles), heights], 1)
     )
-    guessed = load_scene(tmp_path)
     content["ply_file_path"] = "sparse.ply"
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     scene = load_scene(tmp_path)

@@ -224,6 +224,18 @@ def test_reality_focal_length_is_by_the_longer_side(tmp_path: Path) -> None:
     assert (camera.cx, camera.cy) == pytest.approx((3.25, 3.75))
 
 
+@pytest.mark.parametrize("delimiter", [";", "\t"])
+def test_reality_decimal_commas(tmp_path: Path, delimiter: str) -> None:
+    file = write_reality(tmp_path)
+    expected = load_scene(tmp_path)
+    text = file.read_text().replace(".png", "*png").replace(",", delimiter).replace(".", ",")
+    file.write_text(text.replace("*png", ".png"))
+    assert_same(load_scene(tmp_path), expected)
+    file.write_text(text.replace("*png", ".png").replace("45,0", "1.345,0"))
+    with pytest.raises(InputError, match=r"f: '1\.345,0' is no finite number"):
+        load_scene(tmp_path)
+
+
 def test_reality_columns_of_a_template(tmp_path: Path) -> None:
     file = write_reality(tmp_path)
     rows = [line.split(",")[:8] for line in file.read_text().splitlines()]

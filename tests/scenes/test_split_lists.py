@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.scenes.test_colmap import scene_with_model
+from tests.support.tiny_scenes import save, write_transforms
 from warpnerf.checks import InputError
 from warpnerf.scenes.formats.load import load_scene
 from warpnerf.scenes.scene import Scene
@@ -99,3 +100,52 @@ def test_a_list_of_something_else_is_refused(tmp_path: Path, content: bytes) -> 
     (tmp_path / "train_list.txt").write_bytes(content)
     with pytest.raises(InputError, match=r"train_list\.txt: .* remove (it|the file)\."):
         load_scene(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("file", "lines"),
+    [("sparse/0/test.txt", "001.png"), ("test.txt", "001"), ("test_list.txt", "images/001")],
+)
+def test_lists_as_of_3dgs(tmp_path: Path, file: str, lines: str) -> None:
+    scene_with_model(tmp_path)
+    (tmp_path / file).write_text(lines + "\n")
+    scene = load_scene(tmp_path)
+    assert names_of(scene)["test"] == ["001.png"] and len(names_of(scene)["train"]) == 3
+    assert f"test photographs are those of {file}" in scene.notes
+
+
+@pytest.mark.parametrize("content", [b"remember the milk\n", b"\xff\xfe\x00", b"\n"])
+def test_another_text_of_such_a_name_is_not_used(tmp_path: Path, content: bytes) -> None:
+    scene_with_model(tmp_path)
+    (tmp_path / "train.txt").write_bytes(content)
+    scene = load_scene(tmp_path)
+    (warning,) = scene.warnings
+    assert warning.startswith("train.txt: ") and warning.endswith("not used")
+    assert names_of(scene)["test"] == ["000.png"]
+
+
+def test_lists_beside_transforms_json(tmp_path: Path) -> None:
+    content = write_transforms(tmp_path)
+    (tmp_path / "test_list.txt").write_text("001.png\nimages/003\nlost.png\n")
+    scene = load_scene(tmp_path)
+    assert names_of(scene)["test"] == ["images/001.png", "images/003.png"]
+    assert "test photographs are those of test_list.txt" in scene.notes
+    assert scene.warnings == (
+        "test_list.txt: 1 of 3 photographs are not in the scene (first: lost.png)",
+    )
+    every = load_scene(tmp_path, split="all")
+    assert every.warnings == () and not any("test_list" in note for note in every.notes)
+    save(tmp_path / "transforms.json", content | {"test_filenames": ["images/002.png"]})
+    assert names_of(load_scene(tmp_path))["test"] == ["images/002.png"]
+
+
+def test_a_short_name_of_two_photographs_is_that_of_none(tmp_path: Path) -> None:
+    content = write_transforms(tmp_path)
+    (tmp_path / "more").mkdir()
+    (tmp_path / "images" / "003.png").rename(tmp_path / "more" / "001.png")
+    content["frames"][3]["file_path"] = "more/001.png"
+    save(tmp_path / "transforms.json", content)
+    (tmp_path / "test_list.txt").write_text("001\nmore/001\n000\n")
+    scene = load_scene(tmp_path)
+    assert names_of(scene)["test"] == ["images/000.png", "more/001.png"]
+    assert "1 of 3 photographs are not in the scene (first: 001)" in " ".join(scene.warnings)

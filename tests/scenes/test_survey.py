@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.support.tiny_scenes import ring, save, write_blender, write_transforms
+from warpnerf.scenes.formats.load import load_scene
 from warpnerf.scenes.formats.survey import survey
 
 
@@ -81,3 +82,20 @@ def test_times_of_what_moves_are_said(tmp_path: Path, times: tuple[float, ...], 
     save(tmp_path / "transforms.json", content)
     found = " ".join(survey(tmp_path).diagnostics)
     assert ("frames have 3 different times, but the scene is trained as if" in found) == said
+
+
+def test_other_files_of_frames_are_named(tmp_path: Path) -> None:
+    content = write_transforms(tmp_path / "a", 8)
+    save(tmp_path / "a" / "transforms_test.json", content)
+    note = "also in the folder, and not read: transforms_test.json"
+    assert note in load_scene(tmp_path / "a").notes
+    for k in range(3):
+        save(tmp_path / "a" / f"transforms_{k}.json", content)
+    note = "not read: transforms_0.json, transforms_1.json, transforms_2.json, ... (4)"
+    assert load_scene(tmp_path / "a").notes[-1].endswith(note)
+    write_blender(tmp_path / "b", "train", ring(4))
+    write_blender(tmp_path / "b", "test", ring(2))
+    assert not any("also in the folder" in note for note in load_scene(tmp_path / "b").notes)
+    save(tmp_path / "b" / "transforms_all.json", content)
+    note = "also in the folder, and not read: transforms_all.json"
+    assert note in load_scene(tmp_path / "b").notes

@@ -23,6 +23,7 @@ from warpnerf.scenes.extent.points import Points, extent_by_points
 from warpnerf.scenes.files import by_number, exists
 from warpnerf.scenes.formats.frame import Frame, lens_notes, lens_warnings, with_masks_beside
 from warpnerf.scenes.formats.georeference import centred, in_words
+from warpnerf.scenes.formats.left_over import unused_depths, unused_masks, unused_points
 from warpnerf.scenes.formats.reduced import with_reduced
 from warpnerf.scenes.images.depths import Depth, read_depth
 from warpnerf.scenes.images.images import exif_orientation, image_shape, read_image
@@ -92,8 +93,11 @@ def assemble(
         found = masks_of_folder(masks, [frame.name for frame in frames])
         frames = [replace(frame, mask=mask) for frame, mask in zip(frames, found, strict=True)]
     else:
+        unused = unused_masks(folder, frames)
         frames, unfit = with_masks_beside(frames, downscale)
-        warnings = [*warnings, *unfit]
+        warnings = [*warnings, *unused, *unfit]
+    notes += unused_depths(folder, frames)
+    notes += [] if points is not None else unused_points(folder)
 
     frames, points, offset = centred(frames, points)
     if offset is not None:

@@ -25,6 +25,23 @@ def split_file(split: str) -> str:
     return f"transforms_{split}.json"
 
 
+def is_split(file: Path) -> bool:
+    """Whether a file is one of a Blender scene's, which has at least the one for training."""
+    train = file.with_name(split_file("train"))
+    return file.name in map(split_file, SPLITS) and (file == train or exists(train))
+
+
+def other_transforms(folder: Path) -> list[Path]:
+    """Files of frames in a folder that are read only where they are named, by name."""
+    names = {"transforms.json"}
+    if exists(folder / split_file("train")):
+        names.update(map(split_file, SPLITS))
+    try:
+        return sorted(path for path in folder.glob("transforms*.json") if path.name not in names)
+    except OSError:
+        return []
+
+
 def load_blender(
     folder: Path,
     *,

@@ -8,7 +8,6 @@ OpenCV axes, and pixels have their centres at halves, as here.
 from __future__ import annotations
 
 import math
-import os
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -49,16 +48,13 @@ from warpnerf.scenes.formats.colmap_models import (
 )
 from warpnerf.scenes.formats.colmap_points import UnusablePlyError, read_points
 from warpnerf.scenes.formats.frame import Frame
-from warpnerf.scenes.formats.llff import ENDINGS
 from warpnerf.scenes.formats.split_lists import read_split_lists
+from warpnerf.scenes.formats.unnamed_photographs import unnamed_photographs
 from warpnerf.scenes.images.images import image_size
-from warpnerf.scenes.images.masks import mask_in, without_masks
+from warpnerf.scenes.images.masks import mask_in
 from warpnerf.scenes.images.photographs import KEEPING, Keeping
 from warpnerf.scenes.scene import Scene
 from warpnerf.scenes.split import Split
-
-UNPOSED = 0.1
-"""Share of the photographs that are not in the model, above which that is a warning."""
 
 SAME = 0.02
 """Largest difference of two cameras that are one: in spreads of all, and of unit vectors."""
@@ -75,29 +71,6 @@ def _require_once(file: Path, images: Sequence[ModelImage]) -> None:
                 f"{file}: {n} images have the {what} {printable(str(most)[:80])}; remove all but "
                 "one of them, or export it again."
             )
-
-
-def _unposed(photographs: Path, used: set[Path]) -> tuple[list[str], list[str]]:
-    """Notes and warnings of photographs that the model does not have."""
-    there = without_masks(
-        [
-            Path(root) / name
-            for root, _, names in os.walk(photographs)
-            for name in names
-            if name.lower().endswith(ENDINGS) and not name.startswith(".")
-        ]
-    )
-    # Others hold masks or thumbnails.
-    folders = {path.parent for path in used}
-    there = [path for path in there if path.parent in folders]
-    left = sorted(path for path in there if path not in used)
-    if not left:
-        return [], []
-    said = [
-        f"{len(left)} of {len(there)} photographs in {printable(photographs.name)} are not in the "
-        f"model (first: {printable(left[0].relative_to(photographs).as_posix()[:80])})"
-    ]
-    return ([], said) if len(left) > UNPOSED * len(there) else (said, [])
 
 
 def load_colmap(
@@ -198,9 +171,9 @@ def load_colmap(
             f"photograph (first: {missing[0]})"
         )
     notes, larger = other_models(model, len(images), folder)
-    few, many = _unposed(photographs, {frame.path for frame in frames})
+    few, many = unnamed_photographs(photographs, {frame.path for frame in frames}, "the model")
     there, of_model = {frame.name for frame in frames}, {image.name for image in images}
-    splits, listed, lost = read_split_lists(folder, there, of_model)
+    splits, listed, lost = read_split_lists(folder, there, of_model, model)
     notes = [*notes, *few, *listed]
     warnings = [*warnings, *larger, *many, *lost]
     points = None

@@ -51,6 +51,9 @@ MODEL_NAMES = (
 )
 """By their numbers in cameras.bin."""
 
+HEAD = 4096
+"""Characters at the beginning of images.txt among which its comments are."""
+
 DIGITS = "0123456789+-.eE"
 NUMERIC = DIGITS + " \tnaif"
 """Of lines of numbers, which may be nan or inf."""
@@ -215,7 +218,9 @@ def cameras_of_text(file: Path) -> dict[int, ModelCamera]:
 
 def stated_images(file: Path) -> int:
     """How many images a comment of COLMAP's says there are; 0 where there is none."""
-    comment = re.search(r"^# Number of images: (\d{1,9})\b", file.read_text("utf-8"), re.MULTILINE)
+    with file.open(encoding="utf-8") as opened:
+        head = opened.read(HEAD)
+    comment = re.search(r"^# Number of images: (\d{1,9})\b", head, re.MULTILINE)
     return int(comment[1]) if comment else 0
 
 

@@ -141,27 +141,37 @@ def images_of(model: Path) -> list[ModelImage]:
 
 
 def other_models(model: Path, n: int, folder: Path) -> tuple[list[str], list[str]]:
-    """Notes and warnings of models beside that of n images that is read.
+    """Notes and warnings of other models of a scene, and of this one in its other form.
 
     Args:
         model: Which is read.
         n: How many images it has.
         folder: The scene's, which the others are named from.
     """
-    sizes = {path: size_of(path) for path in beside(model)}
-    if not sizes:
-        return [], []
+    elsewhere = [path for place in MODEL_FOLDERS for path in _models_in(folder / place)]
+    others = {path.resolve(): path for path in [*elsewhere, *beside(model)]}
+    sizes = {path: size_of(path) for place, path in others.items() if place != model.resolve()}
 
     def name(path: Path) -> str:
         place = os.path.relpath(path.resolve(), folder.resolve())
         return printable(Path(place).as_posix())
 
+    kind = model_kind(model)
+    stale = [
+        f"{name(model / f'images.{kind}')} of {n} images is read, and not images.{other}, which "
+        f"has {stated}; remove the files of the one that is out of date"
+        for other in _kinds(model)
+        if other != kind and (stated := _stated(model / f"images.{other}")) not in (0, n)
+    ]
+    if not sizes:
+        return [], stale
     rest = ", ".join(
         f"{name(path)} {'is damaged' if size is None else f'has {size}'}"
         for path, size in sizes.items()
     )
     said = [f"the model {name(model)} of {n} images is read; {rest}"]
-    return ([], said) if any(size is None or size > n for size in sizes.values()) else (said, [])
+    worse = any(size is None or size > n for size in sizes.values())
+    return ([], [*said, *stale]) if worse else (said, stale)
 
 
 def beside(model: Path) -> list[Path]:
@@ -174,11 +184,32 @@ def beside(model: Path) -> list[Path]:
 
 
 def model_kind(folder: Path) -> str | None:
-    """Whether a folder holds a model: "bin", "txt" or None."""
-    for kind in ("bin", "txt"):
-        if exists(folder / f"cameras.{kind}") and exists(folder / f"images.{kind}"):
-            return kind
-    return None
+    """Whether a folder holds a model: "bin", "txt" or None; of both the one of more images."""
+    kinds = _kinds(folder)
+    if len(kinds) < 2:
+        return kinds[0] if kinds else None
+    return max(kinds, key=lambda kind: _stated(folder / f"images.{kind}"))
+
+
+def _kinds(folder: Path) -> list[str]:
+    """In which forms a folder holds a model, binary first."""
+    return [
+        kind
+        for kind in ("bin", "txt")
+        if exists(folder / f"cameras.{kind}") and exists(folder / f"images.{kind}")
+    ]
+
+
+def _stated(file: Path) -> int:
+    """How many images a file of them says that it has; 0 where that cannot be read."""
+    try:
+        require_regular_file(file)
+        if file.suffix == ".txt":
+            return stated_images(file)
+        with file.open("rb") as opened:
+            return int.from_bytes(opened.read(8), "little")
+    except (InputError, OSError, UnicodeDecodeError):
+        return 0
 
 
 def scene_folder(model: Path) -> Path:

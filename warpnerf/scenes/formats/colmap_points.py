@@ -16,6 +16,7 @@ import numpy as np
 from warpnerf.checks import InputError
 from warpnerf.scenes.extent.points import Points, usable
 from warpnerf.scenes.files import exists, require_regular_file
+from warpnerf.scenes.formats.colmap_models import model_kind
 from warpnerf.scenes.formats.ply import read_ply
 
 HEAD_BYTES = 8 + 3 * 8 + 3 + 8
@@ -48,7 +49,8 @@ def read_points(model: Path, images: Mapping[int, str], folder: Path) -> Points 
         InputError: The file is damaged.
     """
     found: Points | None = None
-    for name, read in (("points3D.bin", _of_bytes), ("points3D.txt", _of_text)):
+    forms = [("points3D.bin", _of_bytes), ("points3D.txt", _of_text)]
+    for name, read in reversed(forms) if model_kind(model) == "txt" else forms:
         file = model / name
         if not exists(file):
             continue

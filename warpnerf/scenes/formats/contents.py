@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 import shlex
+from contextlib import suppress
 from pathlib import Path
 
 from warpnerf.checks import InputError
-from warpnerf.scenes.files import exists
+from warpnerf.scenes.files import exists, printable
 from warpnerf.scenes.formats import llff
-from warpnerf.scenes.formats.blender import SPLITS, split_file
-from warpnerf.scenes.formats.colmap_models import find_model
+from warpnerf.scenes.formats.blender import SPLITS, other_transforms, split_file
+from warpnerf.scenes.formats.colmap_models import find_model, model_kind
 from warpnerf.scenes.formats.found_photographs import is_written
 from warpnerf.scenes.formats.npz import is_scene_file, single_npz
 from warpnerf.scenes.formats.programs import exports_in
@@ -23,6 +25,26 @@ VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
 
 BESIDE_PHOTOGRAPHS = ("sparse/0", "sparse")
 """Where a model is looked for of which a file is missing."""
+
+UNREAD_POSES = (
+    *("*.nvm", "bundle*.out", "sfm_data.json", "*.sfm", "cameras.json", "*.psx", "*.rcproj"),
+    *("*.rsproj", "reconstruction.json", "opensfm/reconstruction.json", "pose/*.txt"),
+    "camera/*.json",
+)
+"""Files of poses that are not read: of VisualSFM, Bundler, OpenMVG, Meshroom, 3DGS, Metashape,
+RealityCapture, RealityScan, OpenSfM, NSVF and Nerfies."""
+
+PLACES_OF_TEXTS = ("*.csv", "*.txt", "*.xmp", "images/*.csv", "images/*.txt", "images/*.xmp")
+POSES_IN_TEXT = re.compile(
+    rb"omega\W+phi\W+kappa|heading\W+pitch\W+roll|yaw\W+pitch\W+roll|xcr:(rotation|position)",
+    re.IGNORECASE,
+)
+"""Texts in which poses are recognised by what they begin with, of Metashape and RealityCapture."""
+LOOKED_AT = 4096
+"""Bytes at the beginning of a text, and texts at a place, at most, that are looked at."""
+
+IMAGES = re.compile(r"images?(_\d{1,3})?|input|rgb|train|test|val", re.IGNORECASE)
+"""Folders of photographs in a scene's."""
 
 NEEDED = 3
 """Photographs, at least, whose poses can be estimated."""
@@ -66,13 +88,16 @@ def unread_photographs(folder: Path) -> list[Path]:
 def is_unposed(path: Path) -> bool:
     """Whether a path leads to what poses can be estimated of: photographs without any, a video.
 
-    A COLMAP model in any folder within is not skipped unasked.
+    Poses that can be read are not skipped unasked: other files of frames, a COLMAP model in any
+    folder within, a scene whose images/ the folder is.
     """
     if path.is_dir():
         posed = holds_scene(path) or _lacking(path, BESIDE_PHOTOGRAPHS) is not None
         if posed or len(photographs_in(path)) < NEEDED:
             return False
-        return all(find_model(inner) is None for inner in _entries(path) if inner.is_dir())
+        return _poses_nearby(path) is None and all(
+            find_model(inner) is None for inner in _entries(path) if inner.is_dir()
+        )
     return path.suffix.lower() in VIDEOS and exists(path)
 
 
@@ -93,7 +118,11 @@ def _what_is_there(folder: Path) -> str:
         if len(scenes) == 1:
             return f"its folder {scenes[0].name} holds one; use {first}"
         return f"{len(scenes)} of its folders hold one each (first: {scenes[0].name}); use {first}"
+    nearby = _poses_nearby(folder)
+    if nearby is not None:
+        return nearby
     photographs = photographs_in(folder)
+    unread = unread_photographs(folder)
     if photographs:
         n = len(photographs)
         lacking = _lacking(folder, BESIDE_PHOTOGRAPHS)
@@ -106,7 +135,7 @@ def _what_is_there(folder: Path) -> str:
             return (
                 f"it holds {n} photograph{'s' if n > 1 else ''}, and poses need at least {NEEDED}"
             )
-        return f"it holds {n} photographs without poses; estimate them by {pose_command(named)}"
+        return _unposed(folder, photographs, unread)
     half = _half_a_model(folder)
     if half:
         return half
@@ -114,20 +143,103 @@ def _what_is_there(folder: Path) -> str:
     if videos:
         first = shlex.quote(str(videos[0]))
         return f"it holds the video {videos[0].name}; make a scene of it by {pose_command(first)}"
-    unread = unread_photographs(folder)
     if unread:
         return f"it holds {len(unread)} photographs as {_kind(unread[0])}; convert them to JPEG"
-    deeper = [path for path in inner if photographs_in(path) and not is_written(path)]
+    deeper = {
+        path: len(photographs_in(path))
+        for path in inner
+        if photographs_in(path) and not is_written(path)
+    }
     if deeper:
-        first = shlex.quote(str(deeper[0]))
-        n = len(photographs_in(deeper[0]))
+        largest = max(deeper, key=lambda path: deeper[path])
+        command = pose_command(shlex.quote(str(largest)))
+        poses, name = _unread_poses(folder), largest.name
+        if poses:
+            return f"{poses}, or estimate others by {command}"
+        if len(deeper) > 1:
+            return (
+                f"{len(deeper)} of its folders hold {sum(deeper.values())} photographs without "
+                f"poses; copy them into one folder, or estimate those of {name} alone by {command}"
+            )
         return (
-            f"its folder {deeper[0].name} holds {n} photographs without poses; estimate them by "
-            f"{pose_command(first)}"
+            f"its folder {name} holds {deeper[largest]} photographs without poses; estimate them "
+            f"by {command}"
         )
+    poses = _unread_poses(folder)
+    if poses:
+        return poses
     if not _entries(folder):
         return "it is empty"
     return "it holds neither poses nor photographs nor a video"
+
+
+def _poses_nearby(folder: Path) -> str | None:
+    """What to say of poses that can be read, where the folder that was named leads to none."""
+    others = [*other_transforms(folder), *_scenes_as_npz(folder)]
+    if others:
+        named = ", ".join(printable(path.name) for path in others[:3])
+        return f"it holds {named}{', ...' if others[3:] else ''}; use {_quoted(others[0])}"
+    for place in _entries(folder):
+        models = [path for path in _folders(place) if model_kind(path) is not None]
+        if models and not holds_scene(place):
+            name = printable(models[0].relative_to(folder).as_posix())
+            return f"its COLMAP model is in {name}; use {_quoted(models[0])}"
+    above = folder.absolute().parent
+    if IMAGES.fullmatch(folder.name) and holds_scene(above):
+        return (
+            f"it is a folder of the scene {printable(above.name)}; use {_quoted(above)}, or "
+            f"estimate other poses by {pose_command(_quoted(folder))}"
+        )
+    return None
+
+
+def _scenes_as_npz(folder: Path) -> list[Path]:
+    return [path for path in _with_endings(folder, (".npz",)) if is_scene_file(path)]
+
+
+def _unposed(folder: Path, photographs: list[Path], unread: list[Path]) -> str:
+    """What to say of photographs without poses."""
+    n = len(photographs)
+    more = without_masks(_with_endings(folder / "images", llff.ENDINGS))
+    inside = photographs[0].parent != folder / "images" and len(more) > n
+    said = f"it holds {n} photographs without poses"
+    if inside:
+        said += f", and {len(more)} in images"
+    if unread:
+        said += f", and {len(unread)} as {_kind(unread[0])}, to be converted to JPEG"
+    command = pose_command(_quoted(folder / "images" if inside else folder))
+    poses = _unread_poses(folder)
+    if poses:
+        return f"{poses}, or estimate others by {command}"
+    return f"{said}; estimate {'those in images' if inside else 'them'} by {command}"
+
+
+def _unread_poses(folder: Path) -> str:
+    """What to say of poses in forms that are not read; empty: there are none."""
+    found: list[Path] = []
+    with suppress(OSError):
+        for pattern in UNREAD_POSES:
+            found += sorted(folder.glob(pattern))[:1]
+        for pattern in PLACES_OF_TEXTS:
+            texts = sorted(folder.glob(pattern))[:LOOKED_AT]
+            found += [path for path in texts if _begins_with_poses(path)][:1]
+    if not found:
+        return ""
+    named = ", ".join(printable(path.relative_to(folder).as_posix()) for path in found[:3])
+    return (
+        f"it holds poses in a form that is not read ({named}); export them for COLMAP, as "
+        "Metashape's XML, or as RealityCapture's internal and external camera parameters"
+    )
+
+
+def _begins_with_poses(text: Path) -> bool:
+    try:
+        if not text.is_file():
+            return False
+        with text.open("rb") as opened:
+            return POSES_IN_TEXT.search(opened.read(LOOKED_AT)) is not None
+    except OSError:
+        return False
 
 
 def pose_command(source: str) -> str:
@@ -166,6 +278,14 @@ def _entries(folder: Path) -> list[Path]:
         raise InputError(
             f"{folder}: the folder cannot be read ({error.strerror}); give access to it."
         ) from None
+
+
+def _folders(place: Path) -> list[Path]:
+    return [path for path in _entries(place) if path.is_dir()] if _readable(place) else []
+
+
+def _quoted(path: Path) -> str:
+    return printable(shlex.quote(str(path)))
 
 
 def _readable(folder: Path) -> bool:

@@ -19,6 +19,7 @@ from warpnerf.scenes.cameras.lens import Lens
 from warpnerf.scenes.files import IMAGE_SUFFIXES, exists, printable
 from warpnerf.scenes.formats.assemble import POSED, assemble
 from warpnerf.scenes.formats.frame import Frame
+from warpnerf.scenes.formats.left_over import points_beside
 from warpnerf.scenes.formats.llff import ENDINGS
 from warpnerf.scenes.images.depths import DepthFile
 from warpnerf.scenes.images.masks import without_masks
@@ -266,6 +267,7 @@ def scene_of(
     warnings = photographs.missing(file, len(entries), missing)
     few, many = photographs.unposed(file, {frame.path for frame in frames})
     notes, more = say()
+    points, tried = points_beside(photographs.folder)
     scene = assemble(
         folder=photographs.folder,
         file=file,
@@ -276,5 +278,6 @@ def scene_of(
         masks=reading.masks,
         keeping=reading.keeping,
         withhold=reading.withhold,
+        points=points,
     )
-    return replace(scene, notes=(*notes, *few, *_scaled_note(frames, stated), *scene.notes))
+    return replace(scene, notes=(*notes, *tried, *few, *_scaled_note(frames, stated), *scene.notes))

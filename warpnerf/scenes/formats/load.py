@@ -12,9 +12,9 @@ from typing import Any, get_args
 from warpnerf.checked import checked_arguments
 from warpnerf.checks import InputError, require_one_of
 from warpnerf.runtime.memory import require_threads
-from warpnerf.scenes.files import exists
+from warpnerf.scenes.files import exists, printable
 from warpnerf.scenes.formats import llff
-from warpnerf.scenes.formats.blender import SPLITS, load_blender, split_file
+from warpnerf.scenes.formats.blender import is_split, load_blender, split_file
 from warpnerf.scenes.formats.colmap import load_colmap
 from warpnerf.scenes.formats.colmap_models import find_model
 from warpnerf.scenes.formats.contents import VIDEOS, is_unposed, pose_command, what_is_there
@@ -106,7 +106,7 @@ def load_scene(
         return _load_part(path, how)
     if path.is_dir():
         return _load_folder(path, how)
-    if path.name in [split_file(split) for split in SPLITS]:
+    if is_split(path):
         return load_blender(path.parent, **how)
     if re.fullmatch(r"transforms.*\.json", path.name):
         return load_transforms(path, **how)
@@ -151,7 +151,14 @@ def _with_split(scene: Scene, split: Split | None) -> Scene:
 
 
 def _load_folder(folder: Path, how: dict[str, Any]) -> Scene:
-    scene = _first_of_folder(folder, how)
+    try:
+        scene = _first_of_folder(folder, how)
+    except InputError as error:
+        model = find_model(folder)
+        if model is None or not str(error).startswith(str(folder / "transforms")):
+            raise
+        way_out = f"or name the COLMAP model beside it, {printable(str(model))}"
+        raise InputError(f"{str(error).removesuffix('.')}; {way_out}.") from None
     others = forms_in(folder)[1:]
     if not others:
         return scene

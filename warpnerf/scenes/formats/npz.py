@@ -37,6 +37,11 @@ _DAMAGE = (
     RuntimeError,  # of unknown compressions and of encrypted archives
 )
 
+READ = ("images", "poses", "focal")
+"""Arrays of a scene."""
+SHOWN = 8
+"""Names of other arrays, at most, in a message."""
+
 MAX_SMALL = 2**26
 """Bytes of all poses, at most."""
 
@@ -75,6 +80,14 @@ def load_npz(
                 f"{file}: poses: must be [n, 4, 4] or [n, 3, 4], not {list(poses.shape)}."
             )
         images = _images(archive, file, len(poses))
+        unread = sorted({name.removesuffix(".npy") for name in archive.namelist()} - {*READ})
+    warnings = []
+    if unread:
+        shown = ", ".join(printable(name[:40]) for name in unread[:SHOWN])
+        warnings.append(
+            f"{file.name}: arrays that are not read: {shown}{', ...' if unread[SHOWN:] else ''}; "
+            "save a transforms.json, if the lens, the split, masks or depth are among them"
+        )
     lens = Lens(file=file, values={"fl_x": float(focal.item())}, fields={"fl_x": "focal"})
     digits = max(3, len(str(len(poses) - 1)))
     frames = [
@@ -92,7 +105,7 @@ def load_npz(
         file=file,
         frames=frames,
         splits={},
-        warnings=(),
+        warnings=warnings,
         downscale=downscale,
         masks=masks,
         keeping=keeping,

@@ -130,6 +130,8 @@ def _rows(file: Path) -> list[tuple[str, str, dict[str, float]]]:
         numbers = {}
         for column in (*NEEDED[1:], *OPTIONAL):
             word = given.get(column, "0")
+            if delimiter != "," and "." not in word:  # of a country with decimal commas
+                word = word.replace(",", ".")
             try:
                 numbers[column] = float(word)
             except ValueError:

@@ -12,7 +12,7 @@ from warpnerf.checks import InputError
 from warpnerf.scenes.cameras.poses import check_pose
 from warpnerf.scenes.files import exists, printable, read_json
 from warpnerf.scenes.formats import llff
-from warpnerf.scenes.formats.blender import SPLITS, split_file
+from warpnerf.scenes.formats.blender import SPLITS, is_split, other_transforms, split_file
 from warpnerf.scenes.formats.colmap_models import find_model, model_kind
 from warpnerf.scenes.formats.npz import is_scene_file, single_npz
 from warpnerf.scenes.formats.part import ENDING, read_part
@@ -21,6 +21,9 @@ from warpnerf.scenes.formats.transforms import FrameEntry, TransformsFile
 
 SINGLE_PRECISION = 1e-5
 """Error of a rotation that comes from being written in single precision."""
+
+SHOWN = 3
+"""Other files of frames, at most, that are named."""
 
 WITHOUT_EFFECT = {
     *("aabb_scale", "scale", "offset", "up", "n_frames", "sharpness", "colmap_im_id", "rotation"),
@@ -100,7 +103,7 @@ def _files(path: str | Path) -> tuple[str, list[Path]]:
         return "none", []
     if path.is_dir():
         return _files_of_folder(path)
-    if path.name in map(split_file, SPLITS):
+    if is_split(path):
         return _blender(path.parent)
     if path.name == llff.FILE:
         return f"LLFF ({llff.FILE})", []
@@ -137,6 +140,10 @@ def forms_in(folder: Path) -> list[str]:
     archive = single_npz(folder)
     if archive is not None and (not forms or is_scene_file(archive)):
         forms.append(f"npz ({printable(archive.name)})")
+    others = other_transforms(folder)
+    if forms and others:
+        more = f", ... ({len(others)})" if others[SHOWN:] else ""
+        forms.append(", ".join(printable(file.name) for file in others[:SHOWN]) + more)
     return forms
 
 

@@ -10,7 +10,9 @@ from: it turns the points of a COLMAP model with the cameras that it was applied
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -21,11 +23,15 @@ from warpnerf.scenes.cameras.lens import LensFields, read_lens
 from warpnerf.scenes.cameras.poses import check_pose
 from warpnerf.scenes.extent.points import Points, usable
 from warpnerf.scenes.files import exists, find_image, printable, read_json, resolve_inside
+from warpnerf.scenes.formats import left_over
 from warpnerf.scenes.formats.assemble import assemble
 from warpnerf.scenes.formats.colmap import points_beside
+from warpnerf.scenes.formats.colmap_models import find_model, size_of
 from warpnerf.scenes.formats.frame import Frame
 from warpnerf.scenes.formats.frame_images import find_images
 from warpnerf.scenes.formats.ply import read_ply
+from warpnerf.scenes.formats.split_lists import read_split_lists
+from warpnerf.scenes.formats.unnamed_photographs import unnamed_photographs
 from warpnerf.scenes.images.depths import DEFAULT_UNIT, DepthFile
 from warpnerf.scenes.images.masks import Mask
 from warpnerf.scenes.images.photographs import KEEPING, Keeping
@@ -83,9 +89,10 @@ def load_transforms(
 ) -> Scene:
     """Load a scene from a transforms.json.
 
-    The split is the file's ``{train,val,test}_filenames``, else every 8th image is for testing. Box
-    and content distance are those of the points of a COLMAP model in the folder whose cameras are
-    the same, or that ``ply_file_path`` names, where there are such.
+    The split is the file's ``{train,val,test}_filenames``, else that of lists beside it, else every
+    8th image is for testing. Box and content distance are those of the points of a COLMAP model in
+    the folder whose cameras are the same, or that ``ply_file_path`` names, or of the only .ply in
+    the folder, where there are such.
 
     Args:
         file: The file; image paths in it are relative to its folder and stay inside it.
@@ -99,12 +106,8 @@ def load_transforms(
     """
     folder = file.parent
     data, frames, warnings = read_frames(file)
-    unused = folder / "masks"
-    if masks is None and unused.is_dir() and not any(frame.mask for frame in frames):
-        warnings.append(
-            f"{unused} is not used, as no frame has a mask_path; --masks {unused} ignores what is "
-            "black there"
-        )
+    few, many = _unnamed(file, frames)
+    warnings += many
     names = {frame.name for frame in frames}
     splits: dict[str, set[str]] = {}
     for split in ("train", "val", "test"):
@@ -121,10 +124,17 @@ def load_transforms(
                 f"{split}_filenames (first: {absent[0]})"
             )
         splits[split] = members
+    listed_in: list[str] = []
+    if withhold is None and not any(splits.values()):
+        splits, listed_in, lost = read_split_lists(folder, names, names)
+        warnings += lost
     points, why_not = _points(file, data, frames)
     if why_not:
         warnings.append(why_not)
-    return assemble(
+    tried: list[str] = []
+    if points is None:
+        points, tried = left_over.points_beside(folder)
+    scene = assemble(
         folder=folder,
         file=file,
         frames=frames,
@@ -136,6 +146,22 @@ def load_transforms(
         withhold=withhold,
         points=points,
     )
+    return replace(scene, notes=(*few, *listed_in, *tried, *scene.notes))
+
+
+def _unnamed(file: Path, frames: Sequence[Frame]) -> tuple[list[str], list[str]]:
+    """Notes and warnings of photographs that the file does not name."""
+    folder = file.parent
+    photographs = [frame.path for frame in frames]
+    others = [of.path for frame in frames for of in (frame.mask, frame.depth) if of is not None]
+    root = folder / os.path.commonpath([path.relative_to(folder).parent for path in photographs])
+    few, many = unnamed_photographs(root, {*photographs, *others}, printable(file.name))
+    model = find_model(folder) if few or many else None
+    n = None if model is None else size_of(model)
+    if model is not None and n is not None and n > len(frames):
+        advice = f"; name {printable(str(model))} to read the COLMAP model, which has {n}"
+        few, many = ([said + advice for said in part] for part in (few, many))
+    return few, many
 
 
 def _points(file: Path, data: TransformsFile, frames: Sequence[Frame]) -> tuple[Points | None, str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -73,20 +73,23 @@ def without_masks(paths: Sequence[Path]) -> list[Path]:
 
 
 def mask_in(folder: Path, name: str) -> Mask | None:
-    """The mask of a photograph in a folder of masks, as COLMAP has it: NAME.jpg.png or NAME.png.
+    """The mask of a photograph in a folder of masks: NAME.jpg.png or NAME.png, as COLMAP has it, or
+    mask_NAME.png, or as ``mask_beside``.
 
     Args:
         folder: Of masks.
         name: The photograph's path relative to the folder of photographs, with /.
     """
     relative = PurePosixPath(name)
-    if relative.is_absolute() or ".." in relative.parts:
+    if relative.is_absolute() or ".." in relative.parts or not relative.name:
         return None
-    stem = relative.with_suffix("")
-    for path in (f"{name}.png", *(f"{stem}{suffix}" for suffix in SUFFIXES), name):
+    stems = relative.with_suffix(""), relative.with_name(f"mask_{relative.stem}")
+    own, prefixed = ([f"{stem}{suffix}" for suffix in SUFFIXES] for stem in stems)
+    for path in (f"{name}.png", *own, name, *prefixed):
         if os.path.isfile(folder / path):  # noqa: PTH113, never raises
             return Mask(folder / path)
-    return None
+    mask = mask_beside(folder / relative)
+    return None if mask is None else replace(mask, found=False)
 
 
 def masks_of_folder(folder: Path, names: Sequence[str]) -> list[Mask | None]:

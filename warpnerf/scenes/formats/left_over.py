@@ -1,0 +1,145 @@
+"""What lies in a scene's folder and is not read: masks, depth maps, points.
+
+No file of the scene names it, so it may have been meant to be used, or not.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Sequence
+from pathlib import Path, PurePath
+
+from warpnerf.checks import InputError
+from warpnerf.scenes.extent.points import Points, usable
+from warpnerf.scenes.files import printable, resolve_inside
+from warpnerf.scenes.formats.frame import Frame
+from warpnerf.scenes.formats.ply import read_ply
+from warpnerf.scenes.images.masks import SUFFIXES, masks_of_folder
+
+MASKS = re.compile(r"(.*[_-])?masks?", re.IGNORECASE)
+DEPTHS = re.compile(r"(.*[_-])?depths?([_-]?maps?)?", re.IGNORECASE)
+"""Names of folders of masks and of depth maps."""
+DEPTH_ENDINGS = (*SUFFIXES, ".npy", ".tif", ".tiff", ".exr", ".pfm")
+CLOUD_ENDINGS = (".ply", ".pcd", ".las", ".laz", ".e57")
+"""Of depth maps, and of clouds of points."""
+
+MAX_PLY_BYTES = 2**28
+"""Of points that no file names: larger ones would slow down the reading of a scene."""
+
+
+def unused_masks(folder: Path, frames: Sequence[Frame]) -> list[str]:
+    """Warnings of folders of masks that no frame has a mask of.
+
+    Args:
+        folder: The scene's.
+        frames: Of the scene, as its files say.
+    """
+    masks = [frame.mask.path for frame in frames if frame.mask is not None]
+    names = [frame.name for frame in frames]
+    warnings = []
+    for place in _unused(folder, frames, MASKS, masks, SUFFIXES):
+        shown = printable(shlex.quote(str(place)))
+        try:
+            masks_of_folder(place, names)
+            way_out = f"--masks {shown} ignores what is black there"
+        except InputError:
+            name = PurePath(names[0])
+            way_out = (
+                "none of its images is named after a photograph; name them as "
+                f"{printable(name.name)}.png or {printable(name.stem)}.png"
+            )
+        warnings.append(f"{shown} is not used, as no frame has a mask of it: {way_out}")
+    return warnings
+
+
+def unused_depths(folder: Path, frames: Sequence[Frame]) -> list[str]:
+    """Notes of folders of depth maps that no frame has one of.
+
+    Args:
+        folder: The scene's.
+        frames: Of the scene.
+    """
+    maps = [frame.depth.path for frame in frames if frame.depth is not None]
+    return [
+        f"the depth maps in {printable(place.relative_to(folder).as_posix())} are not read: "
+        "depth_file_path of a frame in transforms.json names one, to compare with"
+        for place in _unused(folder, frames, DEPTHS, maps, DEPTH_ENDINGS)
+    ]
+
+
+def points_beside(folder: Path) -> tuple[Points | None, list[str]]:
+    """The points of the only PLY file in a scene's folder, for a scene that names none.
+
+    Args:
+        folder: The scene's.
+
+    Returns:
+        The points, not checked, and a note of that; None where there is no such file, or it cannot
+        be read.
+    """
+    files = [path for path in _clouds(folder) if path.suffix.lower() == ".ply"]
+    if len(files) != 1 or files[0].stat().st_size > MAX_PLY_BYTES:
+        return None, []
+    name = files[0].name
+    try:
+        positions = read_ply(resolve_inside(folder, name, field=name))
+    except InputError:
+        return None, []
+    said = f"the points of {printable(name)}, the only .ply in the folder, are tried"
+    positions = positions[usable(positions)]
+    return Points(positions=positions, tracks=None, source=printable(name)), [said]
+
+
+def unused_points(folder: Path) -> list[str]:
+    """A note of clouds of points in the folder of a scene without points."""
+    names = [printable(path.name) for path in _clouds(folder)]
+    if not names:
+        return []
+    return [
+        f"not used as points: {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}; beside a "
+        "transforms.json or the cameras of a photogrammetric program a single .ply is, of at most "
+        f"{MAX_PLY_BYTES >> 20} MiB"
+    ]
+
+
+def _clouds(folder: Path) -> list[Path]:
+    return [path for path in files_in(folder) if path.suffix.lower() in CLOUD_ENDINGS]
+
+
+def _unused(
+    folder: Path,
+    frames: Sequence[Frame],
+    named: re.Pattern[str],
+    used: Sequence[Path],
+    endings: Sequence[str],
+) -> list[Path]:
+    """Folders of a scene of such a name that hold such files, and none that is used."""
+    photographs = [frame.path for frame in frames]
+    inside = {parent for path in (*photographs, *used) for parent in path.parents}
+    places = {folder}
+    for parent in {path.parent for path in photographs}:
+        while folder in parent.parents:
+            places.add(parent)
+            parent = parent.parent
+    return [
+        path
+        for place in sorted(places)
+        for path in _entries(place)
+        if named.fullmatch(path.name)
+        and path not in inside
+        and path.is_dir()
+        and any(file.suffix.lower() in endings for file in files_in(path))
+    ]
+
+
+def files_in(folder: Path) -> list[Path]:
+    """The files of a folder, by name, but hidden ones; none where it cannot be read."""
+    return [path for path in _entries(folder) if path.is_file()]
+
+
+def _entries(folder: Path) -> list[Path]:
+    try:
+        return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
+    except OSError:
+        return []
