@@ -19,7 +19,7 @@ from warpnerf.scenes.cameras.undistort import seen_pixels
 from warpnerf.scenes.extent.conventions import check_against_photographs
 from warpnerf.scenes.extent.points import Points, extent_by_points
 from warpnerf.scenes.files import by_number, exists
-from warpnerf.scenes.formats.frame import Frame, lens_notes, with_masks_beside
+from warpnerf.scenes.formats.frame import Frame, photograph_notes, with_masks_beside
 from warpnerf.scenes.formats.georeference import centred, in_words
 from warpnerf.scenes.formats.reduced import with_reduced
 from warpnerf.scenes.images.depths import Depth, read_depth
@@ -118,7 +118,9 @@ def assemble(
     left = [entry for entry in read if entry is not None]
     complete, mask_warnings = _without_masked(file, frames, left, complete)
     notes += _mask_notes(left)
-    notes += lens_notes([(entry.frame, entry.whole, entry.photograph.resampling) for entry in left])
+    notes += photograph_notes(
+        [(entry.frame, entry.whole, entry.photograph.resampling) for entry in left]
+    )
     warnings = [*warnings, *_transparency_warning(left)]
     kept = keep([entry.photograph for entry in left], keeping, file=file, downscale=downscale)
     views = [

@@ -7,7 +7,7 @@ import shlex
 from pathlib import Path
 
 from warpnerf.checks import InputError
-from warpnerf.scenes.files import exists
+from warpnerf.scenes.files import ENDINGS, exists
 from warpnerf.scenes.formats import llff
 from warpnerf.scenes.formats.blender import SPLITS, split_file
 from warpnerf.scenes.formats.colmap_models import find_model
@@ -51,7 +51,7 @@ def photographs_in(folder: Path) -> list[Path]:
         InputError: The folder cannot be read.
     """
     for place in (folder, folder / "images"):
-        photographs = without_masks(_with_endings(place, llff.ENDINGS))
+        photographs = without_masks(_with_endings(place, ENDINGS))
         if photographs:
             return photographs
     return []
