@@ -53,8 +53,8 @@ class Photographs:
         self._by_name: dict[str, list[Path]] = {}
         self._by_stem: dict[str, list[Path]] = {}
         for path in self.paths:
-            self._by_name.setdefault(folded(path.name), []).append(path)
-            self._by_stem.setdefault(folded(path.stem), []).append(path)
+            self._by_name.setdefault(normalised(path.name), []).append(path)
+            self._by_stem.setdefault(normalised(path.stem), []).append(path)
 
     def find(
         self, name: str, field: str, fits: Callable[[Path], bool] = lambda path: True
@@ -70,12 +70,12 @@ class Photographs:
             InputError: Several photographs have that name.
         """
         *folders, last = name.replace("\\", "/").split("/")
-        for key in dict.fromkeys([folded(last), folded(without_ending(last))]):
+        for key in dict.fromkeys([normalised(last), normalised(without_ending(last))]):
             found = self._by_name.get(key) or self._by_stem.get(key, [])
             found = [path for path in found if fits(path)]
             while len(found) > 1 and folders:
-                below = folded(folders.pop())
-                found = [path for path in found if folded(path.parent.name) == below] or found
+                below = normalised(folders.pop())
+                found = [path for path in found if normalised(path.parent.name) == below] or found
             if len(found) > 1:
                 first, second = (self.name(path) for path in found[:2])
                 raise InputError(
@@ -121,7 +121,7 @@ class Photographs:
         return ([], said) if len(left) > UNPOSED * len(self.paths) else (said, [])
 
 
-def folded(name: str) -> str:
+def normalised(name: str) -> str:
     """A name for comparing: upper and lower case, and composed and decomposed accents, are one."""
     return unicodedata.normalize("NFC", name).casefold()
 

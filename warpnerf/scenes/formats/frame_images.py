@@ -16,7 +16,7 @@ from warpnerf.scenes.files import (
     printable,
     resolve_inside,
 )
-from warpnerf.scenes.formats.found_photographs import Photographs, folded, without_ending
+from warpnerf.scenes.formats.found_photographs import Photographs, normalised, without_ending
 
 REDUCED = re.compile(r"images_\d{1,3}", re.IGNORECASE)
 """Folders of a scene's photographs, reduced."""
@@ -166,7 +166,7 @@ def find_photographs(
 def _is_named(name: str, converted: bool, path: Path) -> bool:
     """Whether a photograph of some name may be one of that name, perhaps in another format."""
     has_ending = without_ending(name) != name
-    return converted or not has_ending or folded(path.name) == folded(name)
+    return converted or not has_ending or normalised(path.name) == normalised(name)
 
 
 def others_there(folder: Path) -> str:
@@ -189,4 +189,4 @@ def _agree(folder: Path, name: str, path: Path) -> bool:
 
 def _parts(name: str) -> list[str]:
     *folders, last = plain_name(name).split("/")
-    return [folded(part) for part in folders if part] + [folded(without_ending(last))]
+    return [normalised(part) for part in folders if part] + [normalised(without_ending(last))]
