@@ -19,6 +19,12 @@ REALITY_LENS = f"{PROGRAMS}reality_lens"
 USED = "scenes/test_reduced.py::test_reduced_photographs_are_used"
 NOT_USED = "scenes/test_reduced.py::test_others_are_not_used_and_said"
 
+IMAGES = "scenes/test_frame_images.py::test_"
+NAMED = f"{IMAGES}photographs_are_found_by_their_names"
+SCALED = "scenes/test_lens.py::test_a_lens_is_scaled_to_resized_photographs"
+NOT_RESIZED = "scenes/test_lens.py::test_other_photographs_are_no_resized_ones"
+
+LENS, FRAME_IMAGES = "scenes/cameras/lens.py", "scenes/formats/frame_images.py"
 LENSES, BROWN = "scenes/cameras/foreign.py", "scenes/cameras/brown.py"
 RESAMPLING = "scenes/images/resampling.py"
 POLYCAM, RECORD3D, METASHAPE, REALITY, FOUND, REDUCED = (
@@ -140,10 +146,75 @@ MUTANTS = [
     ),
     of_host(
         "another size: not scaled",
-        FOUND,
-        "across, along = size[0] / width, size[1] / height",
+        LENS,
+        "across, along = width / stated[0], height / stated[1]",
         "across = along = 1.0",
         f"{PROGRAMS}record3d_lens_is_scaled_to_its_photographs",
+    ),
+    of_host("another size: by one factor", LENS, '"fl_y": along', '"fl_y": across', SCALED),
+    of_host(
+        "another size: of any shape",
+        LENS,
+        "abs(width * h - height * w) > max(w, h)",
+        "False",
+        NOT_RESIZED,
+    ),
+    of_host(
+        "another size: of the lens already",
+        LENS,
+        "abs(centre - stated / 2) >= abs(centre - size / 2)",
+        "False",
+        NOT_RESIZED,
+    ),
+    of_host("names: no normal form", FOUND, 'unicodedata.normalize("NFC", name)', "name", NAMED),
+    of_host(
+        "names: of any folder",
+        FRAME_IMAGES,
+        "n > 0 and named[-n:] == there[-n:]",
+        "named[-1:] == there[-1:]",
+        f"{IMAGES}photographs_of_other_names_are_mentioned",
+    ),
+    of_host(
+        "names: taken twice",
+        FRAME_IMAGES,
+        "if owner != names[index]:",
+        "if False:",
+        f"{IMAGES}what_is_not_certain_is_refused",
+    ),
+    of_host(
+        "names: of another frame",
+        FRAME_IMAGES,
+        'owners = dict.fromkeys(found.values(), "")',
+        "owners: dict[Path, str] = {}",
+        f"{IMAGES}what_another_name_leads_to_is_not_taken",
+    ),
+    of_host(
+        "names: always of another format",
+        FRAME_IMAGES,
+        "return converted or",
+        "return True or",
+        f"{IMAGES}another_format_is_not_taken_where_others_have_the_files",
+    ),
+    of_host(
+        "names: a few from elsewhere",
+        FRAME_IMAGES,
+        "in () if found else dict",
+        "in dict",
+        f"{IMAGES}photographs_elsewhere_are_not_taken_for_a_few_that_are_missing",
+    ),
+    of_host(
+        "names: a link out",
+        FRAME_IMAGES,
+        "resolve_inside(base, path.relative_to(base).as_posix(), field=field(index))",
+        "pass",
+        f"{IMAGES}what_is_not_certain_is_refused",
+    ),
+    of_host(
+        "photographs: those of macOS",
+        "scenes/files.py",
+        'and not name.startswith(".")',
+        "",
+        "scenes/test_llff.py::test_photographs_are_found_and_those_of_macos_are_none",
     ),
     of_host("Metashape: axes of OpenGL", METASHAPE, "pose * [1.0, -1.0, -1.0, 1.0]", "pose", SAME),
     of_host(

@@ -157,18 +157,30 @@ def test_reduced_photographs_have_a_reduced_lens(tmp_path: Path) -> None:
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (5.0, 5.5, 2.125, 1.375)
 
 
+def test_photographs_resized_in_place_scale_the_lens(tmp_path: Path) -> None:
+    model = scene_with_model(tmp_path, text=True)
+    change(model / "cameras.txt", "8 6 10.0 11.0 4.25 2.75", "32 24 40.0 44.0 17.0 11.0")
+    scene = load_scene(tmp_path)
+    camera = scene.views[0].camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (10.0, 11.0, 4.25, 2.75)
+    said = "4 of 4 photographs are of another size than their lenses were for (first: 000.png 8x6, "
+    assert any(note.startswith(f"{said}the lens 32x24)") for note in scene.notes)
+
+
 @pytest.mark.parametrize(
     ("size", "reduced"),
     [((3115, 2078), (1558, 1039)), ((3118, 2078), (780, 520)), ((4946, 3286), (1237, 822))],
 )
 def test_reduced_photographs_have_whole_pixels(
-    tmp_path: Path, size: tuple[int, int], reduced: tuple[int, int]
+    size: tuple[int, int], reduced: tuple[int, int]
 ) -> None:
-    # size * (reduced / size) misses one of these sides by its last bit.
-    camera = colmap_files.ModelCamera("SIMPLE_PINHOLE", *size, (900.0, 1000.0, 500.0))
-    Image.new("L", reduced).save(tmp_path / "a.png")
-    lens = colmap._lens(Path("cameras.bin"), 1, camera, tmp_path / "a.png", True)
-    assert (lens.values["w"], lens.values["h"]) == reduced
+    camera = colmap_files.ModelCamera("SIMPLE_PINHOLE", *size, (900.0, size[0] / 2, size[1] / 2))
+    lens = colmap._lens(Path("cameras.bin"), 1, camera)
+    assert lens.was_for(*reduced) == size
+    width, height = reduced
+    made = lens.camera(width=width, height=height, c2w=np.eye(3, 4), image="a.png")
+    assert (made.cx, made.cy) == pytest.approx((width / 2, height / 2))
+    assert made.fx == pytest.approx(900.0 * width / size[0])
 
 
 @pytest.mark.parametrize("stated", [None, 4, 9])
@@ -239,7 +251,7 @@ def empty_model(model: Path) -> None:
         (all_around, "camera 7: the lens EQUIRECTANGULAR is not modelled; undistort"),
         (other_camera, "its camera 8 is not in cameras.txt"),
         (no_photographs, r"none of the model\'s 4 photographs is in .*images .first: 000.png"),
-        (no_folder, "photographs are not there; put them into (?!.*sparse).*images"),
+        (no_folder, r"photographs is in (?!.*sparse/0/images).*images .first.*; put them there"),
         (other_size, "is for images of 9x6 pixels, but 000.png has 8x6"),
         (few_parameters, "a PINHOLE has 4 parameters, not 3"),
         (no_number, "line 2: is no camera as COLMAP writes it"),

@@ -132,8 +132,8 @@ def test_numbered_captures_are_not_models_of_one_scene(tmp_path: Path) -> None:
     assert not [said for said in (*scene.notes, *scene.warnings) if "the model" in said]
     with pytest.raises(InputError, match=r"2 of its folders hold one each \(first: 1\)"):
         load_scene(tmp_path)
-    (tmp_path / "1" / "images").rename(tmp_path / "1" / "elsewhere")
-    with pytest.raises(InputError, match=r"put them into .*/1/images"):
+    (tmp_path / "1" / "images").rename(tmp_path / "elsewhere")
+    with pytest.raises(InputError, match=r"is in .*/1/images .*; put them there"):
         load_scene(tmp_path / "1")
 
 

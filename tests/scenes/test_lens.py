@@ -77,6 +77,52 @@ def test_of_two_kinds_of_lenses_the_model_is_used(model: str, flag: bool) -> Non
     )
 
 
+RESIZED = LensFields(fl_x=20.0, fl_y=22.0, cx=8.5, cy=5.5, w=16.0, h=12.0, k1=0.01)
+
+
+@pytest.mark.parametrize(
+    ("lens", "scale"),
+    [
+        (RESIZED, 0.5),
+        (msgspec.structs.replace(RESIZED, h=11.0), 0.5),  # rounded up
+        (LensFields(fl_x=5.0, fl_y=5.5, cx=2.125, cy=1.375, w=4.0, h=3.0), 2.0),
+    ],
+)
+def test_a_lens_is_scaled_to_resized_photographs(lens: LensFields, scale: float) -> None:
+    result = camera(lens)
+    along = 6.0 / lens.h if lens.h else 0.0
+    assert (result.fx, result.cx) == (scale * (lens.fl_x or 0.0), scale * (lens.cx or 0.0))
+    assert (result.fy, result.cy) == pytest.approx(
+        (along * (lens.fl_y or 0.0), along * (lens.cy or 0.0))
+    )
+    assert result.k1 == (lens.k1 or 0.0)
+    stated = read_lens(FILE, [("$", lens)]).was_for(8, 6)
+    assert stated == (lens.w, lens.h)
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "changes"),
+    [
+        (160, 120, {}),
+        (140, 120, {}),  # cut off at one side
+        (159, 120, {}),
+        (120, 160, {}),
+        (80, 62, {}),
+        (80, 60, {"cx": 41.0, "cy": 29.0}),  # of the small ones already
+        (80, 60, {"cy": None}),
+        (80, 60, {"w": None}),
+        (80, 60, {"w": 0.0, "h": 0.0}),
+    ],
+)
+def test_other_photographs_are_no_resized_ones(
+    width: int, height: int, changes: dict[str, float | None]
+) -> None:
+    fields = LensFields(fl_x=200.0, cx=82.0, cy=58.0, w=160.0, h=120.0)
+    lens = read_lens(FILE, [("$", msgspec.structs.replace(fields, **changes))])
+    assert lens.was_for(80, 60) == (None if changes else (160.0, 120.0))
+    assert lens.was_for(width, height) is None
+
+
 @pytest.mark.parametrize(
     "model", ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"]
 )
@@ -121,7 +167,10 @@ def test_known_models_are_accepted(model: str) -> None:
         (LensFields(fl_x=4.0, is_fisheye=True, k1=-4.0), r"\.k1 = -4 folds over within the image"),
         (LensFields(fl_x=10.0, w=16.0, h=12.0), r"\.w: .* 16x12 pixels, but a\.png has 8x6"),
         (LensFields(fl_x=10.0, w=8.0, h=12.0), r"\.h: .* 8x12 pixels, but a\.png has 8x6"),
-        (LensFields(fl_x=10.0, w=6.0, h=8.0), r"\.w: .* 6x8 pixels, but a\.png has 8x6"),
+        (
+            LensFields(fl_x=10.0, w=6.0, h=8.0),
+            r"\.w: .* 6x8 pixels, but a\.png has 8x6: either it is stored turned, .* exchanged",
+        ),
         (LensFields(fl_x=4.0, k1=-0.5), r"\.k1 = -0\.5 folds over within the image a\.png"),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -59,6 +60,31 @@ def test_masks_beside_photographs_are_no_photographs(tmp_path: Path) -> None:
     assert len(scene.views) == 4
     (mask,) = [view.mask for view in scene.views if view.mask is not None]
     assert np.array_equal(mask, np.eye(6, 8, dtype=bool))
+
+
+@pytest.mark.parametrize("place", ["images", ".", "rgb", "input"])
+def test_photographs_are_found_and_those_of_macos_are_none(tmp_path: Path, place: str) -> None:
+    write_llff(tmp_path)
+    (tmp_path / place).mkdir(exist_ok=True)
+    for file in sorted((tmp_path / "images").iterdir()):
+        file.rename(tmp_path / place / file.name)
+        (tmp_path / place / f"._{file.name}").write_bytes(b"\0\5\x16\7")
+    if place != "images":
+        (tmp_path / "images").rmdir()
+    assert len(load_scene(tmp_path).views) == 4
+
+
+def test_photographs_of_several_folders_are_in_no_order(tmp_path: Path) -> None:
+    write_llff(tmp_path)
+    (tmp_path / "images").rename(tmp_path / "left")
+    (tmp_path / "right").mkdir()
+    (tmp_path / "left/003.png").rename(tmp_path / "right/000.png")
+    with pytest.raises(InputError, match=r"in 2 folders \(first: left, right\); put those of"):
+        load_scene(tmp_path)
+    for name in ("left", "right"):
+        shutil.rmtree(tmp_path / name)
+    with pytest.raises(InputError, match="photographs are not there; put them into images/"):
+        load_scene(tmp_path)
 
 
 @pytest.mark.parametrize("near", [0.0, -1.0])

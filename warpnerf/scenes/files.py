@@ -28,6 +28,13 @@ MAX_DIGITS = 300
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 """Tried in this order where a scene file leaves the extension out."""
 
+ENDINGS = (*IMAGE_SUFFIXES, ".webp", ".tif", ".tiff", ".bmp", ".ppm")
+"""Of photographs that are read, lower case."""
+
+
+class OutsideError(InputError):
+    """A path out of a scene file that leaves the scene's folder, but not through a link."""
+
 
 def read_json(
     path: Path,
@@ -177,7 +184,8 @@ def resolve_inside(folder: Path, relative: str, *, field: str) -> Path:
         field: File and field that the path comes from, for the message.
 
     Raises:
-        InputError: The path leaves the folder: by .., by being absolute, or through a link.
+        InputError: The path leaves the folder through a link.
+        OutsideError: It does by .., or by being absolute.
     """
     text = relative.replace("\\", "/")
     # Control characters in a name are no file's of ours, and would steer a terminal.
@@ -199,7 +207,7 @@ def resolve_inside(folder: Path, relative: str, *, field: str) -> Path:
         ) from None
     if outside or linked:
         how = "follows a link out of" if linked else "leaves"
-        raise InputError(
+        raise (InputError if linked else OutsideError)(
             f"{field}: {_quoted(relative)} {how} the scene's folder {folder}; copy the file into "
             "that folder."
         )
@@ -239,16 +247,25 @@ def photograph_folder(folder: Path) -> Path | None:
         folder: The scene's.
 
     Returns:
-        images/, or else the largest ones of images_2/, images_4/, ...; None where there are none.
+        The first that holds some of images/, images_2/, images_4/, ..., and 3DGS's input/; else the
+        first that is there; None where none is.
     """
-    if (folder / "images").is_dir():
-        return folder / "images"
     try:
-        reduced = [path for path in folder.glob("images_*") if path.is_dir()]
+        reduced = [p for p in folder.glob("images_*") if re.fullmatch(r"images_\d{1,3}", p.name)]
     except OSError:
-        return None
-    sizes = {int(m[1]): p for p in reduced if (m := re.fullmatch(r"images_(\d{1,3})", p.name))}
-    return sizes[min(sizes)] if sizes else None
+        reduced = []
+    reduced.sort(key=lambda path: by_number(path.name))
+    places = [p for p in (folder / "images", *reduced, folder / "input") if p.is_dir()]
+    return next(filter(_holds_photographs, places), places[0] if places else None)
+
+
+def is_photograph(name: str) -> bool:
+    """Whether a file has a photograph's name; macOS keeps other things in ._NAME.jpg."""
+    return name.lower().endswith(ENDINGS) and not name.startswith(".")
+
+
+def _holds_photographs(folder: Path) -> bool:
+    return any(is_photograph(name) for _, _, names in os.walk(folder) for name in names)
 
 
 def by_number(name: str) -> tuple[tuple[str | int, ...], str]:

@@ -106,9 +106,9 @@ class Lens:
         fl = size / (2 tan(angle / 2)); without fl_y fl_y = fl_x; without cx, cy the middle.
 
         Raises:
-            InputError: The file states another size, or the distortion folds the image over.
+            InputError: The file states another shape, or the distortion folds the image over.
         """
-        values = self.values
+        values = self._values(width, height)
         for key, size in (("w", width), ("h", height)):
             if key in values and values[key] != size:
                 stated = f"{values.get('w', width):g}x{values.get('h', height):g}"
@@ -116,8 +116,13 @@ class Lens:
                 raise InputError(
                     f"{self.file}: {self.fields[key]}: the file is for images of {stated} pixels, "
                     f"but {image} has {width}x{height}"
-                    + (" as stored, without its EXIF rotation" if turned else "")
-                    + "; use the original images, or change w, h, fl_x, fl_y, cx and cy with them."
+                    + (
+                        ": either it is stored turned, so save the images upright, without an EXIF "
+                        "rotation, or width and height are exchanged in the file."
+                        if turned
+                        else "; use the original images, or change w, h, fl_x, fl_y, cx and cy "
+                        "with them."
+                    )
                 )
         fx, fy = self._focal_lengths(width, height)
         camera = Camera(
@@ -168,7 +173,8 @@ class Lens:
             return None
         width, height = camera.width, camera.height
         fx, fy = self._focal_lengths(width, height)
-        cx, cy = self.values.get("cx", width / 2), self.values.get("cy", height / 2)
+        values = self._values(width, height)
+        cx, cy = values.get("cx", width / 2), values.get("cy", height / 2)
         plane = ImagePlane(width, height, fx, fy, cx, cy)
         found = fitted(self.foreign, plane)
         if found is None:
@@ -184,7 +190,7 @@ class Lens:
         """In what the file contradicts itself, for an image of a size, and what is used; or ""."""
         for place, angle in self.angles.items():
             axis, size = ("x", width) if place.endswith("x") else ("y", height)
-            used, other = self.values[f"fl_{axis}"], _focal_length(angle, size)
+            used, other = self._values(width, height)[f"fl_{axis}"], _focal_length(angle, size)
             if abs(other - used) > MAX_DIFFERENCE * used:
                 return (
                     f"{self.fields[f'fl_{axis}']} is {used:.4g} pixels, which is used, but by "
@@ -193,14 +199,41 @@ class Lens:
                 )
         return self.doubt
 
+    def was_for(self, width: int, height: int) -> tuple[float, float] | None:
+        """The size that the file states, where an image is one of that size that was resized; else
+        None.
+
+        Both sides have then changed, by the same factor, to a pixel; and the principal point tells
+        that the lens is for the stated size: it is nearer to the middle of that.
+        """
+        w, h = self.values.get("w", 0.0), self.values.get("h", 0.0)
+        if min(w, h) < 1.0 or abs(width * h - height * w) > max(w, h):
+            return None
+        for name, stated, size in (("cx", w, width), ("cy", h, height)):
+            centre = self.values.get(name, size / 2)
+            if abs(centre - stated / 2) >= abs(centre - size / 2):
+                return None
+        return w, h
+
+    def _values(self, width: int, height: int) -> Mapping[str, float]:
+        """``values`` for an image of ``width`` by ``height`` pixels, which may be resized."""
+        stated = self.was_for(width, height)
+        if stated is None:
+            return self.values
+        across, along = width / stated[0], height / stated[1]
+        factors = {"fl_x": across, "cx": across, "fl_y": along, "cy": along}
+        scaled = {key: value * factors.get(key, 1.0) for key, value in self.values.items()}
+        return {**scaled, "w": width, "h": height}
+
     def _focal_lengths(self, width: int, height: int) -> tuple[float, float]:
         """Focal lengths along u and v, pixels; one stands in for the other where it is missing."""
+        values = self._values(width, height)
         lengths = {}
         for axis, size in (("x", width), ("y", height)):
-            if f"fl_{axis}" in self.values:
-                lengths[axis] = self.values[f"fl_{axis}"]
-            elif f"camera_angle_{axis}" in self.values:
-                lengths[axis] = _focal_length(self.values[f"camera_angle_{axis}"], size)
+            if f"fl_{axis}" in values:
+                lengths[axis] = values[f"fl_{axis}"]
+            elif f"camera_angle_{axis}" in values:
+                lengths[axis] = _focal_length(values[f"camera_angle_{axis}"], size)
         (any_length, *_) = lengths.values()
         return lengths.get("x", any_length), lengths.get("y", any_length)
 

@@ -21,7 +21,7 @@ from warpnerf.scenes.extent.given_depths import believed_bounds, doubted_depths
 from warpnerf.scenes.extent.masked import inverted_masks, mask_notes
 from warpnerf.scenes.extent.points import Points, extent_by_points
 from warpnerf.scenes.files import by_number, exists
-from warpnerf.scenes.formats.frame import Frame, lens_notes, lens_warnings, with_masks_beside
+from warpnerf.scenes.formats.frame import Frame, lens_warnings, photograph_notes, with_masks_beside
 from warpnerf.scenes.formats.georeference import centred, in_words
 from warpnerf.scenes.formats.left_over import unused_depths, unused_masks, unused_points
 from warpnerf.scenes.formats.reduced import with_reduced
@@ -120,7 +120,9 @@ def assemble(
         turned = list(pool.map(_may_lie, frames))
     left = [entry for entry in read if entry is not None]
     complete, mask_warnings = _without_masked(file, frames, left, complete)
-    notes += lens_notes([(entry.frame, entry.whole, entry.photograph.resampling) for entry in left])
+    notes += photograph_notes(
+        [(entry.frame, entry.whole, entry.photograph.resampling) for entry in left]
+    )
     warnings = [*warnings, *lens_warnings([(entry.frame, entry.whole) for entry in left])]
     warnings += _transparency_warning(left)
     kept = keep([entry.photograph for entry in left], keeping, file=file, downscale=downscale)

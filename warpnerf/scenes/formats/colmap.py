@@ -21,7 +21,6 @@ from warpnerf.scenes.cameras.lens import Lens
 from warpnerf.scenes.cameras.poses import check_pose
 from warpnerf.scenes.extent.points import Points
 from warpnerf.scenes.files import (
-    find_image,
     photograph_folder,
     printable,
     require_regular_file,
@@ -48,9 +47,9 @@ from warpnerf.scenes.formats.colmap_models import (
 )
 from warpnerf.scenes.formats.colmap_points import UnusablePlyError, read_points
 from warpnerf.scenes.formats.frame import Frame
+from warpnerf.scenes.formats.frame_images import find_photographs, others_there
 from warpnerf.scenes.formats.split_lists import read_split_lists
 from warpnerf.scenes.formats.unnamed_photographs import unnamed_photographs
-from warpnerf.scenes.images.images import image_size
 from warpnerf.scenes.images.masks import mask_in
 from warpnerf.scenes.images.photographs import KEEPING, Keeping
 from warpnerf.scenes.scene import Scene
@@ -118,31 +117,36 @@ def load_colmap(
         way_out = f"or name another model of the scene, such as {printable(str(others[0]))}"
         raise InputError(f"{str(error).removesuffix('.')}; {way_out}.") from None
     folder = scene_folder(model)
-    photographs = photograph_folder(folder)
-    if photographs is None:
-        raise InputError(
-            f"{folder}: the model's photographs are not there; put them into {folder / 'images'}."
-        )
+    photographs = photograph_folder(folder) or folder
+
+    def field_of(index: int) -> str:
+        return f"{image_file}: image {printable(images[index].name[:80])!r}"
+
+    found, moved = find_photographs(folder, photographs, [i.name for i in images], field_of)
     frames: list[Frame] = []
     missing: list[str] = []
-    for image in images:
-        field = f"{image_file}: image {printable(image.name[:80])!r}"
-        path = find_image(photographs, image.name, field=field)
+    names = {image.name: image.name for image in images}
+    for index, image in enumerate(images):
+        field, path = field_of(index), found.get(index)
         if path is None or not PurePosixPath(image.name).name:  # such as "."
             missing.append(printable(image.name[:80]))
             continue
         if image.camera not in cameras:
             raise InputError(f"{field}: its camera {image.camera} is not in {camera_file.name}.")
-        camera, reduced = cameras[image.camera], photographs.name != "images"
-        lens = _lens(camera_file, image.camera, camera, path, reduced)
-        mask = mask_in(folder / "masks", image.name)
+        lens = _lens(camera_file, image.camera, cameras[image.camera])
+        called = ""
+        if index in moved:
+            base = photographs if path.is_relative_to(photographs) else folder
+            called, names[image.name] = image.name, path.relative_to(base).as_posix()
+        name, pose = names[image.name], _pose(image, field)
+        mask = mask_in(folder / "masks", name) or mask_in(folder / "masks", image.name)
         mask = None if mask is None else replace(mask, found=True)
-        pose = _pose(image, field)
-        frames.append(Frame(name=image.name, path=path, c2w=pose, lens=lens, mask=mask))
+        frames.append(Frame(name=name, path=path, c2w=pose, lens=lens, mask=mask, called=called))
     if not frames:
+        place = folder / "images" if photographs == folder else photographs
         raise InputError(
-            f"{image_file}: none of the model's {len(images)} photographs is in {photographs} "
-            f"(first: {missing[0] if missing else 'none'}); put them there."
+            f"{image_file}: none of the model's {len(images)} photographs is in {place} (first: "
+            f"{missing[0] if missing else 'none'}){others_there(folder)}; put them there."
         )
     warnings = []
     stated = 0 if kind == "bin" else stated_images(image_file)
@@ -172,13 +176,15 @@ def load_colmap(
         )
     notes, larger = other_models(model, len(images), folder)
     few, many = unnamed_photographs(photographs, {frame.path for frame in frames}, "the model")
-    there, of_model = {frame.name for frame in frames}, {image.name for image in images}
-    splits, listed, lost = read_split_lists(folder, there, of_model, model)
+    used = {frame.name for frame in frames}
+    there = {name for name in names if names[name] in used}
+    splits, listed, lost = read_split_lists(folder, there, set(names), model)
+    splits = {split: {names[name] for name in members} for split, members in splits.items()}
     notes = [*notes, *few, *listed]
     warnings = [*warnings, *larger, *many, *lost]
     points = None
     try:
-        points = read_points(model, {image.number: image.name for image in images}, folder)
+        points = read_points(model, {image.number: names[image.name] for image in images}, folder)
     except UnusablePlyError as error:
         warnings.append(f"no points: {error}")
     scene = assemble(
@@ -281,8 +287,8 @@ def _pose(image: ModelImage, field: str) -> np.ndarray:
     return check_pose(c2w.tolist(), field=field)
 
 
-def _lens(file: Path, number: int, camera: ModelCamera, photograph: Path, reduced: bool) -> Lens:
-    """A camera as a lens for a photograph, which is smaller than the model says if reduced."""
+def _lens(file: Path, number: int, camera: ModelCamera) -> Lens:
+    """A camera as a lens."""
     place = f"camera {number}"
     if camera.model not in PARAMETERS:
         raise InputError(
@@ -305,16 +311,7 @@ def _lens(file: Path, number: int, camera: ModelCamera, photograph: Path, reduce
             values[name] = value
     if min(values["fl_x"], values["fl_y"]) <= 0.0 or min(camera.width, camera.height) < 1:
         raise InputError(f"{file}: {place}: its size and focal lengths must be above 0.")
-    size = camera.width, camera.height
-    if reduced:
-        width, height = image_size(photograph)
-        # Sides are rounded to whole pixels, so that one may be off by one.
-        if abs(width / camera.width * camera.height - height) <= 1.0:
-            size = width, height
-    across, along = size[0] / camera.width, size[1] / camera.height
-    for name, factor in (("fl_x", across), ("cx", across), ("fl_y", along), ("cy", along)):
-        values[name] *= factor
-    values |= {"w": size[0], "h": size[1]}
+    values |= {"w": camera.width, "h": camera.height}
     foreign = None
     if camera.model in MODELS:
         rest = [name for name in names if name not in ("fl", "fl_x", "fl_y", "cx", "cy")]

@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from warpnerf.checks import InputError
-from warpnerf.scenes.files import exists, printable
+from warpnerf.scenes.files import ENDINGS, exists, printable
 from warpnerf.scenes.formats import llff
 from warpnerf.scenes.formats.blender import SPLITS, other_transforms, split_file
 from warpnerf.scenes.formats.colmap_models import find_model, model_kind
@@ -73,7 +73,7 @@ def photographs_in(folder: Path) -> list[Path]:
         InputError: The folder cannot be read.
     """
     for place in (folder, folder / "images"):
-        photographs = without_masks(_with_endings(place, llff.ENDINGS))
+        photographs = without_masks(_with_endings(place, ENDINGS))
         if photographs:
             return photographs
     return []
@@ -200,7 +200,7 @@ def _scenes_as_npz(folder: Path) -> list[Path]:
 def _unposed(folder: Path, photographs: list[Path], unread: list[Path]) -> str:
     """What to say of photographs without poses."""
     n = len(photographs)
-    more = without_masks(_with_endings(folder / "images", llff.ENDINGS))
+    more = without_masks(_with_endings(folder / "images", ENDINGS))
     inside = photographs[0].parent != folder / "images" and len(more) > n
     said = f"it holds {n} photographs without poses"
     if inside:

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+import unicodedata
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,18 +17,19 @@ import numpy as np
 
 from warpnerf.checks import InputError
 from warpnerf.scenes.cameras.lens import Lens
-from warpnerf.scenes.files import IMAGE_SUFFIXES, exists, printable
+from warpnerf.scenes.files import ENDINGS, exists, is_photograph, printable
 from warpnerf.scenes.formats.assemble import POSED, assemble
 from warpnerf.scenes.formats.frame import Frame
 from warpnerf.scenes.formats.left_over import points_beside
-from warpnerf.scenes.formats.llff import ENDINGS
 from warpnerf.scenes.images.depths import DepthFile
 from warpnerf.scenes.images.masks import without_masks
 from warpnerf.scenes.images.photographs import Keeping
 from warpnerf.scenes.scene import Scene
 from warpnerf.scenes.split import Split
 
-NO_PHOTOGRAPHS = re.compile(r"(images_\d{1,3}|masks?|depths?|confidence)", re.IGNORECASE)
+NO_PHOTOGRAPHS = re.compile(
+    r"(images_\d{1,3}|masks?|depths?|confidence|thumb(nail)?s?)", re.IGNORECASE
+)
 """Folders within one of photographs whose images are none, or are the same ones reduced."""
 
 UNPOSED = 0.1
@@ -37,38 +39,44 @@ UNPOSED = 0.1
 class Photographs:
     """The photographs in a scene's images/, or else anywhere in its folder, by name."""
 
-    def __init__(self, folder: Path, among: Path | None = None) -> None:
+    def __init__(self, folder: Path, among: Path | None = None, within: bool = True) -> None:
         """Look for photographs.
 
         Args:
             folder: The scene's.
             among: Where they are; None: in its images/ if there is one, else anywhere in it.
+            within: Whether also in folders within that.
         """
         images = folder / "images"
         self.folder = folder
         self.root = among or (images if images.is_dir() else folder)
-        self.paths = _photographs_below(self.root)
+        self.paths = _photographs_below(self.root, within)
         self._by_name: dict[str, list[Path]] = {}
         self._by_stem: dict[str, list[Path]] = {}
         for path in self.paths:
-            self._by_name.setdefault(path.name.casefold(), []).append(path)
-            self._by_stem.setdefault(path.stem.casefold(), []).append(path)
+            self._by_name.setdefault(normalised(path.name), []).append(path)
+            self._by_stem.setdefault(normalised(path.stem), []).append(path)
 
-    def find(self, name: str, field: str) -> Path | None:
+    def find(
+        self, name: str, field: str, fits: Callable[[Path], bool] = lambda path: True
+    ) -> Path | None:
         """The photograph of a name, with or without folders and extension; None: it is not there.
+
+        Args:
+            name: To look for.
+            field: That holds it, for messages.
+            fits: Which photographs of that name come into question.
 
         Raises:
             InputError: Several photographs have that name.
         """
         *folders, last = name.replace("\\", "/").split("/")
-        stem, dot, ending = last.rpartition(".")
-        keys = [last, stem] if dot and f".{ending.lower()}" in (*ENDINGS, ".tif") else [last]
-        for key in keys:
-            key = key.casefold()
+        for key in dict.fromkeys([normalised(last), normalised(without_ending(last))]):
             found = self._by_name.get(key) or self._by_stem.get(key, [])
+            found = [path for path in found if fits(path)]
             while len(found) > 1 and folders:
-                below = folders.pop().casefold()
-                found = [path for path in found if path.parent.name.casefold() == below] or found
+                below = normalised(folders.pop())
+                found = [path for path in found if normalised(path.parent.name) == below] or found
             if len(found) > 1:
                 first, second = (self.name(path) for path in found[:2])
                 raise InputError(
@@ -114,6 +122,17 @@ class Photographs:
         return ([], said) if len(left) > UNPOSED * len(self.paths) else (said, [])
 
 
+def normalised(name: str) -> str:
+    """A name for comparing: upper and lower case, and composed and decomposed accents, are one."""
+    return unicodedata.normalize("NFC", name).casefold()
+
+
+def without_ending(name: str) -> str:
+    """A photograph's name without the ending of its format, if it has one."""
+    stem, dot, ending = name.rpartition(".")
+    return stem if dot and f".{ending.lower()}" in ENDINGS else name
+
+
 def is_written(folder: Path) -> bool:
     """Whether a folder is a run's or a posed scene: its images are renderings, or photographs of
     another folder again."""
@@ -123,68 +142,20 @@ def is_written(folder: Path) -> bool:
     return is_run or exists(folder / POSED)
 
 
-def _photographs_below(root: Path) -> list[Path]:
+def _photographs_below(root: Path, within: bool) -> list[Path]:
     """All photographs in a folder and in folders within it, by name, but those in runs."""
     found: list[Path] = []
     for place, folders, names in os.walk(root):
         folders[:] = sorted(
             name
             for name in folders
-            if not name.startswith(".")
+            if within
+            and not name.startswith(".")
             and not NO_PHOTOGRAPHS.fullmatch(name)
             and not is_written(Path(place) / name)
         )
-        found += [
-            Path(place) / name
-            for name in names
-            if name.lower().endswith((*ENDINGS, *IMAGE_SUFFIXES)) and not name.startswith(".")
-        ]
+        found += [Path(place) / name for name in filter(is_photograph, names)]
     return sorted(without_masks(found))
-
-
-def scaled(
-    values: Mapping[str, float], stated: tuple[int, int], size: tuple[int, int]
-) -> dict[str, float]:
-    """A lens for photographs of another size and the same shape.
-
-    Args:
-        values: Its focal lengths and principal point, pixels, and coefficients.
-        stated: Width and height that these are for.
-        size: Of the photograph.
-
-    Returns:
-        The values for that, with its w and h; those stated where the shape is another, which is
-        then refused.
-    """
-    width, height = stated
-    # Sides are rounded to whole pixels, so that one may be off by one.
-    if size == stated or abs(size[0] / width * height - size[1]) > 1.0:
-        return {**values, "w": width, "h": height}
-    across, along = size[0] / width, size[1] / height
-    factors = {"fl_x": across, "cx": across, "fl_y": along, "cy": along}
-    there = {name: value * factors.get(name, 1.0) for name, value in values.items()}
-    return {**there, "w": size[0], "h": size[1]}
-
-
-def _scaled_note(frames: Sequence[Frame], stated: Sequence[tuple[int, int] | None]) -> list[str]:
-    """That photographs are of another size than their lenses were for.
-
-    Args:
-        frames: Whose lenses ``scaled`` may have scaled.
-        stated: The size that each of them was for; None: any.
-    """
-    other = [
-        (frame.name, size, (frame.lens.values["w"], frame.lens.values["h"]))
-        for frame, size in zip(frames, stated, strict=True)
-        if size is not None and (frame.lens.values["w"], frame.lens.values["h"]) != size
-    ]
-    if not other:
-        return []
-    name, (width, height), (w, h) = other[0]
-    return [
-        f"{len(other)} of {len(frames)} photographs are of another size than their lenses were for "
-        f"(first: {name} {w:g}x{h:g}, the lens {width}x{height}): the lenses are scaled"
-    ]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -208,9 +179,7 @@ class PosedCamera:
     c2w: np.ndarray
     """[3, 4], OpenGL axes, scene units."""
     lens: Lens
-    """For the photograph as it is there."""
-    stated: tuple[int, int] | None = None
-    """Width and height that the lens was for, before ``scaled``; None: any."""
+    """With the size of the images that it is for, if that is known."""
     depth: DepthFile | None = None
     """True depth; None: not known."""
 
@@ -247,7 +216,6 @@ def scene_of(
         InputError: No photograph is there, or several cameras are of one.
     """
     frames: list[Frame] = []
-    stated: list[tuple[int, int] | None] = []
     missing: list[str] = []
     for entry in entries:
         path = photographs.find(entry.name, entry.place)
@@ -257,7 +225,6 @@ def scene_of(
         camera = entry.read(path)
         name, c2w = photographs.name(path), camera.c2w
         frames.append(Frame(name=name, path=path, c2w=c2w, lens=camera.lens, depth=camera.depth))
-        stated.append(camera.stated)
     twice = len(frames) - len({frame.name for frame in frames})
     if twice:
         raise InputError(
@@ -280,4 +247,4 @@ def scene_of(
         withhold=reading.withhold,
         points=points,
     )
-    return replace(scene, notes=(*notes, *tried, *few, *_scaled_note(frames, stated), *scene.notes))
+    return replace(scene, notes=(*notes, *tried, *few, *scene.notes))

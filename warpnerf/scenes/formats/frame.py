@@ -11,6 +11,7 @@ import numpy as np
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.cameras.foreign import TOLERANCE, ImagePlane
 from warpnerf.scenes.cameras.lens import Lens
+from warpnerf.scenes.files import printable
 from warpnerf.scenes.images.depths import DepthFile
 from warpnerf.scenes.images.images import image_shape
 from warpnerf.scenes.images.masks import Mask, fits, mask_beside, unfit_masks
@@ -41,6 +42,8 @@ class Frame:
     """The same photograph, reduced as is requested; None: it is still to be reduced."""
     bounds: tuple[float, float] | None = None
     """Depth of the nearest and of the farthest content, scene units; None: not known."""
+    called: str = ""
+    """What the file calls the image, where no file is at that path; empty: it is there."""
 
     def resampling(self, whole: Camera, reduced: Camera) -> Resampling | None:
         """How the photograph is undistorted to a camera that ``lens`` made; None: not at all.
@@ -61,19 +64,38 @@ class Frame:
         return Resampling(self.lens.foreign, plane, reduced)
 
 
-def lens_notes(used: Sequence[tuple[Frame, Camera, Resampling | None]]) -> list[str]:
-    """What becomes of photographs whose lenses are none of OpenCV's.
+def photograph_notes(used: Sequence[tuple[Frame, Camera, Resampling | None]]) -> list[str]:
+    """How photographs were found, and what becomes of resized ones and of lenses not of OpenCV's.
 
     Args:
         used: Frames, the cameras of their whole photographs, and how these are undistorted.
     """
+    notes = []
+    named = [frame for frame, *_ in used if frame.called]
+    if named:
+        notes.append(
+            f"{len(named)} of {len(used)} photographs have another path than the file says, and "
+            f"are found by their names (first: {named[0].name} for "
+            f"{printable(named[0].called[:80])})"
+        )
+    resized = [
+        (frame.name, (camera.width, camera.height), stated)
+        for frame, camera, _ in used
+        if (stated := frame.lens.was_for(camera.width, camera.height)) is not None
+    ]
+    if resized:
+        name, (width, height), (w, h) = resized[0]
+        notes.append(
+            f"{len(resized)} of {len(used)} photographs are of another size than their lenses were "
+            f"for (first: {name} {width}x{height}, the lens {w:g}x{h:g}): the lenses are scaled"
+        )
     found: dict[tuple[str, bool], list[float]] = {}
     for frame, camera, resampling in used:
         nearest = frame.lens.nearest(camera, frame.name)
         if frame.lens.foreign is not None and nearest is not None:
             key = frame.lens.foreign.model, resampling is not None
             found.setdefault(key, []).append(nearest[2])
-    return [
+    return notes + [
         f"{len(off)} photographs have a {model} lens; OpenCV's nearest one is at most "
         f"{max(off):.2g} pixels off, "
         + ("so they are undistorted to it" if moved else "and is used in its place")

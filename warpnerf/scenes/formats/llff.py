@@ -16,17 +16,16 @@ import numpy as np
 from warpnerf.checks import InputError
 from warpnerf.scenes.cameras.lens import Lens
 from warpnerf.scenes.cameras.poses import check_pose
-from warpnerf.scenes.files import photograph_folder
+from warpnerf.scenes.files import photograph_folder, printable
 from warpnerf.scenes.formats.assemble import assemble
+from warpnerf.scenes.formats.found_photographs import Photographs
 from warpnerf.scenes.formats.frame import Frame
 from warpnerf.scenes.images.arrays import read_npy
-from warpnerf.scenes.images.masks import without_masks
 from warpnerf.scenes.images.photographs import KEEPING, Keeping
 from warpnerf.scenes.scene import Scene
 from warpnerf.scenes.split import Split
 
 FILE = "poses_bounds.npy"
-ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".ppm")
 
 
 def load_llff(
@@ -59,13 +58,19 @@ def load_llff(
     if not np.isfinite(rows).all():
         raise InputError(f"{file}: must hold finite numbers only; export it again.")
     photographs = photograph_folder(folder)
-    if photographs is None:
+    paths = Photographs(folder, among=photographs, within=photographs is None).paths
+    if not paths:
         raise InputError(f"{folder}: its photographs are not there; put them into images/.")
-    images = sorted(p for p in photographs.iterdir() if p.suffix.lower() in ENDINGS)
-    paths = without_masks(images)
+    places = list(dict.fromkeys(path.parent for path in paths))
+    if len(places) > 1:
+        first, second = (printable(place.name) for place in places[:2])
+        raise InputError(
+            f"{folder}: its photographs are in {len(places)} folders (first: {first}, {second}); "
+            f"put those of {FILE} into images/."
+        )
     if len(paths) != len(rows):
         raise InputError(
-            f"{file}: holds {len(rows)} poses, but {photographs} {len(paths)} photographs; LLFF "
+            f"{file}: holds {len(rows)} poses, but {places[0]} {len(paths)} photographs; LLFF "
             "pairs them by order, so none may be missing."
         )
     frames = []

@@ -25,10 +25,8 @@ from warpnerf.scenes.formats.found_photographs import (
     Photographs,
     PosedCamera,
     Reading,
-    scaled,
     scene_of,
 )
-from warpnerf.scenes.images.images import image_size
 from warpnerf.scenes.scene import Scene
 
 LOOKED_AT = 4096
@@ -107,9 +105,8 @@ def load_metashape(file: Path, reading: Reading) -> Scene:
             sensor = sensors.get(camera.get("sensor_id", ""))
             if sensor is None:
                 raise InputError(f"{place}: its sensor is not in the file; export it again.")
-            lens, size = _lens(file, sensor, image_size(path))
             c2w = check_pose(pose.tolist(), field=f"{place}: transform")
-            return PosedCamera(c2w=c2w, lens=lens, stated=size)
+            return PosedCamera(c2w=c2w, lens=_lens(file, sensor))
 
         return Entry(name=camera.get("label", ""), place=place, read=read)
 
@@ -251,10 +248,8 @@ def _on_the_ground(poses: np.ndarray, reference: str) -> tuple[np.ndarray, list[
     ]
 
 
-def _lens(
-    file: Path, sensor: ElementTree.Element, photograph: tuple[int, int]
-) -> tuple[Lens, tuple[int, int]]:
-    """The lens of a sensor for a photograph, and the size of images that it is for."""
+def _lens(file: Path, sensor: ElementTree.Element) -> Lens:
+    """The lens of a sensor."""
     place = f"sensor {printable(sensor.get('id', '')[:20])}"
     calibrations = sensor.findall("calibration")
     adjusted = [c for c in calibrations if c.get("class") == "adjusted"]
@@ -296,17 +291,15 @@ def _lens(
         slant, tangential = given.get("b2", 0.0), ("p1", "p2", "p3", "p4")
     if min(fx, fy) <= 0.0:
         raise InputError(f"{file}: {place}: its focal length must be above 0; export it again.")
-    values = scaled({"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}, (width, height), photograph)
-    lens = brown_lens(
+    return brown_lens(
         file,
         place,
-        values,
+        {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": width, "h": height},
         radial=[given.get(name, 0.0) for name in COEFFICIENTS[:4]],
         tangential=[given.get(name, 0.0) for name in tangential],
         skew=slant / fx,
         kind=KINDS[kind],
     )
-    return lens, (width, height)
 
 
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")

@@ -20,7 +20,6 @@ from warpnerf.scenes.formats.found_photographs import (
     Photographs,
     PosedCamera,
     Reading,
-    scaled,
     scene_of,
 )
 from warpnerf.scenes.images.depths import DepthFile
@@ -105,8 +104,7 @@ def load_polycam(cameras: Path, reading: Reading) -> Scene:
         def read(path: Path) -> PosedCamera:
             camera, shape = read_json(file, CameraFile), image_size(path)
             pose = [[getattr(camera, f"t_{i}{j}") for j in range(4)] for i in range(3)]
-            values, size = _lens(file, camera)
-            values = scaled(values, size, shape)
+            values = _lens(file, camera)
             depth = keyframes / "depth" / f"{file.stem}.png"
             fits = exists(depth) and _same_shape(image_size(depth), shape)
             if exists(depth) and not fits:
@@ -114,7 +112,6 @@ def load_polycam(cameras: Path, reading: Reading) -> Scene:
             return PosedCamera(
                 c2w=check_pose(pose, field=f"{file}: t_00 to t_23"),
                 lens=Lens(file=file, values=values, fields={name: KEYS[name] for name in values}),
-                stated=size,
                 depth=DepthFile(depth, MILLIMETRE) if fits else None,
             )
 
@@ -136,7 +133,7 @@ KEYS = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", "w": "width", "h": "
 """Of a camera's file, by the names of a lens."""
 
 
-def _lens(file: Path, camera: CameraFile) -> tuple[dict[str, float], tuple[int, int]]:
+def _lens(file: Path, camera: CameraFile) -> dict[str, float]:
     """Focal lengths and principal point, and the size of images that they are for."""
     for key in ("fx", "fy", "width", "height"):
         value = getattr(camera, key)
@@ -145,8 +142,7 @@ def _lens(file: Path, camera: CameraFile) -> tuple[dict[str, float], tuple[int, 
                 f"{file}: $.{key}: {value:g} is no {'size' if key[0] in 'wh' else 'focal length'} "
                 "in pixels; export the capture again."
             )
-    values = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
-    return values, (int(camera.width), int(camera.height))
+    return {name: getattr(camera, key) for name, key in KEYS.items()}
 
 
 def _same_shape(one: tuple[int, int], other: tuple[int, int]) -> bool:

@@ -22,10 +22,8 @@ from warpnerf.scenes.formats.found_photographs import (
     Photographs,
     PosedCamera,
     Reading,
-    scaled,
     scene_of,
 )
-from warpnerf.scenes.images.images import image_size
 from warpnerf.scenes.scene import Scene
 
 NAMES = ("metadata.json", "metadata")
@@ -100,12 +98,11 @@ def load_record3d(file: Path, reading: Reading) -> Scene:
             else:
                 key = f"perFrameIntrinsicCoeffs[{number}]"
                 values = _lens(file, key, per_frame[number])
-            values = scaled(values, (data.w, data.h), image_size(path))
+            values = {**values, "w": data.w, "h": data.h}
             fields = {name: f"$.{name if name in ('w', 'h') else key}" for name in values}
             return PosedCamera(
                 c2w=_pose(place, data.poses[number]),
                 lens=Lens(file=file, values=values, fields=fields),
-                stated=(data.w, data.h),
             )
 
         return Entry(name=f"{images.name}/{number}", place=place, read=read)

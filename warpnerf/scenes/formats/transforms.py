@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 
 from warpnerf.checks import InputError
-from warpnerf.scenes.cameras.lens import LensFields, read_lens
+from warpnerf.scenes.cameras.lens import Lens, LensFields, read_lens
 from warpnerf.scenes.cameras.poses import check_pose
 from warpnerf.scenes.extent.points import Points, usable
 from warpnerf.scenes.files import exists, find_image, printable, read_json, resolve_inside
@@ -28,7 +28,7 @@ from warpnerf.scenes.formats.assemble import assemble
 from warpnerf.scenes.formats.colmap import points_beside
 from warpnerf.scenes.formats.colmap_models import find_model, size_of
 from warpnerf.scenes.formats.frame import Frame
-from warpnerf.scenes.formats.frame_images import find_images
+from warpnerf.scenes.formats.frame_images import REDUCED, find_images
 from warpnerf.scenes.formats.ply import read_ply
 from warpnerf.scenes.formats.split_lists import read_split_lists
 from warpnerf.scenes.formats.unnamed_photographs import unnamed_photographs
@@ -108,7 +108,8 @@ def load_transforms(
     data, frames, warnings = read_frames(file)
     few, many = _unnamed(file, frames)
     warnings += many
-    names = {frame.name for frame in frames}
+    names = {frame.name: frame.name for frame in frames}
+    names |= {frame.called: frame.name for frame in frames if frame.called}
     splits: dict[str, set[str]] = {}
     for split in ("train", "val", "test"):
         listed = getattr(data, f"{split}_filenames") or []
@@ -126,7 +127,9 @@ def load_transforms(
         splits[split] = members
     listed_in: list[str] = []
     if withhold is None and not any(splits.values()):
-        splits, listed_in, lost = read_split_lists(folder, names, names)
+        called = {frame.called or frame.name: frame.name for frame in frames}
+        members_of, listed_in, lost = read_split_lists(folder, called, called)
+        splits = {split: {called[name] for name in of} for split, of in members_of.items()}
         warnings += lost
     points, why_not = _points(file, data, frames)
     if why_not:
@@ -207,7 +210,7 @@ def read_frames(file: Path, required: bool = True) -> tuple[TransformsFile, list
         InputError: As ``load_transforms``.
     """
     data = read_json(file, TransformsFile)
-    found, warnings = find_images(
+    found, warnings, moved = find_images(
         file.parent, file, [entry.file_path for entry in data.frames], required
     )
     unit = data.depth_unit_scale_factor * data.applied_scale
@@ -225,14 +228,18 @@ def read_frames(file: Path, required: bool = True) -> tuple[TransformsFile, list
         if mask is None and not entry.mask_path:
             mask = _named_file(file, "$", "mask_path", data.mask_path, lost)
         depth = _named_file(file, place, "depth_file_path", entry.depth_file_path, lost)
+        lens = read_lens(file, [(place, entry), ("$", data)])
+        if index in moved:
+            _require_size(file, place, lens, path)
         frames.append(
             Frame(
                 name=path.relative_to(file.parent).as_posix(),
                 path=path,
                 c2w=check_pose(entry.transform_matrix, field=f"{file}: {place}.transform_matrix"),
-                lens=read_lens(file, [(place, entry), ("$", data)]),
+                lens=lens,
                 mask=None if mask is None else Mask(mask),
                 depth=None if depth is None else DepthFile(depth, unit),
+                called=entry.file_path if index in moved else "",
             )
         )
     for key, names in lost.items():
@@ -245,6 +252,16 @@ def read_frames(file: Path, required: bool = True) -> tuple[TransformsFile, list
         if getattr(data, key) or any(getattr(entry, key) for entry in data.frames):
             warnings.append(f"{file.name}: {key} is not used: {consequence}")
     return data, frames, warnings
+
+
+def _require_size(file: Path, place: str, lens: Lens, path: Path) -> None:
+    """Refuse a lens in pixels of images that are there reduced only, where it has no size."""
+    reduced = next((p.name for p in path.parents if REDUCED.fullmatch(p.name)), None)
+    if reduced and not lens.values.keys() >= {"w", "h"} and lens.values.keys() & {"fl_x", "fl_y"}:
+        raise InputError(
+            f"{file}: {place}: its image is only in {reduced}, and without w and h its lens in "
+            "pixels cannot be scaled to that; add the w and h of the original images."
+        )
 
 
 def _named_file(
@@ -260,16 +277,26 @@ def _named_file(
 
 
 def _listed_names(
-    folder: Path, file: Path, split: str, listed: Sequence[str], names: set[str]
+    folder: Path, file: Path, split: str, listed: Sequence[str], names: Mapping[str, str]
 ) -> tuple[set[str], list[str]]:
-    """Sort a list of file names into those of frames, by frame name, and the others."""
+    """Sort a list of file names into those of frames, by frame name, and the others.
+
+    Args:
+        folder: The scene's.
+        file: That holds the list, for messages.
+        split: Whose list it is.
+        listed: The list.
+        names: Of frames, by these and by what the file calls them.
+    """
     members: set[str] = set()
     absent: list[str] = []
     for index, text in enumerate(listed):
-        path = find_image(folder, text, field=f"{file}: $.{split}_filenames[{index}]")
-        name = path.relative_to(folder).as_posix() if path else None
-        if name in names:
-            members.add(str(name))
-        else:
+        name = names.get(text)
+        if name is None:
+            path = find_image(folder, text, field=f"{file}: $.{split}_filenames[{index}]")
+            name = names.get(path.relative_to(folder).as_posix()) if path else None
+        if name is None:
             absent.append(text)
+        else:
+            members.add(name)
     return members, absent

@@ -6,9 +6,8 @@ import re
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
-from warpnerf.scenes.files import printable
+from warpnerf.scenes.files import is_photograph, printable
 from warpnerf.scenes.formats.left_over import files_in
-from warpnerf.scenes.formats.llff import ENDINGS
 from warpnerf.scenes.images.masks import without_masks
 
 UNPOSED = 0.1
@@ -28,7 +27,7 @@ def unnamed_photographs(
     there = []
     for place in sorted({path.parent for path in used}):  # others hold masks or thumbnails
         stems = {path.stem for path in used if path.parent == place}
-        images = [path for path in files_in(place) if path.name.lower().endswith(ENDINGS)]
+        images = [path for path in files_in(place) if is_photograph(path.name)]
         there += [
             path
             for path in without_masks(images)
