@@ -32,7 +32,8 @@ from warpnerf_kernels.base.tiles import TILE
 import warpnerf as wn
 from warpnerf.config import TrainConfig
 from warpnerf.presets import PRESETS
-from warpnerf.runtime.parallel import Workers, zero_bytes
+from warpnerf.runtime.memory import zero_bytes
+from warpnerf.runtime.parallel import Workers
 from warpnerf.torch.processes import Processes
 from warpnerf.training.peers import Peers, Signals
 from warpnerf.training.trainer import Trainer

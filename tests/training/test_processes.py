@@ -20,7 +20,7 @@ from tests.support.tiny_trainings import early_growth as early_growth
 from warpnerf.checks import InputError
 from warpnerf.cli.main import main
 from warpnerf.cli.processes import share_of_machine
-from warpnerf.runtime.parallel import zero_bytes
+from warpnerf.runtime.memory import zero_bytes
 from warpnerf.training import exposure
 from warpnerf.training.peers import Peers
 from warpnerf.training.trainer import Trainer

@@ -13,8 +13,8 @@ from warpnerf_kernels.base.simd import LANES
 from warpnerf_kernels.base.types import real
 
 from warpnerf.model.interface import Model, n_weights
-from warpnerf.runtime.memory import prefer_large_pages
-from warpnerf.runtime.parallel import LaunchCache, Workers, zero_bytes
+from warpnerf.runtime.memory import prefer_large_pages, zero_bytes
+from warpnerf.runtime.parallel import LaunchCache, Workers
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

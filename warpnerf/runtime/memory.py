@@ -8,6 +8,8 @@ import mmap
 import os
 from pathlib import Path
 
+import numpy as np
+
 from warpnerf.checks import InputError, require_whole
 
 MOST_PER_CORE = 16
@@ -48,6 +50,11 @@ def usable_memory() -> int | None:
     of_all = [limit for limit in (_machine(), *map(_container, CONTAINER_LIMITS)) if limit]
     limits = [limit // processes_here() for limit in of_all]
     return min((*limits, *filter(None, [_own()])), default=None)
+
+
+def zero_bytes(n_bytes: int) -> np.ndarray:
+    """[n_bytes] uint8 of pages that take no memory until something is written to them."""
+    return np.zeros(n_bytes, np.uint8)
 
 
 def processes_here() -> int:

@@ -21,17 +21,12 @@ from warpnerf_kernels.cpu import barrier
 
 from warpnerf.checks import InputError
 from warpnerf.runtime import kernel_cache
-from warpnerf.runtime.memory import require_threads, usable_cores
+from warpnerf.runtime.memory import require_threads, usable_cores, zero_bytes
 
 NODES = 1 << 20
 RAYS = 1 << 13
 """Items per launch on the CPU, of little and of much work each: a fraction of a second, because
 signals such as Ctrl-C wait for a launch to end."""
-
-
-def zero_bytes(n_bytes: int) -> np.ndarray:
-    """[n_bytes] uint8 of pages that take no memory until something is written to them."""
-    return np.zeros(n_bytes, np.uint8)
 
 
 class LaunchCache:

@@ -7,13 +7,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
-import warp as wp
 
-from warpnerf.runtime.parallel import Workers, zero_bytes
+from warpnerf.runtime.memory import zero_bytes
 
 if TYPE_CHECKING:
+    import warp as wp
+
     from warpnerf.fields.gradients import Gradients
     from warpnerf.fields.parameters import Parameter
+    from warpnerf.runtime.parallel import Workers
 
 T = TypeVar("T")
 
