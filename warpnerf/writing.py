@@ -1,13 +1,15 @@
-"""Files that are written whole or not at all, alone or several together."""
+"""Files that are written whole or not at all, alone or several together; and appending to some."""
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
+from typing import BinaryIO
 
 CHUNK = 1 << 24
 """Bytes per write: signals such as Ctrl-C wait for one to end."""
@@ -23,6 +25,24 @@ def write_atomically(path: str | Path, *pieces: bytes | memoryview) -> None:
     """
     with StagedWrites() as staged:
         staged.add(path, *pieces)
+
+
+def open_to_append(path: Path) -> BinaryIO:
+    """Open a file to append to it, but no link, and no pipe that nobody reads.
+
+    Args:
+        path: Of the file, which is made where it is missing.
+
+    Raises:
+        OSError: It cannot be written, or is such a link or pipe.
+    """
+    flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | getattr(os, "O_BINARY", 0)
+    flags |= getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+    try:
+        return os.fdopen(os.open(path, flags, 0o666), "ab")
+    except OSError as error:
+        why = f"{path.name} is a link" if error.errno == errno.ELOOP else error.strerror
+        raise OSError(error.errno, why, str(path)) from error
 
 
 class StagedWrites:

@@ -8,7 +8,7 @@ import pytest
 
 from tests.support.cli_process import make_scene
 from tests.support.tiny_scenes import look_at, ring, tiny_scene
-from warpnerf.blocks.cut import cut, seen_by
+from warpnerf.blocks.cut import cut, fills, seen_by
 from warpnerf.blocks.folder import BlockFolder, stored_source, write_blocks
 from warpnerf.checks import InputError
 from warpnerf.scenes.formats.load import load_scene
@@ -36,6 +36,24 @@ def test_every_place_is_in_one_cell(count: int) -> None:
     assert len(blocks) == count and (np.sum(inside, axis=0) == 1).all()
     for block in blocks:
         assert (block.box[0] < block.core[0]).all() and (block.core[1] < block.box[1]).all()
+
+
+def test_what_fills_a_box() -> None:
+    cores = np.stack([block.core for block in cut(long_scene(), 5)])
+    box = np.array([cores[:, 0].min(axis=0), cores[:, 1].max(axis=0)])
+    assert (
+        fills(cores, box) and not fills(cores, box[::-1]) and not fills(cores, np.sign(box) * 1e308)
+    )
+    for number, end, axis in np.ndindex(cores.shape):
+        for change in (-0.1, 0.1):
+            moved = cores.copy()
+            moved[number, end, axis] += change
+            assert not fills(moved, box)
+    assert not fills(cores[1:], box) and not fills(np.concatenate([cores, cores[:1]]), box)
+    twice = np.stack([box, box])  # the lower half: as large as the box in all
+    twice[:, 1, 0] = box[:, 0].mean()
+    assert not fills(twice, box)
+    assert not fills(box[None] + 1.0, box)
 
 
 def test_photographs_train_the_blocks_that_they_see() -> None:

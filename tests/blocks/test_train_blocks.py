@@ -121,6 +121,67 @@ def test_what_is_no_scene_in_blocks_is_refused(trained: Path, tmp_path: Path) ->
     assert not (tmp_path / "new/block-0").exists() and not (tmp_path / "new/train.json").exists()
 
 
+@pytest.fixture(scope="module")
+def untrained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two blocks, as they are cut."""
+    return cut(tmp_path_factory.mktemp("untrained") / "room")
+
+
+@pytest.mark.parametrize("name", ["train.json", "block-0.log", "block-1"])
+def test_links_and_pipes_are_not_written_to(untrained: Path, tmp_path: Path, name: str) -> None:
+    folder, precious = tmp_path / "room", tmp_path / "precious"
+    words = ("train-blocks", folder, "--threads", "1", "--", "--steps", "2", *OPTIONS)
+    shutil.copytree(untrained, folder)
+    for is_there in (False, True):
+        (folder / name).symlink_to(precious)
+        assert f"{name} is a link, and train-blocks writes" in refused(*words)
+        assert precious.exists() == is_there
+        precious.mkdir(exist_ok=True)
+        (folder / name).unlink()
+    os.mkfifo(folder / name)
+    assert f"{name} is neither a file nor a folder" in refused(*words)
+
+
+@pytest.mark.parametrize("words", [["--output", "x"], ["--overwrite"], ["--resume=x"]])
+def test_stored_options_are_no_others_than_given_ones(
+    untrained: Path, tmp_path: Path, words: list[str]
+) -> None:
+    shutil.copytree(untrained, tmp_path / "room")
+    (tmp_path / "room/train.json").write_text(json.dumps({"options": ["--steps", "2", *words]}))
+    name = words[0].partition("=")[0]
+    says = f"train.json: $.options: {name} is not an option for the training of blocks"
+    assert says in refused("train-blocks", tmp_path / "room")
+
+
+def test_blocks_that_are_not_those_of_a_cut_are_refused(untrained: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "room"
+    words = ("train-blocks", folder, "--threads", "1", "--", "--steps", "2", *OPTIONS)
+    shutil.copytree(untrained, folder)
+    path = folder / "blocks.json"
+    content = json.loads(path.read_text())
+
+    def said(**changes: object) -> str:
+        first = content["blocks"][0] | changes
+        path.write_text(json.dumps(content | {"blocks": [first, *content["blocks"][1:]]}))
+        return refused(*words)
+
+    assert "at `$.blocks[0].photographs`; correct" in said(photographs=-5)
+    low = content["blocks"][0]["core_min"]
+    high = [(a + b) / 2 for a, b in zip(low, content["blocks"][0]["core_max"], strict=True)]
+    assert "$.blocks: cores must fill the box of the scene, each place once" in said(core_max=high)
+    path.write_text(json.dumps(content | {"blocks": []}))
+    assert "at `$.blocks`; correct" in refused(*words)
+    part = folder / "block-0.part.json"
+    says = refused("blocks", part, "--count", "2", "--output", tmp_path / "parts")
+    assert f"{part} is a part of a capture already" in says and not (tmp_path / "parts").exists()
+
+
+@pytest.mark.ci  # a process of its own, in which Warp starts
+def test_blocks_are_read_in_silence(trained: Path) -> None:
+    done = cli_process.run("eval", trained, env=dict(os.environ))
+    assert done.returncode == 0 and done.stderr == ""
+
+
 class Scripted:
     """An engine whose trainings end at once with the given codes, by block; 0 with a field."""
 

@@ -34,6 +34,15 @@ def test_a_table_and_a_plan(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert {path.name for path in (tmp_path / "plots").iterdir()} == {"cameras.png", "sampling.png"}
 
 
+def test_plots_are_not_written_through_a_link(tmp_path: Path) -> None:
+    write_transforms(tmp_path / "scene", 6)
+    (tmp_path / "plots").mkdir()
+    (tmp_path / "plots" / "sampling.png").symlink_to(tmp_path / "precious")
+    with pytest.raises(InputError, match=r"sampling.png is a link, and inspect writes only"):
+        inspect_command(InspectOptions(scene=str(tmp_path / "scene"), plots=tmp_path / "plots"))
+    assert [path.name for path in (tmp_path / "plots").iterdir()] == ["sampling.png"]
+
+
 def test_json(tmp_path: Path) -> None:
     write_transforms(tmp_path / "scene", 6)
     file = tmp_path / "facts.json"

@@ -18,7 +18,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).parents[2]))
 sys.path.insert(0, str(Path(__file__).parents[2] / "kernels"))
 
-from tests.hostile import command_lines, python_calls, runs, scene_files
+from tests.hostile import blocks, command_lines, python_calls, runs, scene_files
 from tests.hostile.running import Case, outcome
 from tests.support.cli_process import TINY, make_scene
 from tests.support.command_server import redirect
@@ -49,6 +49,7 @@ class Harness:
             "checkpoint",
         ]
         self._quietly(words)
+        self._quietly(["blocks", str(scene), "--count", "2", "--output", str(self.base / "blocks")])
         calls = python_calls.targets(self.base)
         base = self.base
         self.families: dict[str, tuple[Make, int]] = {
@@ -59,6 +60,7 @@ class Harness:
             "transforms": (scene_files.transforms, 5),
             "photographs": (scene_files.photographs, 3),
             "runs": (lambda rng, folder: runs.case(rng, folder, base), 5),
+            "blocks": (lambda rng, folder: blocks.case(rng, folder, base), 2),
             "starved": (lambda rng, folder: command_lines.starved(rng, folder, base), 2),
             "python": (lambda rng, folder: python_calls.case(rng, folder, base, calls), 12),
         }
@@ -77,7 +79,7 @@ class Harness:
             for number, stream in zip((1, 2), streams, strict=True):
                 os.dup2(stream, number)
                 os.close(stream)
-        assert code == 0, "the tiny training failed"
+        assert code == 0, f"{words[0]} failed"
 
     def attempt(self, family: str, seed: int, number: int) -> tuple[Case, str | None]:
         """Make a case by its numbers and run it.

@@ -11,6 +11,11 @@ WHERE_THEY_LOOK = "blocks/test_cut.py::test_photographs_train_the_blocks_that_th
 SEEN = "blocks/test_cut.py::test_depth_and_points_tell_what_is_seen"
 OF_PART = "blocks/test_cut.py::test_the_scene_of_a_block_has_its_photographs_and_box"
 ROOMS = "scenes/test_building.py::test_a_building_is_the_room_again_in_other_places_and_colours"
+BOX = "blocks/test_cut.py::test_what_fills_a_box"
+TRAINING = "blocks/test_train_blocks.py::"
+LINKED = f"{TRAINING}test_links_and_pipes_are_not_written_to"
+STORED = f"{TRAINING}test_stored_options_are_no_others_than_given_ones"
+REFUSED = f"{TRAINING}test_blocks_that_are_not_those_of_a_cut_are_refused"
 CLIPPED, COMPOSITE, CUT = "sampling/clipped.py", "rendering/composite.py", "blocks/cut.py"
 
 MUTANTS = [
@@ -28,4 +33,11 @@ MUTANTS = [
     of_host("in blocks: points behind walls", CUT, "return np.asarray(points[away < FARTHEST * distance])", "return np.asarray(points)", SEEN),
     of_host("in blocks: the box of the whole", "scenes/formats/part.py", "box_min=box[0],", "box_min=whole.box_min,", OF_PART),
     of_host("in blocks: rooms in one row", "scenes/builtin/building.py", "columns = math.ceil(math.sqrt(n_rooms))", "columns = n_rooms", ROOMS),
+    of_host("in blocks: a gap", CUT, "and abs(volume - 1.0) < ROUNDING", "", BOX),
+    of_host("in blocks: twice", CUT, "for n in range(len(low))", "for n in ()", BOX),
+    of_host("in blocks: beyond the box", CUT, "and within", "", BOX),
+    of_host("in blocks: links", "cli/blocks.py", "    blocks.require_own_files(numbers)\n", "", LINKED),
+    of_host("in blocks: any options that are stored", "blocks/train.py", ", (f\"{path}: $.options: \", before or ())", ",", STORED),
+    of_host("in blocks: of a part", "blocks/folder.py", "if scene.endswith(ENDING):", "if False:", REFUSED),
+    of_host("in blocks: fewer than none", "blocks/folder.py", "Annotated[int, msgspec.Meta(ge=1)]", "int", REFUSED),
 ]  # fmt: skip

@@ -20,6 +20,13 @@ MIDDLE = "media/test_curves.py::test_the_mean_runs_through_the_middle"
 LONGER = "training/test_trainer.py::test_a_longer_training_follows_its_own_schedule_from_there_on"
 DONE = "training/test_trainer.py::test_a_training_that_is_done_needs_no_checkpoint"
 QUIET = "evaluation/test_metrics.py::test_threads_of_flip_do_not_spin_and_the_environment_stays"
+LINKED = "reports/test_compare.py::test_a_link_is_not_written_through"
+EMPTIED = "reports/test_compare.py::test_a_record_that_was_emptied_is_not_none"
+ALIVE = "runs/test_saves.py::test_what_another_process_writes_stays"
+COPIED = "runs/test_links.py::test_a_copy_by_hard_links_stays_as_it_is"
+COMES = "runs/test_links.py::test_a_link_that_comes_during_a_training_is_not_followed"
+LATER = "runs/test_listing.py::test_a_checkpoint_tells_the_step_before_the_first_report"
+EXPERIMENT, FILES, WRITING = "reports/experiment.py", "runs/files.py", "writing.py"
 COMPACT, SPLIT, HELD_OUT, LOGS = (
     *("runs/compact.py", "scenes/split.py"),
     *("training/held_out.py", "runs/logs.py"),
@@ -53,6 +60,15 @@ MUTANTS = [
     of_host("events stay", "runs/files.py", ", *(folder / TENSORBOARD).glob(EVENTS)]", "]", REPLACED),
     of_host("a mean that lags", "media/curves.py", "total[k + half + 1] - total[k - half]", "total[k + 1] - total[k - 2 * half]",
             MIDDLE),
+    # links, and what other processes write
+    of_host("links in a comparison", EXPERIMENT, "require_own(matching(folder, WRITTEN), \"a comparison\")", "pass", LINKED),
+    of_host("an emptied record is none", EXPERIMENT, "if found is not None and any(", "if found and any(", EMPTIED),
+    of_host("what is still written is swept", FILES, "if writer == os.getpid() or not is_alive(writer):", "if True:", ALIVE),
+    of_host("what has this number stays", FILES, "writer == os.getpid() or ", "", ALIVE),
+    of_host("a log that is whole is not rewritten", "runs/run.py", "            if path.exists():\n",
+            "            if path.exists() and rewound(path.read_bytes(), step) != path.read_bytes():\n", COPIED),
+    of_host("a link is appended to", WRITING, "getattr(os, \"O_NOFOLLOW\", 0) | ", "", COMES),
+    of_host("listed: the step of the last report", "runs/listing.py", "step=max(report.step, saved)", "step=report.step", LATER),
     # a longer training
     of_host("a grid that shrinks", "training/trainer.py", "if grown <= self._grown or", "if grown == self._grown or", LONGER),
     of_host("a checkpoint all the same", "training/trainer.py", "(checkpoint_when_done or self.fraction < 1.0)", "True", DONE),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 from dataclasses import replace
@@ -277,11 +278,15 @@ def test_more_seeds_and_configurations_are_accepted_and_leftovers_swept(
 ) -> None:
     folder = tmp_path / "out"
     folder.mkdir()
-    (folder / ".experiment.json.71.tmp").write_text("{")
+    dead = 4194304999  # no process has such a number
+    (folder / f".experiment.json.{dead}.tmp").write_text("{")
     made = experiment(folder, room, n_seeds=1)
     made.begin()
-    leftovers = [folder / ".report.html.71.tmp", folder / "moments" / "plain" / ".0.npz.71.tmp"]
-    leftovers[1].parent.mkdir(parents=True)
+    (folder / "moments" / "plain").mkdir(parents=True)
+    leftovers = [
+        folder / f".report.html.{dead}.tmp",
+        folder / f"moments/plain/.0.npz.{dead}.tmp",
+    ]
     for path in leftovers:
         path.write_bytes(b"")
     more = experiment(folder, room)
@@ -292,6 +297,46 @@ def test_more_seeds_and_configurations_are_accepted_and_leftovers_swept(
     assert record["seeds"] == 2 and list(record["configurations"]) == ["plain", "scaled", "third"]
     with pytest.raises(InputError, match="configurations has plain, scaled, third, not plain, sca"):
         experiment(folder, room).begin()
+
+
+def test_a_record_that_was_emptied_is_not_none(room: Scene, tmp_path: Path) -> None:
+    """Else results of other configurations would stand for those that are requested."""
+    (tmp_path / "experiment.json").write_text("{}")
+    with pytest.raises(InputError, match=r"another comparison: its scene is null, not \"builtin:"):
+        experiment(tmp_path, room).begin()
+
+
+@pytest.mark.parametrize("dangling", [False, True])
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("experiment.json", "report.html", "figures.json", "near.png", "floaters.mp4"),
+        *("views/test_00-plain.png", "moments/plain/0.npz", "runs/plain-seed-0/failed.json"),
+        *("views", "moments", "moments/plain", "runs", "runs/plain-seed-0"),
+    ],
+)
+def test_a_link_is_not_written_through(
+    room: Scene, tmp_path: Path, name: str, dangling: bool
+) -> None:
+    made, target = experiment(tmp_path / "out", room), tmp_path / "precious"
+    made.begin()
+    place = made.folder / name
+    place.parent.mkdir(parents=True, exist_ok=True)
+    place.unlink(missing_ok=True)
+    if not dangling and place.suffix:
+        target.write_text("precious")
+    elif not dangling:
+        (target / "0.npz").mkdir(parents=True)
+    place.symlink_to(target)
+    if name == "experiment.json":
+        (made.folder / "runs").mkdir()
+    with pytest.raises(InputError, match=f"{name} is a link, and a comparison writes only to"):
+        made.begin()
+    place.unlink()
+    if place.suffix:
+        os.mkfifo(place)
+        with pytest.raises(InputError, match=f"{name} is neither a file nor a folder"):
+            made.begin()
 
 
 def test_options_that_came_after_an_experiment_began_have_their_defaults(

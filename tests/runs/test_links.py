@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import os
+import shutil
 from pathlib import Path
 
 import msgspec
 import pytest
 
+from tests.support.faulty_saves import run_with, state_of
 from warpnerf.checks import InputError
+from warpnerf.cli.main import main
 from warpnerf.runs.lock import only_writer
 from warpnerf.sfm.scene_files import Record, remove_written
+from warpnerf.writing import open_to_append
 
 FILES = (".lock", "config.json", "log.jsonl", "metrics.json", "test.png", "field.safetensors")
 LATER = ("checkpoint-00000010.safetensors", "test/view.png", "previous/config.json")
@@ -77,6 +81,48 @@ def test_what_is_not_the_run_s_may_be_a_link(tmp_path: Path) -> None:
     for folder in (run, tmp_path / "by_link"):
         with only_writer(folder):
             pass
+
+
+def test_a_copy_by_hard_links_stays_as_it_is(tmp_path: Path) -> None:
+    """When the run is resumed from a checkpoint."""
+    run = run_with(tmp_path / "run", 1)
+    run.log(state_of(1).progress)
+    run.open_log("csv")
+    shutil.copytree(run.folder, tmp_path / "copy", copy_function=os.link)
+    before = {path: path.read_bytes() for path in (tmp_path / "copy").glob("*") if path.is_file()}
+    run.rewind_log(1)
+    run.log(state_of(2).progress)
+    run.write_to(run.open_log("csv"), state_of(2).progress)
+    run.save_checkpoint(state_of(2))
+    assert {path.name for path in before} >= {"log.jsonl", "log.csv", "config.json"}
+    assert all(path.read_bytes() == content for path, content in before.items())
+
+
+@pytest.mark.parametrize("name", ["log.jsonl", "log.csv"])
+def test_a_link_that_comes_during_a_training_is_not_followed(tmp_path: Path, name: str) -> None:
+    run, precious = run_with(tmp_path / "run", 1), tmp_path / "precious"
+    log = run.open_log("csv")
+    precious.write_text("precious")
+    (run.folder / name).unlink(missing_ok=True)
+    (run.folder / name).symlink_to(precious)
+    with pytest.raises(InputError, match=f"cannot be written: {name} is a link"):
+        run.log(state_of(2).progress)
+        run.write_to(log, state_of(2).progress)
+    assert precious.read_text() == "precious"
+
+
+def test_nobody_is_waited_for_who_would_read_a_pipe(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "log")
+    with pytest.raises(OSError, match="log"):
+        open_to_append(tmp_path / "log")
+
+
+def test_measures_are_not_added_through_a_link(tmp_path: Path) -> None:
+    run, precious = run_with(tmp_path / "run", 1), tmp_path / "precious"
+    precious.write_text('{"mean": {}}')
+    (run.folder / "metrics.json").symlink_to(precious)
+    assert main(["eval", str(run.folder), "--measures"]) == 2
+    assert precious.read_text() == '{"mean": {}}'
 
 
 def test_a_record_removes_no_folder_elsewhere(tmp_path: Path) -> None:

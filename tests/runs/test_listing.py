@@ -111,6 +111,23 @@ def test_clean_goes_on_past_a_run_that_is_trained_into(
     assert len(list((folder / "a").glob("checkpoint-*"))) == 1
 
 
+def test_a_checkpoint_tells_the_step_before_the_first_report(folder: Path) -> None:
+    for name in ("a", "deep/b"):
+        (folder / name / "checkpoint-00000075.safetensors").write_bytes(b"")
+    (folder / "a" / "log.jsonl").unlink()
+    assert [run.step for run in runs_in(folder)] == [75, 75]
+    (folder / "deep/b" / "checkpoint-00000075.safetensors").unlink()
+    assert [run.step for run in runs_in(folder)] == [75, 70]
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no pipes")
+def test_a_pipe_is_not_waited_for(folder: Path) -> None:
+    for name in ("log.jsonl", "metrics.json"):
+        (folder / "a" / name).unlink()
+        os.mkfifo(folder / "a" / name)
+    assert runs_in(folder)[0].step == 70 and not runs_in(folder)[0].metrics
+
+
 def test_files_may_go_meanwhile(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A training that saves a checkpoint removes older ones."""
     (run,) = runs_in(folder / "a")
@@ -187,7 +204,7 @@ def test_damaged_files_are_no_obstacle(folder: Path) -> None:
     (folder / "a" / "metrics.json").write_bytes(np.random.default_rng(0).bytes(99))
     (folder / "a" / "log.jsonl").write_text("\n\n[1]\n")
     (run,) = runs_in(folder / "a")
-    assert (run.step, run.metrics, run.is_finished) == (0, {}, False)
+    assert (run.step, run.metrics, run.is_finished) == (70, {}, False)
 
 
 def test_a_folder_that_is_named_as_a_checkpoint_is_left_alone(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -131,6 +132,18 @@ def test_killed_over_and_over_leaves_one_temporary_file(tmp_path: Path) -> None:
         assert in_child(save) == KILLED
         assert len(temporary(tmp_path)) == 1
     require_old_or_new(tmp_path, 2, 2)
+
+
+def test_what_another_process_writes_stays(tmp_path: Path) -> None:
+    """Such as an export into the folder of a run that is trained; not what is left of a process
+    that had this one's number, as in containers."""
+    run = run_with(tmp_path, 1)
+    numbers = (os.getppid(), os.getpid(), 4194304999)  # the last one is no process's
+    alive, *left = (tmp_path / f".mesh.npz.{number}.tmp" for number in numbers)
+    for path in (alive, *left):
+        path.write_bytes(b"")
+    run.save_checkpoint(state_of(2))
+    assert temporary(tmp_path) == [alive]
 
 
 def test_interrupted_at_any_call_nothing_is_lost_or_left(tmp_path: Path) -> None:

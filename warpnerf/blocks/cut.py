@@ -38,7 +38,7 @@ LEAST = 0.1
 """Share of an edge that a split leaves at either side, at least."""
 
 ROUNDING = 1e-9
-"""Of sums of weights."""
+"""Of sums of weights and of volumes."""
 
 MOST = 4096
 """Blocks."""
@@ -97,6 +97,27 @@ def cut(scene: Scene, count: int) -> list[Block]:
         box = np.stack([core[0] - margin, core[1] + margin])
         blocks.append(Block(core=core, cell=cell, box=box, views=tuple(views)))
     return blocks
+
+
+def fills(cores: np.ndarray, box: np.ndarray) -> bool:
+    """Whether boxes fill another one, each place once.
+
+    Args:
+        cores: [n, 2, 3] lower and upper corners, scene units.
+        box: [2, 3] those of the other one.
+    """
+    with np.errstate(all="ignore"):  # of values that are too large, which fill nothing
+        low, high = np.moveaxis((cores - box[0]) / (box[1] - box[0]), 1, 0)  # within [0, 1]
+        within = (low >= 0.0).all() and (low < high).all() and (high <= 1.0).all()
+        volume = (high - low).prod(axis=1).sum()
+    return bool(
+        (box[0] < box[1]).all()
+        and within
+        and abs(volume - 1.0) < ROUNDING
+        and not any(
+            ((low[:n] < high[n]) & (low[n] < high[:n])).all(axis=1).any() for n in range(len(low))
+        )
+    )
 
 
 def seen_by(scene: Scene, index: int) -> np.ndarray:

@@ -15,22 +15,24 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
-import warp as wp
 
-from warpnerf.blocks.cut import Block
+from warpnerf.blocks.cut import MOST, Block, fills
 from warpnerf.checks import InputError, cannot_write
 from warpnerf.media.pictures import png
 from warpnerf.media.scene_plan import blocks_picture
 from warpnerf.rendering.composite import CompositeField
 from warpnerf.rendering.field import Field
 from warpnerf.runs.config import RunConfig, TrainedScene
+from warpnerf.runs.lock import require_own
 from warpnerf.runs.run import Run
 from warpnerf.runtime.memory import available_memory
+from warpnerf.runtime.parallel import Workers
 from warpnerf.scenes.files import exists, read_json
 from warpnerf.scenes.formats.load import BUILTIN
 from warpnerf.scenes.formats.part import ENDING, Part, Triple, read_part
@@ -51,7 +53,7 @@ class BlockEntry(msgspec.Struct, frozen=True, kw_only=True):
     """Lower corner of its core, scene units."""
     core_max: Triple
     """Upper corner."""
-    photographs: int
+    photographs: Annotated[int, msgspec.Meta(ge=1)]
     """How many train it or are withheld."""
 
 
@@ -63,7 +65,7 @@ class BlocksConfig(TrainedScene, frozen=True, kw_only=True):
     them without end."""
     box_max: Triple
     """Upper corner."""
-    blocks: list[BlockEntry]
+    blocks: Annotated[list[BlockEntry], msgspec.Meta(min_length=1, max_length=MOST)]
     """In the order of their numbers."""
 
 
@@ -87,9 +89,12 @@ class BlockFolder:
         if not exists(path):
             raise InputError(f"{path} does not exist; name a folder that warpnerf blocks has made.")
         config = read_json(path, BlocksConfig)
-        corners = np.array([[b.core_min, b.core_max] for b in config.blocks]).reshape(-1, 2, 3)
-        if not len(corners) or not (corners[:, 0] < corners[:, 1]).all():
-            raise InputError(f"{path}: $.blocks: must be boxes, at least one; cut the scene again.")
+        cores = np.array([[block.core_min, block.core_max] for block in config.blocks])
+        if not fills(cores, np.array([config.box_min, config.box_max])):
+            raise InputError(
+                f"{path}: $.blocks: cores must fill the box of the scene, each place once; cut the "
+                "scene again."
+            )
         return BlockFolder(folder=folder, config=config)
 
     def __len__(self) -> int:
@@ -107,6 +112,10 @@ class BlockFolder:
     def run(self, number: int) -> Run:
         """The run of a block."""
         return Run(self.folder / self.name(number))
+
+    def log(self, number: int) -> Path:
+        """What the training of a block printed."""
+        return self.folder / f"{self.name(number)}.log"
 
     @property
     def begun(self) -> list[int]:
@@ -127,6 +136,18 @@ class BlockFolder:
         root = np.array([self.config.box_min, self.config.box_max])
         cores = np.array([[block.core_min, block.core_max] for block in self.config.blocks])
         return np.where(cores == root, np.array([[-np.inf] * 3, [np.inf] * 3]), cores)
+
+    def require_own_files(self, numbers: Sequence[int]) -> None:
+        """Refuse links, pipes and devices in place of what is written when blocks are trained.
+
+        Args:
+            numbers: Of the blocks.
+
+        Raises:
+            InputError: There is one.
+        """
+        paths = [(self.run(number).folder, self.log(number)) for number in numbers]
+        require_own([self.folder / OPTIONS, *chain(*paths)], "train-blocks")
 
     def require_own_runs(self, numbers: Sequence[int]) -> None:
         """Refuse blocks whose folder has results of another scene, such as of another cut.
@@ -217,7 +238,7 @@ class _Fields:
             self._kept.move_to_end(number)
             return self._kept[number][0]
         if self._room is None:
-            device = wp.get_device(self.how[0])
+            device = Workers(*self.how).device
             free = device.free_memory if device.is_cuda else available_memory()
             self._room = np.inf if free is None else MEMORY_SHARE * free
         run = self.runs[number]
@@ -248,7 +269,13 @@ def open_trained(folder: Path) -> Trained:
 def stored_source(
     scene: str, downscale: int, masks: Path | None, split: Split | None
 ) -> dict[str, Any]:
-    """What blocks.json says of a capture, see ``TrainedScene``."""
+    """What blocks.json says of a capture, see ``TrainedScene``.
+
+    Raises:
+        InputError: The scene is a part of a capture.
+    """
+    if scene.endswith(ENDING):
+        raise InputError(f"{scene} is a part of a capture already; name the whole one.")
     return {
         "scene": scene if scene.startswith(BUILTIN) else str(Path(scene).resolve()),
         "downscale": downscale,

@@ -90,15 +90,15 @@ def options_of(blocks: BlockFolder, given: Sequence[str]) -> list[str]:
         InputError: A block's training has such an option by itself, or blocks were begun with
             others.
     """
-    for word in given:
-        name = word.partition("=")[0]
-        if name in OWN:
-            raise InputError(
-                f"{name} is not an option for the training of blocks, which have their own; leave "
-                "it out."
-            )
     path = blocks.folder / OPTIONS
     before = read_json(path, StoredOptions).options if exists(path) else None
+    for where, words in (("", given), (f"{path}: $.options: ", before or ())):
+        for name in (word.partition("=")[0] for word in words):
+            if name in OWN:
+                raise InputError(
+                    f"{where}{name} is not an option for the training of blocks, which have their "
+                    "own; leave it out."
+                )
     if before is not None and (not given or list(given) == before):
         return before
     begun = blocks.begun
@@ -137,7 +137,7 @@ def work_of(blocks: BlockFolder, number: int, options: Sequence[str], threads: i
             words += [] if given & {*names} else [names[0], value]
         words += options
     words += ["--threads", str(threads)]
-    return Work(arguments=words, log=folder.with_name(f"{blocks.name(number)}.log"))
+    return Work(arguments=words, log=blocks.log(number).absolute())
 
 
 class BlockTraining:
@@ -248,7 +248,7 @@ class BlockTraining:
                 continue
             if self._step(number) > self._reached[number]:
                 self._tries[number] = 1
-            last = _last_line(self.log(number))
+            last = _last_line(self._blocks.log(number))
             refused = code == 2 and self._tries[number] == 1 and not self._step(number)
             if refused and not self._blocks.begun:  # so would be the others
                 raise InputError(f"{name}: {last.removeprefix('warpnerf: error: ')}")
@@ -260,22 +260,18 @@ class BlockTraining:
             self._not_before[number] = time.monotonic() + AGAIN
             self._waiting.insert(0, number)
 
-    def log(self, number: int) -> Path:
-        """What a block's training printed."""
-        return self._blocks.folder / f"{self._blocks.name(number)}.log"
-
     def _step(self, number: int) -> int:
         """Of a block's newest checkpoint."""
         return self._blocks.run(number).last_step or 0
 
     def _state(self, number: int) -> BlockState:
-        report = last_report(self._blocks.run(number).folder / "log.jsonl")
+        report = last_report(self._blocks.run(number).folder)
         if self._blocks.is_finished(number):
             state = "done"
         elif number in self.failed:
             state = "failed"
         elif number in self._running:
-            silent = _size(self.log(number)) == self._said[number]
+            silent = _size(self._blocks.log(number)) == self._said[number]
             state = "queued" if silent else "training"
         else:
             state = "stopped" if self._step(number) else "waiting"

@@ -56,11 +56,11 @@ def blocks_command(
     from warpnerf.scenes.images.photographs import Keeping
 
     chosen = None if split is None else read_split(split)
+    source = stored_source(scene, downscale, masks, chosen)
     print(f"reading {scene}", flush=True)
     whole = load_scene(
         scene, downscale=downscale, masks=masks, images="files", threads=threads, split=chosen
     )
-    source = stored_source(scene, downscale, masks, chosen)
     made = write_blocks(output, whole, source, cut(whole, count))
     configs = [
         replace(preset, grid=replace(preset.grid, box="scene", contraction="linf"))
@@ -126,6 +126,7 @@ def train_blocks_command(
     if threads is not None and engine == "local":
         require_threads(threads)
     numbers = range(len(blocks)) if only is None else [only]
+    blocks.require_own_files(numbers)
     blocks.require_own_runs(numbers)
     options = options_of(blocks, _words_for_train(train_options))
     where = _engine(engine, address, workers, threads)
@@ -138,7 +139,7 @@ def train_blocks_command(
     states = training.states()
     print_table(HEADINGS, [s.row for s in states], [s.state == "failed" for s in states])
     for number in training.failed:
-        print(f"{blocks.name(number)} failed; {training.log(number)} says why")
+        print(f"{blocks.name(number)} failed; {blocks.log(number)} says why")
     if code > 1:
         print(f"stopped; continue with: warpnerf train-blocks {shlex.quote(str(folder))}")
     return code

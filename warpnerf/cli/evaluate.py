@@ -41,6 +41,7 @@ def eval_command(
     """
     from warpnerf.blocks.folder import open_trained
     from warpnerf.evaluation.evaluate import evaluate, require_measurable
+    from warpnerf.runs.lock import require_own
     from warpnerf.runs.run import Run
     from warpnerf.runs.scene import path_of
     from warpnerf.scenes.formats.load import load_scene
@@ -57,6 +58,7 @@ def eval_command(
     kept = run if isinstance(run, Run) and its_own and measures else None
     if kept is not None:
         kept.read_metrics()  # refused now, if it is damaged
+        require_own([kept.folder / "metrics.json"], "a run")
     field, notes = run.load_field(device, threads)
     for note in notes:
         print(f"warpnerf: note: {note}", file=sys.stderr)

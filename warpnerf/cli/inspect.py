@@ -113,14 +113,17 @@ def _write_plots(scene: Scene, folder: Path) -> None:
     """Write plots of how cameras share what they see.
 
     Raises:
-        InputError: They cannot be written.
+        InputError: They cannot be written, or one of them is a link.
     """
     from warpnerf.media.overlap_plots import overlap_plots
     from warpnerf.media.pictures import write_png
+    from warpnerf.runs.lock import require_own
 
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name, picture in overlap_plots(scene).items():
+        plots = overlap_plots(scene)
+        require_own((folder / name for name in plots), "inspect")
+        for name, picture in plots.items():
             write_png(folder / name, picture)
             print(f"wrote {folder / name}")
     except OSError as error:

@@ -24,6 +24,7 @@ from warpnerf.config_json import config_from_json, config_to_json, decode
 from warpnerf.evaluation.sight import SurfaceVisibility
 from warpnerf.rendering.field import Field, Rendering
 from warpnerf.runs.files import is_leftover, sweep
+from warpnerf.runs.lock import matching, require_own
 from warpnerf.runs.run import Run
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.files import read_json
@@ -43,6 +44,13 @@ MOMENT_PIXELS = 320 * 240
 """Of these renderings, at most, about."""
 
 RECORD, FAILED = "experiment.json", "failed.json"
+
+WRITTEN = (
+    *("*.json", "*.html", "*.png", "*.mp4", "*.gif", "views", "views/*.png"),
+    *("moments", "moments/*", "moments/*/*.npz", "runs", "runs/*", "runs/*/*.json*"),
+)
+"""What an experiment and its report write in the folder, as patterns of names; folders before what
+lies in them. Each run has a list of its own."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,14 +102,15 @@ class Experiment:
         """Make the folder, or continue in it, with more seeds or configurations as well.
 
         Raises:
-            InputError: It holds another experiment or other files, or cannot be written to.
+            InputError: It holds another experiment, other files, or links in place of its own; or
+                it cannot be written to.
         """
         path = self.folder / RECORD
         require_free(self.folder)
         wanted = json.loads(json.dumps(self._record()))
-        found = read_json(path, dict[str, Any], _of_today) if path.exists() else {}
-        begun = _begun(wanted, found)
-        if found and any(found.get(name) != begun[name] for name in begun):
+        found = read_json(path, dict[str, Any], _of_today) if path.exists() else None
+        begun = wanted if found is None else _begun(wanted, found)
+        if found is not None and any(found.get(name) != begun[name] for name in begun):
             wrong = f"holds another comparison: its {_difference(found, begun)}; name a new folder."
             if found | {"views": begun["views"]} == begun:
                 wrong = (
@@ -286,7 +295,7 @@ def require_free(folder: Path) -> None:
     """Raise InputError where a folder holds other files than those of an experiment.
 
     Raises:
-        InputError: It does, or cannot be read.
+        InputError: It does, has links in place of them, or cannot be read.
     """
     try:
         names = sorted(p.name for p in folder.iterdir() if not is_leftover(p))
@@ -296,6 +305,7 @@ def require_free(folder: Path) -> None:
         raise cannot_write(f"--output {folder}", error) from error
     if names and RECORD not in names:
         raise InputError(f"--output {folder} holds other files ({names[0]}); name a new folder.")
+    require_own(matching(folder, WRITTEN), "a comparison")
 
 
 def _of_today(record: Any) -> Any:

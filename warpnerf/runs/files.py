@@ -6,6 +6,7 @@ Nothing else in the folder is touched. What each file is, run.py lists.
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Callable
 from contextlib import suppress
@@ -18,6 +19,7 @@ from warpnerf.checks import InputError
 from warpnerf.runs import lock
 from warpnerf.runs.config import RunConfig, read_run_config
 from warpnerf.runs.logs import CSV, EVENTS, TENSORBOARD
+from warpnerf.runtime.process import is_alive
 from warpnerf.sfm.scene_files import (
     IN_RUN,
     NEXT_IN_RUN,
@@ -125,10 +127,13 @@ def _counts(path: Path) -> bool:
 
 
 def sweep(folder: Path) -> None:
-    """Remove what processes left behind that were killed while saving."""
+    """Remove what processes left behind that were killed while saving, but nothing that a process
+    of this machine still writes, such as an export."""
     for path in folder.glob(".*.tmp"):
         if is_leftover(path):
-            path.unlink()
+            writer = int(path.name.split(".")[-2])
+            if writer == os.getpid() or not is_alive(writer):  # in containers, numbers come again
+                path.unlink(missing_ok=True)
 
 
 def is_leftover(path: Path) -> bool:

@@ -20,7 +20,7 @@ from warpnerf.runs import files, lock
 from warpnerf.runs.config import RunConfig
 from warpnerf.runs.names import scene_name
 from warpnerf.runtime.terminal import table_text
-from warpnerf.scenes.files import exists, printable
+from warpnerf.scenes.files import exists, printable, require_regular_file
 from warpnerf.sfm.scene_files import IN_RUN, read_record
 
 DEPTH = 3
@@ -55,7 +55,7 @@ class RunSummary:
     config: RunConfig
     """What was requested."""
     step: int
-    """Of the last report; 0: there is none."""
+    """Of the last report or checkpoint; 0: there is none."""
     fraction: float
     """Of the training that is done, [0, 1]."""
     seconds: float
@@ -205,9 +205,9 @@ def runs_table(runs: Sequence[RunSummary], folder: Path) -> str:
 
 def _summary(folder: Path) -> RunSummary:
     config = files.read_config(folder)
-    last, metrics = last_report(folder / "log.jsonl"), Metrics()
-    with suppress(OSError, msgspec.MsgspecError):
-        metrics = msgspec.json.decode((folder / "metrics.json").read_bytes(), type=Metrics)
+    last, metrics = last_report(folder), Metrics()
+    with suppress(msgspec.MsgspecError):
+        metrics = msgspec.json.decode(_content(folder / "metrics.json"), type=Metrics)
     return RunSummary(
         folder=folder,
         config=config,
@@ -245,13 +245,23 @@ def _scene_of(run: RunSummary) -> str:
     return scene_name(source)
 
 
-def last_report(log: Path) -> Report:
-    """The last line of a log that is whole: a crash may have cut one off."""
-    with suppress(OSError):
-        for line in reversed(log.read_bytes().splitlines()):
-            with suppress(msgspec.MsgspecError):
-                return msgspec.json.decode(line, type=Report)
-    return Report()
+def last_report(folder: Path) -> Report:
+    """The last line of a run's log that is whole, as a crash may have cut one off; with the step of
+    its newest checkpoint where that is a later one."""
+    saved = max(map(files.step_of, files.checkpoints(folder)), default=0)
+    for line in reversed(_content(folder / "log.jsonl").splitlines()):
+        with suppress(msgspec.MsgspecError):
+            report = msgspec.json.decode(line, type=Report)
+            return msgspec.structs.replace(report, step=max(report.step, saved))
+    return Report(step=saved)
+
+
+def _content(path: Path) -> bytes:
+    """What a file holds; nothing where it cannot be read, or a pipe or device is in its place."""
+    with suppress(OSError, InputError):
+        require_regular_file(path)
+        return path.read_bytes()
+    return b""
 
 
 def _changes(config: TrainConfig, begin: TrainConfig) -> dict[str, Any]:

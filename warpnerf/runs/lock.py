@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -80,23 +80,41 @@ def is_held(folder: Path) -> bool:
 
 
 def require_own_files(folder: Path) -> None:
-    """Raise InputError where a file of a run is a symbolic link, a pipe or a device.
-
-    What a link leads to would be overwritten or removed, and a pipe be waited for without end.
-    """
+    """Raise InputError where a file of a run is a symbolic link, a pipe or a device."""
     older = folder / "previous"
     paths = [folder / name for name in (NAME, "next", "next/scene", older.name)]
-    for place in (folder, older):
-        for name in WRITTEN:
-            paths += sorted(place.glob(name)) if "*" in name else [place / name]
+    paths += [*matching(folder, WRITTEN), *matching(older, WRITTEN)]
     for place in (folder, folder / "next", older):
         for inside, folders, files in os.walk(place / "scene"):
             paths += [Path(inside, name) for name in sorted((*folders, *files))]
+    require_own(paths, "a run")
+
+
+def matching(folder: Path, patterns: Iterable[str]) -> Iterator[Path]:
+    """Files and folders by patterns of names, and links that lead to nothing as well.
+
+    Args:
+        folder: In which they are looked for.
+        patterns: Such as ``test/*.png``. Names without * need not exist.
+    """
+    for name in patterns:
+        yield from sorted(folder.glob(name)) if "*" in name else [folder / name]
+
+
+def require_own(paths: Iterable[Path], writer: str) -> None:
+    """Raise InputError where a path is that of a symbolic link, a pipe or a device.
+
+    What a link leads to would be overwritten or removed, and a pipe be waited for without end.
+
+    Args:
+        paths: Of what may be written; folders before what lies in them.
+        writer: Of them, such as "a run".
+    """
     for path in paths:
         if path.is_symlink():
             raise InputError(
-                f"{path} is a link, and a run writes only to files of its own folder; remove the "
-                "link, or name another folder."
+                f"{path} is a link, and {writer} writes only to files of its own folder; remove "
+                "the link, or name another folder."
             )
         if path.exists() and not (path.is_file() or path.is_dir()):
             raise InputError(

@@ -16,6 +16,7 @@ import msgspec
 from warpnerf.checks import InputError
 from warpnerf.media.curves import CurvePoint
 from warpnerf.training.state import Progress
+from warpnerf.writing import open_to_append, write_atomically
 
 LogKind = Literal["csv", "tensorboard", "wandb"]
 
@@ -74,12 +75,13 @@ class CsvLog:
     def __init__(self, path: Path, reports: Sequence[Mapping[str, Any]]) -> None:
         """Write the lines so far; what a resumed training does again is dropped."""
         self._path = path
-        path.write_text(",".join(COLUMNS) + "\n" + "".join(map(_line, reports)), newline="")
+        # A file of its own: that of before may have another name as well, as a hard link.
+        write_atomically(path, (",".join(COLUMNS) + "\n" + "".join(map(_line, reports))).encode())
 
     def write(self, progress: Progress) -> None:
         """Append a line."""
-        with self._path.open("a", newline="") as file:
-            file.write(_line(vars(progress)))
+        with open_to_append(self._path) as file:
+            file.write(_line(vars(progress)).encode())
 
     def close(self, metrics: Mapping[str, float]) -> None:
         """All is written already."""

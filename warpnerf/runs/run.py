@@ -50,7 +50,7 @@ from warpnerf.scenes.files import read_json
 from warpnerf.scenes.scene import Scene
 from warpnerf.scenes.split import Split
 from warpnerf.training.state import MAY_GROW, Progress, TrainingState, differences
-from warpnerf.writing import write_atomically
+from warpnerf.writing import open_to_append, write_atomically
 
 KEPT = 2
 """Checkpoints: should the last turn out to be damaged, there is the one before."""
@@ -179,8 +179,8 @@ class Run:
         Raises:
             InputError: It cannot be written.
         """
-        with self._writing(), (self.folder / "log.jsonl").open("a") as file:
-            file.write(json.dumps(asdict(progress)) + "\n")
+        with self._writing(), open_to_append(self.folder / "log.jsonl") as file:
+            file.write(json.dumps(asdict(progress)).encode() + b"\n")
 
     def save_checkpoint(self, state: TrainingState) -> None:
         """Write a checkpoint beside the last one; older ones are then removed.
@@ -299,15 +299,16 @@ class Run:
     def rewind_log(self, step: int) -> None:
         """Drop reports of steps that will be done again, and a line that a crash cut off.
 
+        The log becomes a file of its own: that of before may be in a copy of the folder as well,
+        as a hard link.
+
         Raises:
             InputError: It cannot be written.
         """
         path = self.folder / "log.jsonl"
         with self._writing():
-            content = path.read_bytes() if path.exists() else b""
-            kept = rewound(content, step)
-            if kept != content:
-                write_atomically(path, kept)
+            if path.exists():
+                write_atomically(path, rewound(path.read_bytes(), step))
 
     def discard_figures(self) -> None:
         """Remove metrics and pictures, before the field becomes another one.

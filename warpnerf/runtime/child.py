@@ -13,6 +13,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from warpnerf.writing import open_to_append
+
 IS_CHILD = "WARPNERF_CHILD"
 """Environment variable that is set in such processes."""
 
@@ -31,10 +33,10 @@ def start(arguments: Sequence[str], log: Path) -> subprocess.Popen[bytes]:
         log: What it prints is appended to this file.
 
     Raises:
-        OSError: The file cannot be written to, or there is no room for a process.
+        OSError: The file cannot be written to or is a link, or there is no room for a process.
     """
     words = [sys.executable, "-m", "warpnerf.runtime.child", str(os.getpid()), *arguments]
-    with log.open("ab") as file:
+    with open_to_append(log) as file:
         return subprocess.Popen(
             words,
             stdin=subprocess.DEVNULL,

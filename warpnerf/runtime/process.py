@@ -25,3 +25,20 @@ def make_own() -> None:
 def is_own() -> bool:
     """Whether it is."""
     return _own
+
+
+def is_alive(process: int) -> bool:
+    """Whether a process runs on this machine; true where that cannot be found out.
+
+    Args:
+        process: Its number.
+    """
+    if os.name != "posix":  # where the call would end it
+        return True
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:  # another user's
+        return True
+    return True

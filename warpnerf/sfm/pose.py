@@ -19,6 +19,7 @@ from PIL import Image
 from warpnerf.checked import checked_arguments
 from warpnerf.checks import InputError
 from warpnerf.runtime.memory import usable_cores
+from warpnerf.runtime.process import is_alive
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.cameras.lens import FISHEYE
 from warpnerf.scenes.cameras.undistort import COEFFICIENTS
@@ -225,18 +226,8 @@ def _sweep(place: Path, name: str) -> None:
     """Remove what processes left behind that were killed."""
     for folder in place.glob(f".{glob.escape(name)}.*.tmp"):
         number = folder.name.split(".")[-2]
-        if number.isdigit() and os.name == "posix" and not _is_alive(int(number)):
+        if number.isdecimal() and not is_alive(int(number)):
             shutil.rmtree(folder, ignore_errors=True)
-
-
-def _is_alive(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except OSError:  # another user's
-        return True
-    return True
 
 
 def _into_scene(
