@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import importlib.util
 import math
+import operator
 from collections.abc import Iterable
 
 import numpy as np
@@ -33,8 +34,13 @@ def way_out(error: OSError) -> str:
         return "make room there, or name another place"
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         return "give access to it, or name another place"
+    if error.errno in (errno.EEXIST, errno.ELOOP):  # where a folder is to be made
+        return "remove the file or the link of that name, or name another place"
     return "check that it exists and may be used"
 
+
+MAX_COORDINATE = 1e12
+"""Scene units; larger numbers are mistakes, and their squares would overflow."""
 
 LONGEST = 60
 """Characters of a value that a sentence quotes."""
@@ -54,28 +60,39 @@ def said(value: object) -> str:
     return text if len(text) <= LONGEST else f"{text[: LONGEST - 4]}...{text[-1]}"
 
 
-def _is_finite(value: object) -> bool:
+def is_finite(value: object) -> bool:
+    """Whether a value is a finite number, or an array of one."""
     try:
         return math.isfinite(value)  # type: ignore[arg-type]
-    except (TypeError, OverflowError):  # no number, or a larger one than there are
+    except (TypeError, ValueError, OverflowError, RuntimeError):  # no number, or too large a one
         return False
 
 
 def require_finite(field: str, value: float) -> None:
     """Raise InputError unless value is a finite number."""
-    if not _is_finite(value):
+    if not is_finite(value):
         raise InputError(f"{field} must be a finite number, not {said(value)}.")
 
 
 def require_positive(field: str, value: float) -> None:
     """Raise InputError unless value is a finite number above zero; NaN is refused as well."""
-    if not (_is_finite(value) and value > 0):
+    if not (is_finite(value) and value > 0):
         raise InputError(f"{field} must be a finite number above 0, not {said(value)}.")
+
+
+def require_length(field: str, value: float) -> None:
+    """Raise InputError unless value is a length above zero that single precision can square."""
+    require_positive(field, value)
+    if not 1.0 / MAX_COORDINATE <= value <= MAX_COORDINATE:
+        raise InputError(
+            f"{field} must lie between {1.0 / MAX_COORDINATE:g} and {MAX_COORDINATE:g} scene "
+            f"units, not at {said(value)}."
+        )
 
 
 def require_at_least(field: str, value: float, least: float) -> None:
     """Raise InputError unless value is a finite number of at least `least`."""
-    if not (_is_finite(value) and value >= least):
+    if not (is_finite(value) and value >= least):
         raise InputError(
             f"{field} must be a finite number of at least {least:g}, not {said(value)}."
         )
@@ -83,7 +100,11 @@ def require_at_least(field: str, value: float, least: float) -> None:
 
 def require_whole(field: str, value: int, least: int) -> None:
     """Raise InputError unless value is a whole number of at least `least`, below 2^63."""
-    if isinstance(value, bool) or not hasattr(value, "__index__") or value < least:
+    try:
+        whole = not isinstance(value, bool) and operator.index(value) >= least
+    except TypeError:  # no whole number, or an array of another kind or of several
+        whole = False
+    if not whole:
         raise InputError(f"{field} must be a whole number of at least {least}, not {said(value)}.")
     if value >= 2**63:
         raise InputError(f"{field} must be below 2^63, which is more than any machine counts to.")
@@ -91,7 +112,7 @@ def require_whole(field: str, value: int, least: int) -> None:
 
 def require_one_of(field: str, value: str, choices: Iterable[str]) -> None:
     """Raise InputError unless value is one of the choices."""
-    if value not in choices:
+    if not isinstance(value, str) or value not in choices:
         raise InputError(f"{field} must be one of {', '.join(choices)}, not {said(value)}.")
 
 
@@ -127,8 +148,11 @@ def require_extra(package: str, extra: str, what: str) -> None:
 
 
 def require_rays(origins: np.ndarray, directions: np.ndarray) -> None:
-    """Raise InputError unless both are [n_rays, 3], finite, and directions of unit length."""
+    """Raise InputError unless both are [n_rays, 3], of finite real numbers, and directions of unit
+    length."""
     for name, array in (("origins", origins), ("directions", directions)):
+        if array.dtype.kind not in "fiu":
+            raise InputError(f"{name} must be real numbers, not {array.dtype}.")
         if array.ndim != 2 or array.shape[1] != 3:
             raise InputError(f"{name} must have shape [n_rays, 3], not {list(array.shape)}.")
         if not np.isfinite(array).all():

@@ -11,6 +11,7 @@ from warpnerf.checks import (
     InputError,
     require_at_least,
     require_kind,
+    require_length,
     require_one_of,
     require_positive,
     require_whole,
@@ -315,7 +316,7 @@ class TrainConfig:
         if isinstance(self.content_distance, str):
             require_one_of("content_distance", self.content_distance, ("auto", "per-camera"))
         else:
-            require_positive("content_distance", self.content_distance)
+            require_length("content_distance", self.content_distance)
         if isinstance(self.background, str):
             require_one_of("background", self.background, get_args(Background))
         elif len(self.background) != 3 or not all(

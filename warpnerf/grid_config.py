@@ -7,6 +7,7 @@ from typing import Literal
 
 from warpnerf.checked import checked
 from warpnerf.checks import (
+    MAX_COORDINATE,
     InputError,
     require_at_least,
     require_one_of,
@@ -31,9 +32,6 @@ growth leaves that out; elsewhere coarse grids do more in the same time."""
 
 MAX_VOXELS = 2**31
 """Nodes are counted in 32 bits."""
-
-MAX_COORDINATE = 1e12
-"""Of a corner of a box, scene units: as of poses."""
 
 MIN_EDGE = 1e-3
 """Of a box, in its longest edges: voxels are cubes, and one axis alone takes all nodes of a rod."""

@@ -81,7 +81,9 @@ is of s; an MLP colours each sample. Different here:
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from types import MappingProxyType
 
 from warpnerf.config import GridConfig, LossConfig, MarchConfig, TrainConfig
 from warpnerf.model.models import PerSample
@@ -119,7 +121,7 @@ _DVGO = TrainConfig(
     loss=LossConfig(entropy=3e-3, sample_colour=3e-2),
 )
 
-PRESETS: dict[str, TrainConfig] = {
+_PRESETS = {
     "fast": _FAST,
     "quality": replace(
         _FAST,
@@ -244,6 +246,8 @@ PRESETS: dict[str, TrainConfig] = {
         loss=LossConfig(photometric="huber", distortion=0.03, opacity="auto"),
     ),
 }
+
+PRESETS: Mapping[str, TrainConfig] = MappingProxyType(_PRESETS)
 """By name; change one with ``dataclasses.replace``."""
 
 DEFAULT_PRESETS = ("fast", "quality")

@@ -5,14 +5,29 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO
 
 CHUNK = 1 << 24
 """Bytes per write: signals such as Ctrl-C wait for one to end."""
+
+LONGEST_NAME = 220
+"""Bytes of a name that can be added to: systems of files take 255."""
+
+
+def temporary_name(name: str) -> str:
+    """What a file or folder is called beside its place while it is written.
+
+    That is ``.NAME.PROCESS.tmp``, with the end of a name that is too long for more.
+    """
+    whole = os.fsencode(name)
+    if len(whole) > LONGEST_NAME:
+        name = f"{zlib.crc32(whole):08x}-{name[-50:]}"
+    return f".{name}.{os.getpid()}.tmp"
 
 
 def write_atomically(path: str | Path, *pieces: bytes | memoryview) -> None:
@@ -99,7 +114,7 @@ class StagedWrites:
         fill(temporary)
 
     def _beside(self, path: Path) -> Path:
-        temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+        temporary = path.with_name(temporary_name(path.name))
         self._ready.append((temporary, path))
         return temporary
 
@@ -126,10 +141,11 @@ class StagedWrites:
                     n_renamed += 1
         finally:
             for temporary, _ in self._ready[n_renamed:]:
-                if temporary.is_dir():
-                    shutil.rmtree(temporary, ignore_errors=True)
-                else:
-                    temporary.unlink(missing_ok=True)
+                with suppress(OSError):  # one may not be there, and another error is on its way
+                    if temporary.is_dir():
+                        shutil.rmtree(temporary, ignore_errors=True)
+                    else:
+                        temporary.unlink()
         if kind is None and os.name == "posix":
             for parent in {path.parent for _, path in self._ready}:
                 folder = os.open(parent, os.O_RDONLY)

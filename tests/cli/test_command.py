@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -158,7 +159,7 @@ def test_overwrite_replaces_a_run(tmp_path: Path) -> None:
 def test_a_time_limit_takes_the_place_of_the_presets_steps(tmp_path: Path) -> None:
     few = replace(PRESETS["fast"], steps=2)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(PRESETS, "fast", few)
+        patch.setattr(train, "PRESETS", {**PRESETS, "fast": few})
         begun = []
         patch.setattr(train, "_begin", lambda *a: begun.append(a[3]) or 0)
         for given in (
@@ -301,6 +302,17 @@ def test_a_training_that_nobody_reads_goes_on(tmp_path: Path) -> None:
     assert process.wait(timeout=240) == 0, err
     assert "Traceback" not in err and "Broken pipe" not in err
     assert (tmp_path / "run" / "metrics.json").exists()
+
+
+def test_streams_that_are_closed_take_nothing_away(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in ``warpnerf train ... >&- 2>&-``."""
+    monkeypatch.setattr(sys, "stdout", None)
+    monkeypatch.setattr(sys, "stderr", None)
+    monkeypatch.setattr(train, "_begin", lambda *_: 7 if sys.stdout and sys.stderr else 0)
+    assert main(["train", "builtin:room", "--output", str(tmp_path / "a")]) == 7
+    assert main(["train", "--none"]) == 2
 
 
 def test_what_is_odd_is_said_in_training(tmp_path: Path) -> None:

@@ -139,6 +139,10 @@ def test_a_folder_that_holds_something_is_left_alone(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="needs the scene"):
         export(ball_field(), tmp_path / "other", level=LEVEL)
     assert not (tmp_path / "other").exists()
+    (tmp_path / "mesh").touch()
+    for path in (tmp_path / "mesh", "/dev/stdout"):
+        with pytest.raises(InputError, match="its name has no ending, which says what to write"):
+            export(ball_field(), path, scene=ball_scene(), level=LEVEL)
 
 
 def test_what_fails_half_way_leaves_nothing(

@@ -15,6 +15,7 @@ import warpnerf as wn
 from tests.exporting.test_cameras import ball_scene
 from tests.hostile.running import Case, fresh
 from tests.hostile.values import PYTHON
+from tests.rendering.test_composite import composite_of
 from tests.support.solid_fields import ball_field
 from tests.support.tiny_fields import tiny_field, tiny_state
 from tests.support.tiny_scenes import ring, tiny_scene
@@ -32,6 +33,7 @@ def targets(base: Path) -> dict[str, Maker]:
     rays = {"origins": np.zeros((2, 3)), "directions": np.array([[0.0, 0, 1]] * 2)}
     of_scene = {n: getattr(scene, n) for n in scene.__dataclass_fields__ if n != "warnings"}
     view = scene.views[0]
+    together = composite_of([field] * 4)
     path = str(base / "scene")
     calls: dict[str, Maker] = {
         "load_scene": lambda: (wn.load_scene, {"path": path}),
@@ -66,6 +68,11 @@ def targets(base: Path) -> dict[str, Maker]:
         "demo": lambda: (wn.demo, {"output": "out", "steps": 0, "downscale": 32}),
         "field.render": lambda: (field.render, {"camera": camera}),
         "field.render_rays": lambda: (field.render_rays, rays),
+        "field.beyond": lambda: (lambda distance: field.beyond(distance).render(camera), {}),
+        "field.up_to": lambda: (lambda distance: field.up_to(distance).render(camera), {}),
+        "field.cropped": lambda: (field.cropped, {"low": (-1.0,) * 3, "high": (1.0,) * 3}),
+        "composite.cropped": lambda: (together.cropped, {"low": (-1.0,) * 3, "high": (1.0,) * 3}),
+        "CompositeField": lambda: (wn.CompositeField, vars(together)),
         "Camera": lambda: (wn.Camera, lens),
         "View": lambda: (wn.View, {"name": "a", "camera": camera, "image": view.image}),
         "Scene": lambda: (wn.Scene, of_scene),
@@ -101,8 +108,18 @@ def torch_targets() -> dict[str, Maker]:
     return {
         "scale_gradient": lambda: (wt.scale_gradient, scaled),
         "render_rays": lambda: (wt.render_rays, {**rendered, "box": box, "step": 0.5}),
-        "March": lambda: (wt.March, {"step": 0.5}),
-        "Head": lambda: (wt.Head, {"model": "rgb", "layers": ()}),
+        "March": lambda: (
+            lambda step, near, far: wt.render_rays(
+                **rendered, box=box, step=wt.March(step, near, far)
+            ),
+            {"step": 0.5, "near": 0.0, "far": None},
+        ),
+        "Head": lambda: (
+            lambda model, layers: wt.render_rays(
+                **rendered, box=box, step=0.5, head=wt.Head(model, layers)
+            ),
+            {"model": "rgb", "layers": ()},
+        ),
     }
 
 

@@ -113,6 +113,14 @@ def test_stills_have_the_names_they_are_given(tmp_path: Path) -> None:
     np.testing.assert_array_equal(pixels, expected)
 
 
+@pytest.mark.parametrize("name", ["../x", "/x.png", "a/b.png", "a/", "", ".", "..", "a\0b"])
+def test_stills_stay_in_their_folder(tmp_path: Path, name: str) -> None:
+    cameras = {"a.png": path()[0], name: path()[0]}
+    with pytest.raises(InputError, match="by names of files without a path, not "):
+        render_stills(tiny_field(), cameras, tmp_path / "stills")
+    assert not any(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("depths", [(2.0, 2.0), (3.0, 1.0), (-1.0, 2.0), (0.0, float("nan"))])
 def test_depths_in_the_wrong_order_are_refused(tmp_path: Path, depths: Any) -> None:
     with pytest.raises(InputError, match="range of depths"):

@@ -78,6 +78,32 @@ def test_it_is_said_which_and_what_is_wanted(make: Any, says: str) -> None:
         make()
 
 
+@pytest.mark.parametrize(
+    ("kind", "name", "value"),
+    [
+        (wn.Deferred, "specular", "1"),
+        (wn.Deferred, "frequencies", np.array(1.5)),
+        (wn.PerSample, "hidden_layers", np.array(1.5)),
+        (wn.SphericalHarmonics, "degree", np.array(1.5)),
+        (wn.Hash, "coarsest", np.array(1.5)),
+        (wn.Hash, "levels", np.array([2, 3])),
+        (wn.Vm, "learning_rate", "0.1"),
+        (wn.Resampled, "update_every", np.array(1.5)),
+    ],
+)
+def test_nothing_is_rounded_or_read_from_text(kind: Any, name: str, value: Any) -> None:
+    with pytest.raises(InputError, match=rf"\.{name} must be a "):
+        kind(**{name: value})
+
+
+def test_presets_stay_what_they_are() -> None:
+    presets: Any = wn.PRESETS
+    with pytest.raises(TypeError, match="does not support item"):
+        presets["fast"] = 5
+    with pytest.raises(TypeError, match="does not support item"):
+        del presets["ngp"]
+
+
 def test_numbers_of_numpy_are_numbers() -> None:
     config = wn.TrainConfig(
         steps=np.int64(7),

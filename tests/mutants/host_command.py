@@ -35,6 +35,8 @@ MUTANTS = (
             r"e\d{1,2}", r"e\d{1,2}z", TAKEN),
     of_host("options: help of fast whatever the preset", "cli/main.py",
             '.get("--preset", "fast")', '.get("--preset", "fast") and "fast"', PRESET),
+    of_host("streams: closed ones are none", "cli/main.py", "if getattr(sys, name) is None:", "if False:",
+            "cli/test_command.py::test_streams_that_are_closed_take_nothing_away"),
     of_host("repeat: the scene beside the folder of this process", REPEAT,
             "scene=str(path.parent / config.scene)", "scene=config.scene", FOUND),
     of_host("repeat: fields of parts are not looked at", REPEAT,

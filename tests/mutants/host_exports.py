@@ -17,6 +17,7 @@ FAR = "exporting/test_spz.py::test_far_splats_do_not_cost_the_near_ones_their_pl
 TEXELS = "exporting/test_atlas.py::test_texels_show_their_places"
 LARGEST = "exporting/test_atlas.py::test_a_texture_stays_within_the_largest"
 FEWER = "exporting/test_decimation.py::test_a_ball_of_fewer_faces_stays_a_closed_ball"
+LONG_NAMES = "project/test_writing.py::test_names_as_long_as_they_may_be_are_written"
 BORDER = "exporting/test_decimation.py::test_a_plane_keeps_its_border_and_a_crease"
 LEFT = "exporting/test_decimation.py::test_what_cannot_be_contracted_is_left"
 CLOSED = "exporting/test_holes.py::test_a_narrow_hole_is_closed_and_a_wide_one_is_told"
@@ -54,6 +55,13 @@ MUTANTS = [
     # holes.py, pinhole.py, first_view.py
     of_host("holes: fans inside out", HOLES, "[np.roll(border, -1), border, middle]", "[border, np.roll(border, -1), middle]",
             CLOSED),
+    # writing.py, filming.py
+    of_host("writing: the end of a name alone", "writing.py", "{zlib.crc32(whole):08x}-", "", LONG_NAMES),
+    of_host("writing: long names are added to", "writing.py", "if len(whole) > LONGEST_NAME:", "if False:", LONG_NAMES),
+    of_host("writing: the last error is told", "writing.py", "suppress(OSError)", "suppress(KeyError)",
+            "project/test_writing.py::test_what_cannot_be_removed_hides_no_error"),
+    of_host("stills: wherever names lead", "media/filming.py", " or Path(name).name != name", "",
+            "media/test_filming.py::test_stills_stay_in_their_folder"),
     of_host("pinhole: a pixel aside", PINHOLE, "(camera.cx, camera.cy) - 0.5", "(camera.cx, camera.cy) + 1.5", PIXEL),
     of_host("pinhole: masks as they are", PINHOLE, "_interpolated(both.astype(np.float32)[..., None], low, shares)[..., 0]",
             "both.astype(np.float32)", PIXEL),

@@ -44,6 +44,7 @@ LIKE_FIELD = "exporting/test_splats.py::test_a_ball_of_splats_looks_like_the_fie
 CELLS = "exporting/test_splats.py::test_splats_of_folded_space_are_as_large_as_their_cells"
 FIELDS = "exporting/test_splats.py::test_the_file_has_the_fields_of_3dgs_in_their_order"
 LIGHT = "exporting/test_sight.py::test_all_light_comes_from_some_node"
+NO_PART = "rendering/test_composite.py::test_what_is_no_part_of_a_field_is_refused"
 COLOURS = "exporting/test_sight.py::test_colours_are_means_over_the_pixels_that_see_them"
 HALF = "exporting/test_sight.py::test_pixels_that_do_not_count_see_nothing"
 CIRCLE = "exporting/test_sight.py::test_corners_outside_of_a_fisheyes_circle_see_nothing"
@@ -152,6 +153,12 @@ MUTANTS = [
     of_host("volume: what none sees", VOLUME, "there = np.ones_like(seen) if unseen else seen", "there = np.ones_like(seen)",
             BLOCK),
     of_host("volume: raw", VOLUME, "density(field, raw[block])", "raw[block]", NODES),
+    # field.py, composite.py: arguments
+    of_host("field: any distance", "rendering/field.py", "if not distance >= 0.0:", "if distance < 0.0:", NO_PART),
+    of_host("field: a crop upside down", "rendering/field.py", "x < y for x, y", "True for x, y", NO_PART),
+    of_host("composite: cells upside down", "rendering/composite.py",
+            " or not (self.cells[:, 0] < self.cells[:, 1]).all()", "",
+            "rendering/test_composite.py::test_cells_are_boxes_one_for_each_member"),
     # pictures.py
     of_host("pictures: depth in all ranges", "media/pictures.py", "return far > DISPARITY_FROM * near > 0.0", "return False",
             DISPARITY),

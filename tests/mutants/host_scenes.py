@@ -43,6 +43,8 @@ FOLLOWS = "scenes/test_space_plan.py::test_a_scene_s_space_follows_its_configura
 NODES = "exporting/test_sight.py::test_node_coordinates_are_those_that_kernels_read"
 MESH = "exporting/test_mesh.py::test_folded_space_comes_out_in_scene_units"
 BEHIND = "scenes/test_frustum.py::test_node_coordinates_are_those_that_kernels_read"
+NO_RAYS = "scenes/test_camera.py::test_what_makes_no_rays_is_refused"
+BY_HAND = "scenes/test_scene.py::test_a_scene_that_nothing_can_be_trained_on_is_refused"
 BLOCKS = "scenes/test_masks.py::test_a_pixel_that_stands_for_several_counts_if_all_do"
 
 POINTS, FOCUS, OVERLAP, FISHEYE = (
@@ -182,4 +184,9 @@ MUTANTS = [
     of_host("masks: any of a block", "scenes/images/masks.py", "blocks.all(axis=(1, 3))", "blocks.any(axis=(1, 3))", BLOCKS),
     of_host("masks: transparent counts", "scenes/images/masks.py", "        white &= image[..., 3] > 127\n", "        pass\n",
             "scenes/test_masks.py::test_every_kind_of_image_is_a_mask"),
+    # cameras and scenes made by hand
+    of_host("camera: any matrix", "scenes/cameras/camera.py", '        require_rigid("Camera.c2w", self.c2w)\n', "", NO_RAYS),
+    of_host("camera: complex", "scenes/cameras/camera.py", 'self.c2w.dtype.kind not in "fiu"', "False", NO_RAYS),
+    of_host("scene: points of nothing", "scenes/scene.py", "            or not np.isfinite(points).all()\n", "", BY_HAND),
+    of_host("scene: any box", "scenes/scene.py", "(np.abs(box) <= MAX_COORDINATE).all()", "np.isfinite(box).all()", BY_HAND),
 ]  # fmt: skip

@@ -15,6 +15,7 @@ EACH_DISTANCE = "scenes/test_points.py::test_training_takes_each_camera_s_distan
 FIRST_GRID = (
     "scenes/test_extent.py::test_the_first_grid_is_empty_but_for_the_density_that_is_asked_for"
 )
+FEW_STEPS = "scenes/test_extent.py::test_steps_of_which_no_kernel_would_come_to_an_end_are_refused"
 STEPS = "scenes/test_extent.py::test_steps_are_as_long_as_they_are_asked_to_be"
 CLIPPED = "scenes/test_extent.py::test_near_and_far_that_leave_no_sample_are_refused"
 BEHIND = "scenes/test_extent.py::test_what_is_behind_the_scene_is_what_is_asked_for"
@@ -222,6 +223,8 @@ MUTANTS = [
             "space.voxel_edges(plan.stages[0].size)", FIRST_GRID),
     of_host("a border around any box", SPACE_PLAN, "if not kind.contracts:\n        return space", "if False:\n        return space",
             FIRST_GRID),
+    of_host("steps without end through the box", EXTENT, "_require_few(march, across, step, MOST_STEPS)", "pass", FEW_STEPS),
+    of_host("steps without end to the box", EXTENT, "_require_few(march, reach, step, MOST_LINEAR)", "pass", FEW_STEPS),
     of_host("FAR_BOXES", EXTENT, "FAR_BOXES = 64.0", "FAR_BOXES = 8.0", STEPS),
     of_host("far from the camera", EXTENT, "FAR_BOXES * half + reach if", "FAR_BOXES * half if", STEPS),
     of_host("steps of one voxel", EXTENT, "march.step_voxels * float(", "float(", STEPS),

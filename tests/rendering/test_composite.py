@@ -9,6 +9,7 @@ import pytest
 
 from tests.support.tiny_fields import tiny_field
 from tests.support.tiny_scenes import camera_at, look_at
+from warpnerf.checks import InputError
 from warpnerf.rendering import render
 from warpnerf.rendering.composite import CompositeField, crossings
 from warpnerf.rendering.field import Field, Rendering
@@ -40,6 +41,43 @@ def composite_of(fields: list[Field], cells: np.ndarray = CELLS) -> CompositeFie
         transmittance_min=0.0,
         workers=fields[0].workers,
     )
+
+
+@pytest.mark.parametrize("together", [False, True])
+def test_what_is_no_part_of_a_field_is_refused(together: bool) -> None:
+    field: Any = composite_of([whole_field()] * 4) if together else whole_field()
+    for wrong in ("x", None, [1.0], float("nan"), -1.0):
+        for part in (field.beyond, field.up_to):
+            with pytest.raises(InputError, match="distance must be "):
+                part(wrong)
+    for low, high in (
+        ("abc", "def"),
+        (None, None),
+        ([0, 0], [1, 1]),
+        ([1, 1, 1], [0, 2, 2]),
+        ([0, 0, 0], [1, 1, 10**400]),
+        ([0, 0, 0], [1, 1, float("nan")]),
+        ([[0]], [[1, 2], 3]),
+    ):
+        with pytest.raises(
+            InputError, match=r"^(crop must be a lower|cropped: low must be a list)"
+        ):
+            field.cropped(low, high)
+    camera = camera_at(look_at((2.0, 1.1, 0.7), (0.1, 0.0, 0.2)), width=4, height=3)
+    dark = field.beyond(float("inf")).render(camera)
+    np.testing.assert_allclose(dark.rgb, np.broadcast_to(field.background, (3, 4, 3)), atol=1e-6)
+    whole = field.up_to(float("inf")).render(camera)
+    np.testing.assert_array_equal(whole.rgb, field.render(camera).rgb)
+
+
+def test_cells_are_boxes_one_for_each_member() -> None:
+    together = composite_of([whole_field()] * 4)
+    for cells in (CELLS[:3], CELLS[:, ::-1], np.full((4, 2, 3), np.nan), CELLS[:, :, :2]):
+        with pytest.raises(InputError, match=r"^CompositeField\.cells must be \[4, 2, 3\]"):
+            replace(together, cells=cells)
+    wrong: Any = None
+    with pytest.raises(InputError, match=r"^CompositeField\.cells must be an array, not None"):
+        replace(together, cells=wrong)
 
 
 @pytest.mark.parametrize("packed", [True, False])

@@ -1,12 +1,14 @@
 """Batches of random pixels: each ray a function of its step and the seed."""
 
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import pytest
 import warp as wp
 
 from tests.training.test_determinism import small_scene
+from warpnerf.checks import InputError, require_rays
 from warpnerf.fields.lattice import Lattice
 from warpnerf.fields.occupancy import FreeCells
 from warpnerf.rendering.rays import PixelSampler, RayBatch, camera_rays, runs_of
@@ -24,6 +26,24 @@ def sampler(device: str, seed: int = 0) -> PixelSampler:
 
 def drawn(batch: RayBatch) -> dict[str, np.ndarray]:
     return {field.name: getattr(batch, field.name).numpy().copy() for field in fields(batch)}
+
+
+def test_more_pixels_than_kernels_count_are_refused() -> None:
+    camera = replace(small_scene().cameras[0], width=70_000, height=40_000)
+    with pytest.raises(InputError, match=r"fewer than 2\^31 pixels, not 70000 x 40000"):
+        camera_rays(camera, Workers("cpu", 1))
+
+
+@pytest.mark.parametrize("dtype", [object, "U3", "M8[s]", complex, bool])
+def test_rays_are_of_real_numbers(dtype: Any) -> None:
+    rays = np.zeros((2, 3)), np.array([[0.0, 0.0, 1.0]] * 2)
+    require_rays(*rays)
+    for wrong in (0, 1):
+        given = [
+            array.astype(int).astype(dtype) if k == wrong else array for k, array in enumerate(rays)
+        ]
+        with pytest.raises(InputError, match=r"^(origins|directions) must be real numbers, not "):
+            require_rays(*given)
 
 
 @pytest.mark.parametrize("n_steps", [1, 2, 5])

@@ -105,6 +105,31 @@ def test_near_and_far_that_leave_no_sample_are_refused() -> None:
     extent.require_samples(around, resolve_space(around, CONFIG), MarchConfig(far=0.999 * begin))
 
 
+@pytest.mark.parametrize("unbounded", [False, True])
+def test_steps_of_which_no_kernel_would_come_to_an_end_are_refused(unbounded: bool) -> None:
+    """By the box, of 2 or 3 units across, and by the reach; in grids of a hundredth of a unit."""
+    scene, config = scene_in_box(unbounded), config_for(unbounded)
+    space = resolve_space(scene, config)
+    across = float(np.linalg.norm(BOX[1] - BOX[0]))
+    edge = float(space.voxel_edges((9, 9, 9)).min())
+    least = across / (edge * 2**16)
+    for share, far_away in ((1.01, 9.0), (0.99, 9.0), (1.01, 0.99 * 2**8 * across)):
+        march = replace(config.march, step_voxels=share * least)
+        if share > 1.0:
+            extent.march_steps(march, space, (9, 9, 9), far_away)
+            continue
+        with pytest.raises(InputError, match=r"^march\.step_voxels .* 65536 steps; use a longer"):
+            extent.march_steps(march, space, (9, 9, 9), far_away)
+    march = replace(config.march, step_voxels=1.01 * least)
+    with pytest.raises(InputError, match=r"^march\.step_voxels .* 16777216 steps; use a longer"):
+        extent.march_steps(march, space, (9, 9, 9), 1.02 * 2**8 * across)
+    for step_voxels in (1e-320, 5e-324):
+        with pytest.raises(InputError, match="is too short"):
+            Trainer(scene, replace(config, march=replace(config.march, step_voxels=step_voxels)))
+    with pytest.raises(InputError, match=r"^march\.near is 1e\+308"):
+        Trainer(scene, replace(config, march=replace(config.march, near=1e308)))
+
+
 def with_alpha(scene: Scene) -> Scene:
     views = [replace(view, image=picture(n, channels=4)) for n, view in enumerate(scene.views)]
     return replace(scene, views=views)

@@ -54,6 +54,11 @@ def test_a_photograph_of_another_camera_is_refused(changes: dict[str, Any], mess
     [
         ({"views": [view_of(), view_of()]}, "two views have one name"),
         ({"content_distance": 0.0}, "content_distance must be a finite number above 0"),
+        ({"content_distance": 1e-320}, r"content_distance must lie between 1e-12 and 1e\+12"),
+        ({"box_max": np.full(3, 1e300)}, r"box_min must lie .* within 1e\+12 scene units of 0"),
+        ({"points": np.zeros((5, 2))}, r"points must be finite numbers, \[n, 3\], not .*5, 2"),
+        ({"points": np.full((5, 3), np.nan)}, "points must be finite numbers"),
+        ({"points": np.full((5, 3), "a")}, "points must be finite numbers"),
         ({"splits": {"train": (0, 2)}}, r"splits\['train'\] must be indices of 2 views"),
         ({"splits": {"train": (0,), "test": (-1,)}}, r"splits\['test'\] must be indices"),
         ({"splits": {"train": (), "test": (0,)}}, r"splits\['train'\] must name at least one view"),

@@ -1,5 +1,6 @@
 """scale_gradient against the paper's operation, the oracle, and in a whole rendering."""
 
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -139,6 +140,8 @@ def test_scale_gradient_refuses(device: str) -> None:
     ]:
         with pytest.raises(InputError, match=message):
             scale_gradient(*arguments)
+    half: Any = Fraction(1, 2)
+    assert torch.equal(scale_gradient(colors, sigmas, t, half)[0], colors)
 
 
 def test_a_content_distance_that_requires_grad_is_refused(device: str) -> None:

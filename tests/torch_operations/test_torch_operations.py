@@ -163,6 +163,11 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "near": ({"near": -1.0}, "near must be"),
     "nan near": ({"near": float("nan")}, "near must be"),
     "far": ({"far": 0.01}, "far must lie beyond near"),
+    "far of text": ({"far": "x"}, "far must lie beyond near"),
+    "layers of a number": ({"head": Head("rgb", 5)}, "head.layers must be a list of arrays, not 5"),
+    "no layers": ({"head": Head("rgb", None)}, "head.layers must be a list of arrays, not None"),
+    "shift of several": ({"density_shift": torch.ones(3)}, "density_shift must be a finite number"),
+    "scalings": ({"scaling": np.array(["none", "quadratic"])}, "scaling must be one of none"),
     "shift": ({"density_shift": float("inf")}, "density_shift must be a finite number"),
     "content distance of text": (
         {"content_distance": "far"},

@@ -14,6 +14,7 @@ import sys
 import warnings
 from collections.abc import Callable, Sequence
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import tyro
@@ -244,6 +245,9 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"warpnerf {__version__}")
         return 0
     raise_when_asked()
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # it was closed before Python began
+            setattr(sys, name, Path(os.devnull).open("w"))  # noqa: SIM115
     process.make_own()
     warnings.filterwarnings("ignore", module="PIL")  # what matters in an image is refused
     logging.getLogger("PIL").setLevel(logging.CRITICAL)

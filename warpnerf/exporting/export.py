@@ -336,7 +336,12 @@ def checked_ending(path: str | Path) -> str:
         raise InputError(f"{path}: its folder does not exist; make it first.")
     if ending and path.is_dir():
         raise InputError(f"{path}: is a folder; choose another name.")
-    if not ending and path.exists() and not (path.is_dir() and not any(path.iterdir())):
+    if not ending and path.exists() and not path.is_dir():
+        raise InputError(
+            f"{path}: its name has no ending, which says what to write, and it is no folder; let "
+            f"it end in {', '.join(known[::-1])}."
+        )
+    if not ending and path.exists() and any(path.iterdir()):
         raise InputError(f"{path}: exists already; name a new folder.")
     if not os.access(path.parent, os.W_OK):
         raise InputError(f"{path}: its folder cannot be written to; choose another one.")

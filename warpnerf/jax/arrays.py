@@ -27,9 +27,14 @@ def array_of(field: str, value: Any) -> jax.Array:
     return jnp.asarray(value)
 
 
-def known(field: str, value: Any) -> np.ndarray | None:
+def known(field: str, value: Any, dtype: Any = None) -> np.ndarray | None:
     """The values of an array or of numbers; None while a function of them is traced, as under
     ``jax.jit``.
+
+    Args:
+        field: What they are.
+        value: The array or numbers.
+        dtype: Of the values, in which what is too large is infinite; None: as given.
 
     Raises:
         InputError: The value is neither.
@@ -42,7 +47,8 @@ def known(field: str, value: Any) -> np.ndarray | None:
         array = np.array(None)
     if not jnp.issubdtype(array.dtype, jnp.floating) and array.dtype.kind not in "iu":
         raise InputError(f"{field} must be an array or numbers, not {said(value)}.")
-    return array
+    with np.errstate(over="ignore", under="ignore"):
+        return array if dtype is None else array.astype(dtype)
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))

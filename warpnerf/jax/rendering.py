@@ -115,12 +115,14 @@ def render_rays(
     begins, towards = known("origins", origins), known("directions", directions)
     if begins is not None and towards is not None:
         require_visible(call, begins, towards)
-    seen, far = known("background", background), known("content_distance", content_distance)
+    seen, far = (
+        known(field, value, raw.dtype)
+        for field, value in (("background", background), ("content_distance", content_distance))
+    )
+    shape = np.shape(background)
+    if shape not in ((3,), (n, 3)) or (seen is not None and not np.isfinite(seen).all()):
+        raise InputError(f"background must be finite rgb, [3] or [n_rays, 3], not {list(shape)}.")
     behind = constant("background", jnp.asarray(background, raw.dtype))
-    if behind.shape not in ((3,), (n, 3)) or (seen is not None and not np.isfinite(seen).all()):
-        raise InputError(
-            f"background must be finite rgb, [3] or [n_rays, 3], not {list(behind.shape)}."
-        )
     content = constant("content_distance", jnp.asarray(content_distance, raw.dtype))
     if content.shape not in ((), (1,), (n,)) or (far is not None and not (far > 0).all()):
         raise InputError(

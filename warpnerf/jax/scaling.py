@@ -58,6 +58,7 @@ def scale_gradient(
         content_distance = constant("content_distance", content_distance)
     else:
         require_positive("content_distance", content_distance)
+        content_distance = float(content_distance)
     if scaling == "none":
         return colors, sigmas, distances
     ratio = jax.lax.stop_gradient(distances / content_distance)

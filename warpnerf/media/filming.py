@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from warpnerf.checked import checked_arguments
-from warpnerf.checks import InputError
+from warpnerf.checks import InputError, said
 from warpnerf.media.camera_path import path_lens
 from warpnerf.media.panels import USUAL, Output, Panels
 from warpnerf.media.pictures import write_png
@@ -95,11 +95,17 @@ def render_stills(
         on_frame: Called with the number of pictures that are done.
 
     Raises:
-        InputError: No camera, or depths in the wrong order.
+        InputError: No camera, a name that is not that of a file in the folder, or depths in the
+            wrong order.
         OSError: A picture cannot be written; each is there whole or not at all.
     """
     if not cameras:
         raise InputError("stills need at least one camera.")
+    for name in cameras:
+        if name in ("", ".", "..") or Path(name).name != name or "\0" in name:
+            raise InputError(
+                f"stills go into one folder, by names of files without a path, not {said(name)}."
+            )
     panels = _panels(field, list(cameras.values()), depths, show, transparent)
     folder = Path(folder)
     folder.mkdir(exist_ok=True)

@@ -19,7 +19,7 @@ from PIL import Image
 
 from warpnerf.checks import InputError, require_extra, require_positive
 from warpnerf.media.pictures import png
-from warpnerf.writing import write_atomically
+from warpnerf.writing import temporary_name, write_atomically
 
 QUALITY = "18"
 """Constant rate factor of H.264: hardly to be told from the original."""
@@ -159,7 +159,7 @@ def _timed(frames: Iterator[np.ndarray], fps: float) -> Iterator[Image.Image]:
 
 
 def _write_folder(path: Path, frames: Iterator[np.ndarray]) -> None:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = path.with_name(temporary_name(path.name))
     temporary.mkdir()
     try:
         for number, pixels in enumerate(frames):

@@ -58,7 +58,7 @@ class Model(ABC):
         So what files hold of it is read back as the same. For ``__post_init__``.
 
         Raises:
-            InputError: A field whose default is a bool is given something else.
+            InputError: A field is given something of another type than its default is.
         """
         registry.keep_plain(self, "model")
 

@@ -9,8 +9,7 @@ from __future__ import annotations
 from dataclasses import asdict, fields
 from typing import Any, TypeVar
 
-import numpy as np
-
+from warpnerf.checked import fits, in_words
 from warpnerf.checks import InputError, require_finite, said
 
 Kind = TypeVar("Kind", bound=type[Any])
@@ -59,13 +58,13 @@ def keep_plain(value: Any, what: str) -> None:
         what: It is, in configurations.
 
     Raises:
-        InputError: A field whose default is a bool is given something else, or one whose default is
-            a float something that is neither that nor a finite number.
+        InputError: A field is given something of another type than its default is, or a float that
+            is neither that nor finite.
     """
     for f in fields(value):
         given, kind = getattr(value, f.name), type(f.default)
-        if kind is bool and not isinstance(given, bool | np.bool_):
-            raise InputError(f"{what}.{f.name} must be True or False, not {said(given)}.")
+        if kind in (bool, int, float) and not fits(given, kind):
+            raise InputError(f"{what}.{f.name} must be {in_words(kind)}, not {said(given)}.")
         if kind is float and given != f.default:
             require_finite(f"{what}.{f.name}", given)
         if kind in (bool, int, float):

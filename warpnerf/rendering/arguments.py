@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from warpnerf.checks import InputError, require_at_least, require_positive, said
+from warpnerf.checked import fits
+from warpnerf.checks import InputError, is_finite, require_at_least, require_positive, said
 from warpnerf.grid_config import MAX_VOXELS
 from warpnerf.model.interface import Model, loader
 from warpnerf.model.models import model_of
@@ -79,29 +80,33 @@ def steps_of(step: float | March) -> Steps:
     length, near, far = step if isinstance(step, March) else March(step)
     require_positive("step", length)
     require_at_least("near", near, 0.0)
-    if far is not None and not far > near:
-        raise InputError(f"far must lie beyond near, not at {far}.")
-    return Steps(near=near, far=min(1e30, math.inf if far is None else far), step=length)
+    end = 1e30 if far is None or (fits(far, float) and far == math.inf) else far
+    if not (is_finite(end) and end > near):
+        raise InputError(f"far must lie beyond near, not at {said(far)}.")
+    return Steps(near=float(near), far=min(1e30, float(end)), step=float(length))
 
 
 def head_of(head: str | Model | Head) -> tuple[Model, list[Any]]:
     """The model and its layers, which render_rays takes as its head.
 
     Raises:
-        InputError: It is neither a model nor the name of one.
+        InputError: It is neither a model nor the name of one, or layers are no list.
     """
     model, layers = head if isinstance(head, Head) else Head(head)
     if isinstance(model, str):
         model = model_of(model)
     if not isinstance(model, Model):
         raise InputError(f"model must be a name or a model, not {said(model)}.")
-    return model, list(layers)
+    try:
+        return model, list(layers)
+    except TypeError as error:
+        raise InputError(f"head.layers must be a list of arrays, not {said(layers)}.") from error
 
 
 def require_box(box: Any) -> None:
     """Raise InputError unless a box is two things."""
     if not isinstance(box, Sequence) or len(box) != 2:
-        raise InputError(f"box must be its lower and its upper corner, not {box!r}.")
+        raise InputError(f"box must be its lower and its upper corner, not {said(box)}.")
 
 
 def require_ascending(corners: tuple[np.ndarray, np.ndarray]) -> None:

@@ -8,9 +8,9 @@ from functools import partial
 
 import numpy as np
 
-from warpnerf.checked import checked_arguments
-from warpnerf.checks import InputError, require_rays
-from warpnerf.rendering.field import Field, Rendering
+from warpnerf.checked import checked, checked_arguments
+from warpnerf.checks import InputError, require_rays, said
+from warpnerf.rendering.field import Field, Rendering, checked_crop, require_distance
 from warpnerf.rendering.rays import camera_rays
 from warpnerf.runtime.parallel import Workers
 from warpnerf.scenes.cameras.camera import Camera
@@ -22,6 +22,7 @@ Member = Callable[[], Field]
 """One of the fields, loaded when it is first seen."""
 
 
+@checked("CompositeField")
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CompositeField:
     """A radiance field put together from several, composited front to back.
@@ -53,6 +54,20 @@ class CompositeField:
         """Whether steps are lengths in normalised device coordinates: never."""
         return False
 
+    def __post_init__(self) -> None:
+        """Refuse what is no field.
+
+        Raises:
+            InputError: Cells are no boxes, or not one for each member.
+        """
+        shape = (len(self.members), 2, 3)
+        if self.cells.shape != shape or not (self.cells[:, 0] < self.cells[:, 1]).all():
+            raise InputError(
+                f"CompositeField.cells must be {list(shape)}, a lower corner below an upper one "
+                f"for each of {shape[0]} members, not {said(self.cells)}."
+            )
+
+    @checked_arguments
     def cropped(self, low: Sequence[float], high: Sequence[float]) -> CompositeField:
         """Crop to a box: rays see nothing outside of it.
 
@@ -66,18 +81,14 @@ class CompositeField:
         Raises:
             InputError: It is no box.
         """
-        box = np.array([low, high], np.float64)
-        if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[0] < box[1]).all():
-            raise InputError(
-                "crop must be a lower and an upper corner, x y z each, the first below the second, "
-                f"not {' '.join(f'{x:g}' for x in box.ravel())}."
-            )
+        box = checked_crop(low, high)
         cells = np.stack(
             [np.maximum(self.cells[:, 0], box[0]), np.minimum(self.cells[:, 1], box[1])], axis=1
         )
         kept = np.flatnonzero((cells[:, 0] < cells[:, 1]).all(axis=1))
         return replace(self, cells=cells[kept], members=[self.members[int(k)] for k in kept])
 
+    @checked_arguments
     def beyond(self, distance: float) -> CompositeField:
         """All that is not nearer than a distance, see ``Field.beyond``.
 
@@ -86,9 +97,14 @@ class CompositeField:
 
         Returns:
             The same fields, from there on.
+
+        Raises:
+            InputError: It is no distance.
         """
+        require_distance(distance)
         return replace(self, near=max(self.near, distance))
 
+    @checked_arguments
     def up_to(self, distance: float) -> CompositeField:
         """All that is nearer than a distance, see ``Field.up_to``.
 
@@ -97,7 +113,11 @@ class CompositeField:
 
         Returns:
             The same fields, nearer than that.
+
+        Raises:
+            InputError: It is no distance.
         """
+        require_distance(distance)
         members = [partial(_marched, member) for member in self.members]
         far = min(self.far, distance)
         return replace(self, members=members, far=far, transmittance_min=0.0)

@@ -11,7 +11,7 @@ from warpnerf_kernels.base.types import real, vec2, vec3
 from warpnerf_kernels.launch import assembly
 
 from warpnerf.checked import checked_arguments
-from warpnerf.checks import InputError, require_rays
+from warpnerf.checks import InputError, is_finite, require_rays, said
 from warpnerf.fields.lattice import Lattice
 from warpnerf.fields.nodes import cells_within
 from warpnerf.fields.occupancy import FreeCells
@@ -41,6 +41,28 @@ class Rendering:
     """[...] float32, sum of weight times t, scene units; nothing is added for the background."""
     opacity: np.ndarray
     """[...] float32 in [0, 1]."""
+
+
+def checked_crop(low: Sequence[float], high: Sequence[float]) -> np.ndarray:
+    """The corners of a box to crop to, [2, 3] float64.
+
+    Raises:
+        InputError: It is no box.
+    """
+    corners = (*low, *high)
+    three = len(low) == len(high) == 3 and all(map(is_finite, corners))
+    if not three or not all(x < y for x, y in zip(low, high, strict=True)):
+        raise InputError(
+            "crop must be a lower and an upper corner, x y z each, the first below the second, "
+            f"not {said(corners)}."
+        )
+    return np.array([low, high], np.float64)
+
+
+def require_distance(distance: float) -> None:
+    """Raise InputError unless a number is at least 0; it may be infinite."""
+    if not distance >= 0.0:
+        raise InputError(f"distance must be at least 0, not {said(distance)}.")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -111,12 +133,7 @@ class Field:
         Raises:
             InputError: It is no box.
         """
-        box = np.array([low, high], np.float64)
-        if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[0] < box[1]).all():
-            raise InputError(
-                "crop must be a lower and an upper corner, x y z each, the first below the second, "
-                f"not {' '.join(f'{x:g}' for x in box.ravel())}."
-            )
+        box = checked_crop(low, high)
         inside = cells_within(self.lattice, *box)
         if not inside.any():
             raise InputError(
@@ -181,6 +198,7 @@ class Field:
         dark = replace(self, background=(0.0, 0.0, 0.0))
         return self._rendering(dark._render(*rays, origins, between), (len(origins),))
 
+    @checked_arguments
     def beyond(self, distance: float) -> Field:
         """All of the field that is not nearer than a distance.
 
@@ -189,11 +207,16 @@ class Field:
 
         Returns:
             A field with the same storage.
+
+        Raises:
+            InputError: It is no distance.
         """
+        require_distance(distance)
         if distance <= self.steps.near:
             return self
-        return replace(self, steps=replace(self.steps, near=distance))
+        return replace(self, steps=replace(self.steps, near=min(distance, 1e30)))
 
+    @checked_arguments
     def up_to(self, distance: float) -> Field:
         """All of the field that is nearer than a distance, marched, also what hardly any light
         passes.
@@ -203,7 +226,11 @@ class Field:
 
         Returns:
             A field with the same storage.
+
+        Raises:
+            InputError: It is no distance.
         """
+        require_distance(distance)
         far = min(self.steps.far, distance)
         steps = replace(self.steps, far=far, transmittance_min=0.0)
         return replace(self, steps=steps, proposal=None)

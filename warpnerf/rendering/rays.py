@@ -15,6 +15,7 @@ from warpnerf_kernels.launch import assembly
 from warpnerf_kernels.sampling import coverage
 from warpnerf_kernels.space import camera as kernels
 
+from warpnerf.checks import InputError
 from warpnerf.fields.lattice import Lattice
 from warpnerf.fields.occupancy import FreeCells
 from warpnerf.runtime.parallel import RAYS, LaunchCache, Workers
@@ -107,8 +108,16 @@ def camera_rays(camera: Camera, workers: Workers) -> tuple[wp.array, wp.array]:
 
     Returns:
         origins [H * W] vec3 in scene units, and directions [H * W] vec3 of unit length.
+
+    Raises:
+        InputError: They are more than kernels count.
     """
     n = camera.width * camera.height
+    if n >= 2**31:
+        raise InputError(
+            f"a picture must have fewer than 2^31 pixels, not {camera.width} x {camera.height}; "
+            "render it in parts, or smaller."
+        )
     origins = wp.empty(n, dtype=vec3, device=workers.device)
     directions = wp.empty(n, dtype=vec3, device=workers.device)
     workers.launch(kernels.camera_rays, n, view_struct(camera), origins, directions)

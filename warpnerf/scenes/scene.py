@@ -9,7 +9,7 @@ from typing import Protocol, overload
 import numpy as np
 
 from warpnerf.checked import checked
-from warpnerf.checks import InputError, require_kind, require_positive, said
+from warpnerf.checks import MAX_COORDINATE, InputError, require_kind, require_length, said
 from warpnerf.optim_config import SceneKind
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.cameras.observations import Observations
@@ -213,15 +213,17 @@ class Scene:
         """Refuse what nothing can be trained on.
 
         Raises:
-            InputError: An empty box, no distance, or a split of views that are not there.
+            InputError: An empty box, no distance, points that are none, or a split of views that
+                are not there.
         """
         box = np.stack([self.box_min, self.box_max])
-        if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[0] < box[1]).all():
+        within = box.shape == (2, 3) and (np.abs(box) <= MAX_COORDINATE).all()
+        if not within or not (box[0] < box[1]).all():
             raise InputError(
-                f"{self.name}: box_min must lie below box_max on every axis, both finite, not "
-                f"{self.box_min} and {self.box_max}."
+                f"{self.name}: box_min must lie below box_max on every axis, both within "
+                f"{MAX_COORDINATE:g} scene units of 0, not {box[0]} and {box[1]}."
             )
-        require_positive(f"{self.name}: content_distance", self.content_distance)
+        require_length(f"{self.name}: content_distance", self.content_distance)
         distances = self.content_distances
         if distances is not None and (
             distances.shape != (len(self.views),) or not (distances > 0.0).all()
@@ -229,6 +231,16 @@ class Scene:
             raise InputError(
                 f"{self.name}: content_distances must be one above 0 for each of "
                 f"{len(self.views)} views."
+            )
+        points = self.points
+        if points is not None and (
+            points.dtype.kind not in "fiu"
+            or points.shape[1:] != (3,)
+            or not np.isfinite(points).all()
+        ):
+            raise InputError(
+                f"{self.name}: points must be finite numbers, [n, 3], not {points.dtype} "
+                f"{list(points.shape)}; leave out those that are not."
             )
         if self.bounds is not None and self.bounds.shape != (len(self.views), 2):
             raise InputError(

@@ -53,6 +53,7 @@ def scale_gradient(
             raise InputError("content_distance must be above 0 everywhere.")
     else:
         require_positive("content_distance", content_distance)
+        content_distance = float(content_distance)
     if scaling == "none":
         return colors, sigmas, distances
     ratio = distances.detach() / content_distance

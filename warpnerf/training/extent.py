@@ -8,7 +8,7 @@ import numpy as np
 
 from warpnerf.checks import InputError
 from warpnerf.config import MarchConfig, TrainConfig
-from warpnerf.rendering.steps import Steps
+from warpnerf.rendering.steps import MOST_LINEAR, Steps
 from warpnerf.scenes.cameras.focus import find_focus
 from warpnerf.scenes.cameras.overlap import views_of_content
 from warpnerf.scenes.extent.frustum import FARTHEST
@@ -17,6 +17,9 @@ from warpnerf.scenes.scene import Scene
 
 FAR_BOXES = 64.0
 """How far an unbounded scene is sampled, in half edges of its box; beyond lies the background."""
+
+MOST_STEPS = 2**16
+"""Steps of a ray through the box: more take minutes a batch, and no kernel is stopped midway."""
 
 GROWTH, MOST_GROWTH = 0.02, 0.1
 """By which steps outside a box grow, times its border: a wider shell has shorter voxels; and at
@@ -122,13 +125,20 @@ def march_steps(
         space: That the grid fills.
         size: Its nodes along each axis.
         reach: See there, scene units: how far steps have one length where space is contracted.
+
+    Raises:
+        InputError: Steps are too short.
     """
     step = march.step_voxels * float(space.voxel_edges(size).min())
+    across = float(np.linalg.norm(space.box_max - space.box_min))
+    _require_few(march, across, step, MOST_STEPS)
+    if space.frustum is None:
+        _require_few(march, reach, step, MOST_LINEAR)
     half = float(0.5 * (space.box_max - space.box_min).max())
     far = march.far
     if far is None:
         far = march.near + FAR_BOXES * half + reach if space.contracted else math.inf
-    n_linear = max(0, math.ceil((reach - march.near) / step))
+    n_linear = math.ceil(max(0.0, (reach - march.near) / step))
     return Steps(
         near=march.near,
         far=min(far, 1e30),
@@ -138,6 +148,15 @@ def march_steps(
         transmittance_min=march.transmittance_min,
         in_ndc=space.frustum is not None,
     )
+
+
+def _require_few(march: MarchConfig, length: float, step: float, most: int) -> None:
+    """Raise InputError where a ray takes too many steps over a length."""
+    if not length <= most * step:
+        raise InputError(
+            f"march.step_voxels {march.step_voxels:g} is too short: over {length:.4g} units a ray "
+            f"would take more than {most} steps; use a longer one."
+        )
 
 
 def _growth(march: MarchConfig, space: Space) -> float:

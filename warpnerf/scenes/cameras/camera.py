@@ -14,6 +14,7 @@ import numpy as np
 from warpnerf.checked import checked
 from warpnerf.checks import InputError, require_at_least, require_finite, require_positive
 from warpnerf.scenes.cameras.fisheye import Coefficients, distorted_angle
+from warpnerf.scenes.cameras.poses import require_rigid
 
 
 @checked("Camera")
@@ -74,7 +75,7 @@ class Camera:
 
         Raises:
             InputError: A size or focal length is not above zero, a number is not finite, a
-                coefficient is of another lens, or the pose has another shape.
+                coefficient is of another lens, or the pose has another shape or is not rigid.
         """
         require_at_least("Camera.width", self.width, 1)
         require_at_least("Camera.height", self.height, 1)
@@ -90,8 +91,11 @@ class Camera:
                 f"Camera.c2w must be an array [3, 4], not {list(np.shape(self.c2w))}; leave out a "
                 "4x4 matrix's last row."
             )
+        if self.c2w.dtype.kind not in "fiu":
+            raise InputError(f"Camera.c2w must be real numbers, not {self.c2w.dtype}.")
         if not np.isfinite(self.c2w).all():
             raise InputError("Camera.c2w must be finite, but holds NaN or infinity.")
+        require_rigid("Camera.c2w", self.c2w)
 
     @property
     def position(self) -> np.ndarray:

@@ -6,13 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from warpnerf.checks import InputError
+from warpnerf.checks import MAX_COORDINATE, InputError
 
 RIGID_TOLERANCE = 1e-3
 """Largest error of R^T R against the identity: single precision passes, scale does not."""
-
-MAX_COORDINATE = 1e12
-"""Scene units; larger numbers are mistakes, and their squares would overflow."""
 
 
 def check_pose(matrix: Sequence[Sequence[float]], *, field: str) -> np.ndarray:
@@ -43,13 +40,18 @@ def check_pose(matrix: Sequence[Sequence[float]], *, field: str) -> np.ndarray:
             f"{field}: its last row is {_numbers(pose[3])}, not [0, 0, 0, 1]; transpose the matrix "
             "if its translation stands there."
         )
-    if np.abs(pose[:3]).max() > MAX_COORDINATE:
-        raise InputError(f"{field}: holds numbers beyond {MAX_COORDINATE:g}; correct the pose.")
-    problem = _why_not_rigid(pose[:3, :3])
-    if problem:
-        raise InputError(f"{field}: {problem}.")
+    require_rigid(field, pose[:3])
     u, _, vt = np.linalg.svd(pose[:3, :3])
     return np.concatenate([u @ vt, pose[:3, 3:]], axis=1)
+
+
+def require_rigid(field: str, pose: np.ndarray) -> None:
+    """Raise InputError unless a finite [3, 4] matrix is a rotation and a translation."""
+    if np.abs(pose).max() > MAX_COORDINATE:
+        raise InputError(f"{field}: holds numbers beyond {MAX_COORDINATE:g}; correct the pose.")
+    problem = _why_not_rigid(pose[:, :3])
+    if problem:
+        raise InputError(f"{field}: {problem}.")
 
 
 def _why_not_rigid(axes: np.ndarray) -> str:

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from warpnerf.checks import MAX_COORDINATE
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.cameras.focus import Extent
 from warpnerf.scenes.cameras.observations import Observations, observe, quantiles
 from warpnerf.scenes.cameras.overlap import in_picture
-from warpnerf.scenes.cameras.poses import MAX_COORDINATE
 from warpnerf.scenes.scene import Scene, View
 
 MAX_PROJECTED = 5000
