@@ -152,7 +152,7 @@ MUTANTS = [
     of_host("lens: is_fisheye decides", LENS, "            fisheye = level.camera_model == FISHEYE\n",
             "            fisheye = bool(level.is_fisheye)\n", KIND),
     of_host("lens: an angle of all shapes", FRAME, "SAME_LENS = 0.01", "SAME_LENS = 10.0", SIZES),
-    of_host("lens: an angle of no other shape", FRAME, "shape or (fx and fy)", "shape", SIZES),
+    of_host("lens: an angle of no other shape", FRAME, "same[:2].all() or (by_angle and same[2:].all())", "same[:2].all()", SIZES),
     of_host("lens: oblong pixels", DIAGNOSTICS, "SQUARE = 1.2", "SQUARE = 2.0",
             "inspection/test_inspection.py::test_lenses_in_other_units_are_said"),
     of_host("ndc: depth as it is", "scenes/extent/frustum.py", "self.depth * (1.0 - self.near / w)", "1.0 - self.near / w", NDC),

@@ -128,12 +128,13 @@ def lens_warnings(used: Sequence[tuple[Frame, Camera]]) -> list[str]:
 
 
 def _go_together(sizes: Mapping[tuple[int, int], tuple[Frame, Camera]]) -> bool:
-    """Whether one lens can be that of images of these sizes: reduced, or cropped by an angle."""
-    lenses = np.array([(c.fx, c.fy, c.width / c.height) for _, c in sizes.values()])
-    fx, fy, shape = lenses.max(axis=0) <= (1.0 + SAME_LENS) * lenses.min(axis=0)
+    """Whether one lens can be that of images of these sizes: resized, or cropped by an angle."""
+    cameras = [camera for _, camera in sizes.values()]
+    lenses = np.array([(c.fx / c.width, c.fy / c.height, c.fx, c.fy) for c in cameras])
+    same = lenses.max(axis=0) <= (1.0 + SAME_LENS) * lenses.min(axis=0)
     (frame, _) = next(iter(sizes.values()))
     by_angle = not frame.lens.values.keys() & {"fl_x", "fl_y"}
-    return len(sizes) == 1 or (by_angle and bool(shape or (fx and fy)))
+    return bool(same[:2].all() or (by_angle and same[2:].all()))
 
 
 def _one_lens(sizes: Mapping[tuple[int, int], tuple[Frame, Camera]]) -> str:
