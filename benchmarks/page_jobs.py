@@ -7,7 +7,8 @@ from measuring import show
 from page_parts import Records, below, place, table, text
 
 EXCHANGES = {
-    "shared": "add through shared memory",
+    "shared": "sum in shared memory",
+    "messages": "sum through shared memory",
     "tiles": "exchange by gloo",
     "dense": "exchange by gloo, the whole gradient",
 }

@@ -69,7 +69,7 @@ class Tiles(Messages):
     """Shares no memory: all goes by gloo."""
 
     def _shared(self, n_bytes: int) -> None:
-        return None
+        return None  # nor do they meet there
 
 
 class Dense(Tiles):

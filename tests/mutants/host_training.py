@@ -103,6 +103,14 @@ FORGED = "runs/test_checkpoint.py::test_a_forged_training_is_refused"
 SAYS = "training/test_plan.py::test_it_says_what_is_trained"
 WAITS = "training/test_plan.py::test_a_plan_that_waits_for_a_short_training_is_refused"
 GOES_BY = "training/test_plan.py::test_a_resumed_training_goes_by_the_plan_that_it_began_with"
+MEET, LEARN, LOST = (
+    f"runtime/test_meeting.py::test_{name}"
+    for name in (
+        "nobody_goes_on_before_all_have_come",
+        "all_learn_what_each_has_said_each_time",
+        "one_that_is_lost_is_noticed",
+    )
+)
 PROCESSES = "training/test_processes.py::test_processes_with_a_share_of_the_rays_are_one_with_all"
 REDUCED = "training/test_plan.py::test_gradients_are_reduced_before_they_are_regularised"
 WITHOUT_PLAN = (
@@ -268,6 +276,11 @@ MUTANTS = [
     of_host("a flag stands for its tile alone", "torch/processes.py",
             "    holds[1:] |= touched[:-1]\n", "", PROCESSES),
     of_host("a share of the rows stays as it is", "torch/processes.py", "dim=1)[self.rank]", "dim=1)[0]", PROCESSES),
+    of_host("a meeting of one", "runtime/meeting.py", "while (self._come < self._times).any():", "while False:", MEET),
+    of_host("a meeting where all say the first's", "runtime/meeting.py", "half[self._rank] = numbers", "half[0] = numbers", LEARN),
+    of_host("a meeting that the dead come to", "runtime/meeting.py", "if not is_alive(", "if False and not is_alive(", LOST),
+    of_host("a meeting without end", "runtime/meeting.py", "if not in_time:", "if False:", LOST),
+    of_host("zombies live", "runtime/process.py", '[:1] != [b"Z"]', '[:1] != [b"?"]', "runtime/test_meeting.py::test_a_zombie_is_not_alive"),
     of_host("a share of the shared tiles stays as it is", "torch/processes.py", "            self.rank,\n            n_tiles,", "            0,\n            n_tiles,", PROCESSES),
     of_host("no gradient lies in shared memory", TRAINER, "config.threads, peers.zeros)", "config.threads)", PROCESSES),
     of_host("the shared are not summed", "torch/processes.py", "            add()\n", "            pass\n", PROCESSES),

@@ -7,6 +7,7 @@ cache, standard error, how threads of OpenMP wait.
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 _own = False
 
@@ -41,4 +42,8 @@ def is_alive(process: int) -> bool:
         return False
     except OSError:  # another user's
         return True
-    return True
+    try:
+        stat = Path(f"/proc/{process}/stat").read_bytes()
+    except OSError:  # no Linux
+        return True
+    return stat.rpartition(b")")[2].split()[:1] != [b"Z"]  # a zombie, which nobody waited for

@@ -21,13 +21,14 @@ from warpnerf_kernels.optim.reduction import BLOCK, add_tiles
 from warpnerf.checks import InputError
 from warpnerf.fields.gradients import Gradients
 from warpnerf.fields.parameters import Parameter
+from warpnerf.runtime.meeting import Meeting, meeting_bytes
 from warpnerf.runtime.parallel import Workers
 from warpnerf.runtime.shared_memory import opened, share
 from warpnerf.training.peers import PeerLostError, Peers, Signals
 
 PATIENCE = timedelta(seconds=45)
 """For a process that does not come to the end of its update: then it hangs."""
-MEETING = timedelta(minutes=5)
+STARTING = timedelta(minutes=5)
 """For the others to start."""
 SET_UP = timedelta(hours=24)
 """For one that sets up: it may estimate poses, or compile."""
@@ -40,7 +41,8 @@ T = TypeVar("T")
 class Processes(Peers):
     """The processes of this training, by gloo between CPUs and by NCCL between CUDA devices.
 
-    Where all can reach the same memory, on the CPU, gradients lie there, or go through that.
+    Where all can reach the same memory, on the CPU, they meet there, and gradients lie there, or
+    go through that.
     """
 
     def __init__(self) -> None:
@@ -53,7 +55,7 @@ class Processes(Peers):
         self._rows: WeakValueDictionary[int, np.ndarray] = WeakValueDictionary()
         self._has_begun = False
         try:
-            self._store, self.rank, self.count = next(dist.rendezvous("env://", timeout=MEETING))
+            self._store, self.rank, self.count = next(dist.rendezvous("env://", timeout=STARTING))
             dist.init_process_group(
                 "gloo",
                 store=dist.PrefixStore("gloo", self._store),
@@ -66,12 +68,22 @@ class Processes(Peers):
             self._devices: dist.ProcessGroup | None = None
             # Who refuses its options ends at once, and others would still ask its store.
             dist.barrier(self._saving)
+            self._meeting = self._meeting_place()
         except (RuntimeError, ValueError) as error:
             why = str(error).strip().partition("\n")[0][:200].rstrip(".")
             raise InputError(
                 f"process {os.environ.get('RANK')} does not meet the others ({why}); start all "
                 "of them by torchrun."
             ) from error
+
+    def _meeting_place(self) -> Meeting | None:
+        """In memory, where all can reach the same."""
+        memory = self._shared(meeting_bytes(self.count))
+        if memory is None:
+            return None
+        process_ids = [0] * self.count
+        dist.all_gather_object(process_ids, os.getpid(), group=self._saving)
+        return Meeting(memory, self.rank, process_ids)
 
     def is_first_to_fail(self) -> bool:
         """By a count in the store where they met."""
@@ -120,10 +132,18 @@ class Processes(Peers):
         first = self.rank == 0
         seconds, save = signals.seconds if first else 0.0, first and signals.save
         mine = (seconds, signals.stop, save, not signals.finite)
-        all_of = torch.tensor([float(value) for value in mine], dtype=torch.float64)
-        self._reduce(all_of, dist.ReduceOp.MAX)
-        seconds, stop, save, failed = all_of.tolist()
-        return Signals(seconds=seconds, stop=bool(stop), save=bool(save), finite=not failed)
+        most = self._largest([float(value) for value in mine])
+        stop, saves, failed = (bool(number) for number in most[1:])
+        return Signals(seconds=most[0], stop=stop, save=saves, finite=not failed)
+
+    def _largest(self, numbers: list[float]) -> list[float]:
+        """The largest of all processes, number by number."""
+        if self._meeting is not None:
+            with _lost():
+                return list(self._meeting.exchange(numbers, _patience()).max(axis=0))
+        of_all = torch.tensor(numbers, dtype=torch.float64)
+        self._reduce(of_all, dist.ReduceOp.MAX)
+        return [float(number) for number in of_all]
 
     @property
     def kernels(self) -> tuple[wp.Kernel, ...]:
@@ -275,11 +295,19 @@ class Processes(Peers):
     def _meet(self) -> None:
         """Wait until all are here; what each has written before, all can read."""
         with _lost():
-            dist.barrier(self._training)
+            if self._meeting is not None:
+                self._meeting.wait(_patience())
+            else:
+                dist.barrier(self._training)
 
     def _reduce(self, tensor: torch.Tensor, operation: Any) -> None:
         with _lost():
             dist.all_reduce(tensor, operation, self._devices if tensor.is_cuda else self._training)
+
+
+def _patience() -> float:
+    """Seconds until a process that does not come to the end of its update counts as hung."""
+    return PATIENCE.total_seconds()
 
 
 class Tiles(NamedTuple):
