@@ -61,6 +61,12 @@ def test_a_focal_length_and_an_angle_that_contradict_each_other_are_told() -> No
         "is 4; remove the wrong one"
     )
     assert "$.fl_y is 3 pixels" in told(none, LensFields(fl_x=4.0, fl_y=3.0, **right))
+    # Some exports for Blender have the field of view of the sensor's height beside the right one.
+    assert (
+        told(none, LensFields(fl_x=4.0, fl_y=4.0, camera_angle_x=np.pi / 2, camera_angle_y=1.0))
+        == ""
+    )
+    assert "$.camera_angle_y" in told(none, LensFields(fl_x=4.0, fl_y=4.0, camera_angle_y=1.0))
     # What a frame says is what holds of it, whatever the file says of others.
     assert told(LensFields(fl_x=8.0), LensFields(**right)) == ""
     assert told(LensFields(camera_angle_x=1.0), LensFields(fl_x=4.0)) == ""

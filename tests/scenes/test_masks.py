@@ -295,7 +295,7 @@ def test_masks_that_leave_less_than_half_are_told_but_where_they_leave_the_focus
         frame["transform_matrix"] = np.eye(4).tolist()
         frame["transform_matrix"][2][3] = -1.0 * i
     save(tmp_path / "transforms.json", {**content, "mask_path": "all.png"})
-    assert [text.startswith(said) for text in told(slice(3, 6))] == [True]
+    assert told(slice(0, 3)) == []
 
 
 def test_views_refuse_masks_that_are_not_theirs() -> None:

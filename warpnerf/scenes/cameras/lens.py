@@ -188,15 +188,18 @@ class Lens:
 
     def contradiction(self, width: int, height: int) -> str:
         """In what the file contradicts itself, for an image of a size, and what is used; or ""."""
-        for place, angle in self.angles.items():
+        values = self._values(width, height)
+        for place, angle in sorted(self.angles.items()):
             axis, size = ("x", width) if place.endswith("x") else ("y", height)
-            used, other = self._values(width, height)[f"fl_{axis}"], _focal_length(angle, size)
+            used, other = values[f"fl_{axis}"], _focal_length(angle, size)
             if abs(other - used) > MAX_DIFFERENCE * used:
                 return (
                     f"{self.fields[f'fl_{axis}']} is {used:.4g} pixels, which is used, but by "
                     f"{place}, {math.degrees(angle):.4g} degrees of {size} pixels, it is "
                     f"{other:.4g}; remove the wrong one"
                 )
+            if values.get("fl_y") == used:  # Blender's angle_y may be that of its sensor
+                break
         return self.doubt
 
     def was_for(self, width: int, height: int) -> tuple[float, float] | None:

@@ -66,17 +66,19 @@ def _share_kept(masks: Masks, cameras: Sequence[Camera]) -> float:
 
 
 def _keep_the_focus(masks: Masks, cameras: Sequence[Camera], training: Sequence[int]) -> bool:
-    """Whether most masks leave the point that most cameras look at, if there is one."""
+    """Whether most masks leave the point that most cameras look at; true where there is none."""
     try:
         focus = find_focus([cameras[i] for i in training])
     except InputError:
-        return False
+        return True
+    if focus.guessed:
+        return True
     kept = [
         _leaves(mask, camera, focus.point)
         for mask, camera in zip(masks, cameras, strict=True)
         if mask is not None
     ]
-    return not focus.guessed and float(np.mean(kept)) > HALF
+    return float(np.mean(kept)) > HALF
 
 
 def _leaves(mask: PackedMask, camera: Camera, point: np.ndarray) -> bool:
