@@ -87,7 +87,8 @@ class StagedWrites:
             return
         with _naming(path):
             temporary = self._beside(Path(os.path.realpath(path)))
-            flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | getattr(os, "O_BINARY", 0)
+            temporary.unlink(missing_ok=True)  # a link, or of a process that had this number
+            flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
             file = os.open(temporary, flags, 0o666)
             try:
                 for piece in pieces:

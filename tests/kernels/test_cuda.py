@@ -18,6 +18,7 @@ from warpnerf.rendering.structs import variant_of
 SHARED = [
     "optim.exposure",
     "optim.near_decay",
+    "optim.reduction",
     "sampling.occupancy",
     "space.camera",
     "space.reprojection",

@@ -165,6 +165,37 @@ def test_a_lost_process_ends_the_others_with_a_checkpoint(
     assert (run / "field.safetensors").exists()
 
 
+@pytest.mark.parametrize("lost", [0, 1])
+def test_one_that_is_lost_while_the_grid_grows_ends_the_others_likewise(
+    lost: int, tmp_path: Path
+) -> None:
+    scene, run, grow = make_scene(tmp_path), tmp_path / "run", Trainer._grow
+    growing: list[int] = []
+
+    def grown(trainer: Trainer, fraction: float) -> None:
+        growing.append(trainer._updates)
+        grow(trainer, fraction)
+        growing.clear()
+
+    def one(rank: int) -> int:
+        zeros = processes.Processes.zeros
+
+        def lost_in_growth(peers: Any, n_bytes: int) -> np.ndarray:
+            if growing and growing[0] > 0 and rank == lost:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return np.asarray(zeros(peers, n_bytes))
+
+        Trainer._grow = grown  # type: ignore[method-assign]
+        processes.Processes.zeros = lost_in_growth
+        return command(scene, run, "--steps", "20")
+
+    done = several(one, tmp_path, killed_after=1 - lost)
+    assert done[1 - lost].code == 1 and done[lost].code == -signal.SIGKILL, done
+    (sentence,) = sentences(done)
+    assert "has ended, or hangs; continue after step" in sentence
+    assert main(["train", "--resume", str(run), "--eval-views", "none"]) == 0
+
+
 def test_a_gpu_with_a_number_is_refused() -> None:
     config = tiny_config(device="cuda:1")
     with pytest.raises(InputError, match="--device cuda:1 does not go with several processes"):

@@ -86,14 +86,14 @@ def zero_entries(
     else:  # pages that take no memory until a gradient is added to them
         width = dtype._length_
         n_bytes = 4 * (n * width + LANES)
-        room = (zero_bytes if large_pages else workers.zeros)(n_bytes).view(np.float32)
+        zeros_of = zero_bytes if large_pages else workers.zeros
+        room = zeros_of(n_bytes).view(np.float32)
         if large_pages:
             prefer_large_pages(room.ctypes.data, room.nbytes)
         begin = -room.ctypes.data // 4 % LANES  # of a cache line: entries lie in as few as can be
         zeros = room[begin : begin + n * width].reshape(n, width)
         values = wp.array(zeros, dtype=dtype, device=device, copy=False)
-        flags = workers.zeros(n_tiles(n))
-        touched = wp.array(flags, dtype=wp.uint8, device=device, copy=False)
+        touched = wp.array(zeros_of(n_tiles(n)), dtype=wp.uint8, device=device, copy=False)
     return {"values": values, "touched": touched}
 
 

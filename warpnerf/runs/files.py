@@ -138,7 +138,7 @@ def sweep(folder: Path) -> None:
 
 def is_leftover(path: Path) -> bool:
     """Whether a file is one that a process was killed while it wrote, by its name."""
-    kinds = "html|json|jsonl|npz|png|safetensors"
+    kinds = "csv|html|json|jsonl|npz|png|safetensors"
     return re.fullmatch(rf"\..+\.({kinds})\.\d+\.tmp", path.name) is not None
 
 

@@ -95,7 +95,10 @@ class Meeting:
 
     def _require_others(self, in_time: bool) -> None:
         for rank in np.flatnonzero(self._come < self._times).tolist():
-            if not is_alive(self._process_ids[rank]):
+            lives = is_alive(self._process_ids[rank])
+            if self._come[rank] >= self._times:  # it may have come, and ended, meanwhile
+                continue
+            if not lives:
                 raise RuntimeError(f"process {rank} has ended")
             if not in_time:
                 raise RuntimeError(f"process {rank} does not come")

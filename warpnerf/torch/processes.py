@@ -93,7 +93,7 @@ class Processes(Peers):
             return False
 
     def from_first(self, make: Callable[[], T]) -> T:
-        """By a broadcast; the others wait for as long as it takes."""
+        """By a broadcast; before updates begin, the others wait for as long as it takes."""
         found: list[Any] = [None, None]
         if self.rank == 0:
             try:
@@ -101,7 +101,7 @@ class Processes(Peers):
             except InputError as error:
                 found[1] = str(error)
         with _lost():
-            dist.broadcast_object_list(found)
+            dist.broadcast_object_list(found, group=self._training if self._has_begun else None)
         result, refused = found
         if refused is not None:
             raise InputError(refused)
@@ -122,6 +122,7 @@ class Processes(Peers):
 
     def wait(self) -> None:
         """Until all are here, as after compiling or saving."""
+        self._has_begun = False  # updates, of which the next one begins with ``agree``
         with _lost():
             dist.all_reduce(torch.zeros(1), group=self._saving)
 
@@ -164,9 +165,9 @@ class Processes(Peers):
     def add(self, accumulated: Sequence[tuple[Gradients, Parameter]], workers: Workers) -> None:
         """Sums of touched tiles and of weights; the order of summands depends on ranks alone.
 
-        Where gradients do not lie in shared memory themselves, all flags come first, then all sums:
-        each message waits for the slowest process. So no process writes a message before all have
-        read the sums of the update before.
+        Where gradients do not lie in shared memory themselves, all flags come first, then all sums.
+        No process writes a message before all have read the sums of the update before, as all
+        ``agree`` in between.
         """
         device = accumulated[0][0].arrays["weights"].device
         if device.is_cuda:

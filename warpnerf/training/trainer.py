@@ -407,7 +407,8 @@ class Trainer:
     def _load_kernels(self) -> None:
         """Compile what is not yet in the cache."""
         of_training = kernels_of(self.plan, self.lattice.contraction, self.workers.device)
-        for kernel in (*of_training, *self.peers.kernels):
+        of_peers = self.peers.kernels if self.workers.device.is_cpu else ()
+        for kernel in (*of_training, *of_peers):
             self.workers.load(kernel)
 
     def _grow(self, fraction: float) -> None:
@@ -416,6 +417,8 @@ class Trainer:
         if grown <= self._grown or self.steps_done < FIRST_LOOK:
             return
         config, box, nodes = self.config, self._tight_box(), self.plan.stages[grown].nodes
+        if self.peers.count > 1 and self.steps_done:  # of which one may be lost meanwhile
+            self.report()
         # What holds the old arrays gives their memory back before more is requested.
         del self._pass, self._resampling, self.regulariser, self._decays
         before, shift = self.storage, (grown - self._grown) * config.grid.shift_at_growth

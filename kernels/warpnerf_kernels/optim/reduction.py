@@ -46,8 +46,10 @@ for (int group = begin; group < end; group += GROUP) {
     }
 }
 auto prefetch = [&](int tile) {
+#if !defined(__CUDA_ARCH__)  // which has no memory that processes share
     for (int k = 0; k < count; ++k)
         for (size_t i = 0; i < floats; i += 16) __builtin_prefetch(row(k) + tile * floats + i, 1);
+#endif
 };
 for (int i = 0; i < AHEAD && i < n_chosen; ++i) prefetch(chosen[i]);
 for (int i = 0; i < n_chosen; ++i) {
