@@ -157,6 +157,13 @@ def test_metashape_two_photographs_of_a_name_are_refused(tmp_path: Path) -> None
         load_scene(tmp_path)
 
 
+def test_metashape_images_named_after_photographs_are_no_second_ones(tmp_path: Path) -> None:
+    write_metashape(tmp_path)
+    for name in ("normals", "sky_masks", "depth_maps"):
+        write_pictures(tmp_path / "images" / name, ["000.png"])
+    assert len(load_scene(tmp_path).views) == 4
+
+
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
