@@ -24,6 +24,7 @@ from warpnerf.scenes.files import (
     exists,
     is_photograph,
     printable,
+    resolve_inside,
 )
 from warpnerf.scenes.formats.assemble import POSED, assemble
 from warpnerf.scenes.formats.frame import Frame
@@ -241,6 +242,7 @@ def scene_of(
         if path is None:
             missing.append(entry.name)
             continue
+        resolve_inside(photographs.folder, photographs.name(path), field=entry.place)
         camera = entry.read(path)
         name, c2w = photographs.name(path), camera.c2w
         frames.append(Frame(name=name, path=path, c2w=c2w, lens=camera.lens, depth=camera.depth))
