@@ -22,6 +22,7 @@ NOT_USED = "scenes/test_reduced.py::test_others_are_not_used_and_said"
 IMAGES = "scenes/test_frame_images.py::test_"
 NAMED = f"{IMAGES}photographs_are_found_by_their_names"
 SCALED = "scenes/test_lens.py::test_a_lens_is_scaled_to_resized_photographs"
+NEARLY = "scenes/test_lens.py::test_photographs_of_nearly_the_stated_size_are_not_resized_ones"
 NOT_RESIZED = "scenes/test_lens.py::test_other_photographs_are_no_resized_ones"
 
 LENS, FRAME_IMAGES = "scenes/cameras/lens.py", "scenes/formats/frame_images.py"
@@ -166,12 +167,14 @@ MUTANTS = [
         "False",
         NOT_RESIZED,
     ),
+    of_host("another size: by a pixel", LENS, "MIN_RESIZED = 1.015", "MIN_RESIZED = 1.01", NEARLY),
+    of_host("another size: by much", LENS, "MIN_RESIZED = 1.015", "MIN_RESIZED = 1.02", NEARLY),
     of_host("names: no normal form", FOUND, 'unicodedata.normalize("NFC", name)', "name", NAMED),
     of_host(
         "names: of any folder",
         FRAME_IMAGES,
-        "n > 0 and named[-n:] == there[-n:]",
-        "named[-1:] == there[-1:]",
+        "self._whole.setdefault(parts, [])",
+        "self._whole.setdefault(parts[-1:], [])",
         f"{IMAGES}photographs_of_other_names_are_mentioned",
     ),
     of_host(
@@ -184,9 +187,51 @@ MUTANTS = [
     of_host(
         "names: of another frame",
         FRAME_IMAGES,
-        'owners = dict.fromkeys(found.values(), "")',
-        "owners: dict[Path, str] = {}",
+        "[*found.values(), *taken]",
+        "taken",
         f"{IMAGES}what_another_name_leads_to_is_not_taken",
+    ),
+    of_host(
+        "names: of another file",
+        FRAME_IMAGES,
+        "[*found.values(), *taken]",
+        "found.values()",
+        f"{IMAGES}photographs_for_training_are_not_found_for_testing",
+    ),
+    of_host(
+        "names: with another ending anywhere",
+        FRAME_IMAGES,
+        "if converted or n > 1",
+        "if True",
+        f"{IMAGES}photographs_of_other_names_are_mentioned",
+    ),
+    of_host(
+        "names: of renderings",
+        FRAME_IMAGES,
+        "if RENDERINGS.fullmatch(parts[start - 1]):",
+        "if False:",
+        f"{IMAGES}images_that_are_named_after_photographs_are_none",
+    ),
+    of_host(
+        "names: of masks and the like",
+        FOUND,
+        "|{OTHER_IMAGES.pattern}",
+        "",
+        f"{IMAGES}images_that_are_named_after_photographs_are_none",
+    ),
+    of_host(
+        "names: a folder of any name",
+        FRAME_IMAGES,
+        "len(self._parts_of(path)) > len(_parts(name)) and",
+        "False and",
+        f"{IMAGES}photographs_of_a_folder_of_any_name_are_warned_of",
+    ),
+    of_host(
+        "names: a folder of photographs",
+        FRAME_IMAGES,
+        " and not OWN.fullmatch(top)",
+        "",
+        NAMED,
     ),
     of_host(
         "names: always of another format",
@@ -392,6 +437,20 @@ MUTANTS = [
         "withhold is None and not any(splits.values())",
         "not any(splits.values())",
         f"{LISTS_TESTS}lists_beside_transforms_json",
+    ),
+    of_host(
+        "models: photographs of the folder above",
+        MODELS,
+        " or (folder == own and _has_photographs(folder))",
+        "",
+        f"{MODELS_TESTS}photographs_in_the_folder_itself_are_not_those_of_the_one_above",
+    ),
+    of_host(
+        "models: a picture beside a model",
+        MODELS,
+        "(folder == own and _has_photographs(folder))",
+        "_has_photographs(folder)",
+        f"{MODELS_TESTS}photographs_in_the_folder_itself_are_not_those_of_the_one_above",
     ),
     of_host(
         "models: the smaller form",

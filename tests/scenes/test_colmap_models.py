@@ -163,6 +163,20 @@ def test_models_may_lie_beside_their_photographs(tmp_path: Path) -> None:
         assert "the model 1 of 9 images is read; 0 has 4" in scene.notes
 
 
+def test_photographs_in_the_folder_itself_are_not_those_of_the_one_above(tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        scene_with_model(tmp_path / name)
+        for file in (tmp_path / name / "images").iterdir():
+            file.rename(tmp_path / name / file.name)
+        (tmp_path / name / "images").rmdir()
+        shutil.copy(tmp_path / name / "000.png", tmp_path / name / "sparse/0/preview.png")
+    (tmp_path / "images").mkdir()
+    shutil.copy(tmp_path / "one/000.png", tmp_path / "images/other.png")
+    scene = load_scene(tmp_path / "one")
+    assert scene.name == "one"
+    assert [view.name for view in scene.views] == [f"{i:03d}.png" for i in range(4)]
+
+
 def test_models_in_a_renamed_folder_are_named_and_no_poses_are_estimated(tmp_path: Path) -> None:
     two_models(tmp_path, False)
     (tmp_path / "sparse").rename(tmp_path / "out")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import unicodedata
 from collections.abc import Callable
@@ -22,10 +23,15 @@ from tests.support.tiny_scenes import (
     write_transforms,
 )
 from warpnerf.checks import InputError
+from warpnerf.scenes.files import OTHER_IMAGES
+from warpnerf.scenes.formats import frame_images
 from warpnerf.scenes.formats.load import load_scene
 from warpnerf.scenes.scene import Scene
 
 FOUND = "4 of 4 photographs have another path than the file says, and are found by their names"
+ELSEWHERE = (
+    "4 of 4 photographs are found by their names only, in a folder that the file does not name"
+)
 
 
 def photographs(folder: Path, names: list[str]) -> None:
@@ -76,7 +82,10 @@ ACCENT = unicodedata.normalize("NFC", "images/é{}.png")
         ("/home/me/photographs/{}.png", "images/{}.png"),
         ("images/{}.png", "{}.png"),
         ("images/{}.png", "Images/{}.png"),
-        ("{}.png", "rgb/{}.png"),
+        ("{}.png", "Images/{}.png"),
+        ("{}.png", "images/cam/{}.png"),
+        ("/home/me/capture/train/{}.jpg", "train/{}.png"),
+        ("/home/me/capture/renders/{}.png", "renders/{}.png"),
         ("images/{}.png", "images_2/{}.png"),
         ("images_4/{}.png", "images/{}.png"),
     ],
@@ -99,6 +108,8 @@ def test_photographs_are_found_by_their_names(tmp_path: Path, said: str, there: 
         ("images/{}.png", "rgb/{}.png"),
         ("cam_1/{}.png", "images/cam_2/{}.png"),
         ("train/{}.png", "test/{}.png"),
+        ("{}.jpg", "rgb/{}.png"),  # perhaps masks, or depths
+        ("images/{}.jpg", "{}.png"),
         ("images/{}.png", "photographs/IMG_{}.png"),
     ],
 )
@@ -108,6 +119,77 @@ def test_photographs_of_other_names_are_mentioned(tmp_path: Path, said: str, the
     says = rf"no image of 4 frames .*, but 4 others are \(first: {four(there)[0]}\); put"
     with pytest.raises(InputError, match=says):
         load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("ending", ["png", "PNG"])
+@pytest.mark.parametrize("model", [False, True])
+def test_photographs_of_a_folder_of_any_name_are_warned_of(
+    tmp_path: Path, model: bool, ending: str
+) -> None:
+    if model:
+        scene_with_model(tmp_path)
+        shutil.rmtree(tmp_path / "images")
+    else:
+        named(tmp_path, four("{}.png"))
+    photographs(tmp_path, four(f"rgb/{{}}.{ending}"))
+    scene = load_scene(tmp_path)
+    assert_read(scene)
+    first = f"{ELSEWHERE} (first: rgb/000.{ending} for 000.png): if they are others, put the right"
+    assert any(first in warning for warning in scene.warnings)
+    assert not any("names" in note for note in scene.notes)
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        *("normals", "sky_masks", "depth_maps", "semantic", "Thumbnails", "confidence"),
+        *("renders", "test_renderings", "renders/masks", "out/normal-maps"),
+    ],
+)
+@pytest.mark.parametrize("model", [False, True])
+def test_images_that_are_named_after_photographs_are_none(
+    tmp_path: Path, model: bool, place: str
+) -> None:
+    if model:
+        scene_with_model(tmp_path)
+        shutil.rmtree(tmp_path / "images")
+    else:
+        named(tmp_path, four("{}.png"))
+    photographs(tmp_path, four(place + "/{}.png"))
+    with pytest.raises(InputError, match=r"no image of 4 frames|none of the model's 4"):
+        load_scene(tmp_path)
+
+
+def test_folders_of_other_images_have_their_names() -> None:
+    for name in ("mask", "sky_masks", "depth", "mono-depth_maps", "Normal_Images", "disparities"):
+        assert OTHER_IMAGES.fullmatch(name)
+    for name in ("images", "rgb", "photos_2024", "left", "masked_man", "abnormal"):
+        assert not OTHER_IMAGES.fullmatch(name)
+
+
+def test_names_of_every_folder_are_looked_up_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Steps grow as photographs do, though all folders have the same names."""
+    steps = [0, 0]
+    normalised = frame_images.normalised
+    for run, n in enumerate((10, 40)):
+        folder = tmp_path / str(n)
+        names = [f"{i:03d}/cam{c}.png" for i in range(n) for c in range(2)]
+        for name in names:
+            path = folder / "images" / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.touch()
+
+        def counted(name: str, run: int = run) -> str:
+            steps[run] += 1
+            return normalised(name)
+
+        monkeypatch.setattr(frame_images, "normalised", counted)
+        moved = [f"/home/me/images/{name}" for name in names]
+        found, _ = frame_images.find_photographs(folder, folder, moved, str)
+        assert [found[i] for i in range(2 * n)] == [folder / "images" / name for name in names]
+    assert steps[1] < 5 * steps[0]
 
 
 def test_what_another_name_leads_to_is_not_taken(tmp_path: Path) -> None:
@@ -197,6 +279,32 @@ def test_test_photographs_that_are_missing_are_not_those_for_training(tmp_path: 
     assert any("transforms_test.json is not used" in warning for warning in scene.warnings)
 
 
+def test_photographs_for_training_are_not_found_for_testing(tmp_path: Path) -> None:
+    for split in ("train", "test"):
+        content = write_blender(tmp_path, split, ring(4), channels=3)
+    shutil.rmtree(tmp_path / "test")
+    (tmp_path / "train").rename(tmp_path / "images")
+    content = json.loads((tmp_path / "transforms_train.json").read_text())
+    for frame in content["frames"]:
+        frame["file_path"] = frame["file_path"].replace("train", "images")
+    save(tmp_path / "transforms_train.json", content)
+    scene = load_scene(tmp_path)
+    assert len(scene.views) == 4
+    assert not set(scene.splits["train"]) & set(scene.splits["test"])
+    assert any("transforms_test.json is not used: none of the 4" in w for w in scene.warnings)
+
+
+def test_photographs_of_all_splits_may_be_moved(tmp_path: Path) -> None:
+    for split in ("train", "test"):
+        write_blender(tmp_path, split, ring(4), channels=3)
+        content = json.loads((tmp_path / f"transforms_{split}.json").read_text())
+        for frame in content["frames"]:
+            frame["file_path"] = f"/home/me/{frame['file_path'].removeprefix('./')}"
+        save(tmp_path / f"transforms_{split}.json", content)
+    scene = load_scene(tmp_path)
+    assert [len(scene.splits[split]) for split in ("train", "test")] == [4, 4]
+
+
 def test_reduced_photographs_need_the_size_that_the_lens_is_for(tmp_path: Path) -> None:
     write_transforms(tmp_path, scale=2)
     (tmp_path / "images").rename(tmp_path / "images_2")
@@ -225,7 +333,6 @@ def test_reduced_photographs_need_the_size_that_the_lens_is_for(tmp_path: Path) 
         ("cam/{}.png", "images/{}.png", "{}.png"),
         ("/home/me/capture/images/{}.png", "images/{}.png", "{}.png"),
         (r"C:\capture\{}.png", "images/{}.png", "{}.png"),
-        ("{}.png", "rgb/{}.png", "rgb/{}.png"),
         ("{}.png", "Images/{}.png", "Images/{}.png"),
     ],
 )

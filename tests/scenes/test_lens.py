@@ -130,6 +130,19 @@ def test_other_photographs_are_no_resized_ones(
 
 
 @pytest.mark.parametrize(
+    ("width", "height", "is_resized"),
+    [(270, 480, False), (268, 477, False), (273, 486, False), (266, 473, True), (276, 491, True)],
+)
+def test_photographs_of_nearly_the_stated_size_are_not_resized_ones(
+    width: int, height: int, is_resized: bool
+) -> None:
+    middle = 135.75 if width < 271 else 135.25
+    fields = LensFields(fl_x=342.0, cx=middle, cy=middle + 105.5, w=271.0, h=482.0)
+    stated = read_lens(FILE, [("$", fields)]).was_for(width, height)
+    assert stated == ((271.0, 482.0) if is_resized else None)
+
+
+@pytest.mark.parametrize(
     "model", ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"]
 )
 def test_known_models_are_accepted(model: str) -> None:

@@ -74,6 +74,17 @@ def test_photographs_are_found_and_those_of_macos_are_none(tmp_path: Path, place
     assert len(load_scene(tmp_path).views) == 4
 
 
+def test_photographs_that_are_links_out_of_the_folder_are_refused(tmp_path: Path) -> None:
+    folder = tmp_path / "scene"
+    write_llff(folder)
+    (folder / "images").rename(tmp_path / "images")
+    (folder / "images").mkdir()
+    for file in (tmp_path / "images").iterdir():
+        (folder / "images" / file.name).symlink_to(file)
+    with pytest.raises(InputError, match=r"row 0: .images/000.png. follows a link out of the sce"):
+        load_scene(folder)
+
+
 def test_photographs_of_several_folders_are_in_no_order(tmp_path: Path) -> None:
     write_llff(tmp_path)
     (tmp_path / "images").rename(tmp_path / "left")

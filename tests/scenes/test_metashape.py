@@ -157,6 +157,22 @@ def test_metashape_two_photographs_of_a_name_are_refused(tmp_path: Path) -> None
         load_scene(tmp_path)
 
 
+def test_metashape_images_named_after_photographs_are_no_second_ones(tmp_path: Path) -> None:
+    write_metashape(tmp_path)
+    for name in ("normals", "sky_masks", "depth_maps"):
+        write_pictures(tmp_path / "images" / name, ["000.png"])
+    assert len(load_scene(tmp_path).views) == 4
+
+
+def test_metashape_photographs_that_are_links_out_of_the_folder_are_refused(tmp_path: Path) -> None:
+    write_metashape(tmp_path / "scene")
+    photograph = tmp_path / "scene/images/001.png"
+    photograph.rename(tmp_path / "001.png")
+    photograph.symlink_to(tmp_path / "001.png")
+    with pytest.raises(InputError, match=r"camera '001': .images/001.png. follows a link out of"):
+        load_scene(tmp_path / "scene")
+
+
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [

@@ -31,6 +31,18 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 ENDINGS = (*IMAGE_SUFFIXES, ".webp", ".tif", ".tiff", ".bmp", ".ppm")
 """Of photographs that are read, lower case."""
 
+REDUCED = re.compile(r"images_\d{1,3}", re.IGNORECASE)
+"""Names of folders of a scene's photographs, reduced."""
+MASKS = re.compile(r"(.*[_-])?masks?", re.IGNORECASE)
+DEPTHS = re.compile(r"(.*[_-])?depths?([_-]?maps?)?", re.IGNORECASE)
+"""Names of folders of masks and of depth maps."""
+OTHER_IMAGES = re.compile(
+    rf"{MASKS.pattern}|{DEPTHS.pattern}|(.*[_-])?(normals?|semantics?|segmentations?|instances?|"
+    r"labels?|dispari(ty|ties)|albedos?|confidences?|thumb(nail)?s?)([_-]?(maps?|images?))?",
+    re.IGNORECASE,
+)
+"""Names of folders of images that are named after photographs and are none."""
+
 
 class OutsideError(InputError):
     """A path out of a scene file that leaves the scene's folder, but not through a link."""
@@ -251,7 +263,7 @@ def photograph_folder(folder: Path) -> Path | None:
         first that is there; None where none is.
     """
     try:
-        reduced = [p for p in folder.glob("images_*") if re.fullmatch(r"images_\d{1,3}", p.name)]
+        reduced = [path for path in folder.glob("images_*") if REDUCED.fullmatch(path.name)]
     except OSError:
         reduced = []
     reduced.sort(key=lambda path: by_number(path.name))

@@ -38,6 +38,8 @@ MIN_FOCAL = 0.02
 """Shortest focal length, in sizes of the image: a field of view of 178 degrees."""
 MAX_FOCAL = 1e6
 """Longest focal length, in sizes of the image."""
+MIN_RESIZED = 1.015
+"""Least factor by which photographs are resized; by less, they rather are cropped or padded."""
 MAX_DIFFERENCE = 0.01
 """Of a focal length and a field of view that mean the same, as a share."""
 MIN_ANGLE = 1e-100
@@ -206,11 +208,14 @@ class Lens:
         """The size that the file states, where an image is one of that size that was resized; else
         None.
 
-        Both sides have then changed, by the same factor, to a pixel; and the principal point tells
-        that the lens is for the stated size: it is nearer to the middle of that.
+        Both sides have then changed, by the same factor, to a pixel, and by more than what is
+        cropped or padded; and the principal point tells that the lens is for the stated size: it is
+        nearer to the middle of that.
         """
         w, h = self.values.get("w", 0.0), self.values.get("h", 0.0)
         if min(w, h) < 1.0 or abs(width * h - height * w) > max(w, h):
+            return None
+        if 1.0 / MIN_RESIZED < max(width, height) / max(w, h) < MIN_RESIZED:
             return None
         for name, stated, size in (("cx", w, width), ("cy", h, height)):
             centre = self.values.get(name, size / 2)

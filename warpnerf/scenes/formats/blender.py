@@ -71,7 +71,8 @@ def load_blender(
         file = folder / split_file(split)
         if split != "train" and not exists(file):
             continue
-        _, found, found_warnings = read_frames(file, required=split == "train")
+        taken = [frame.path for frame in frames.values()]
+        _, found, found_warnings = read_frames(file, required=split == "train", taken=taken)
         # An image in two files keeps the first file's pose.
         for frame in found:
             frames.setdefault(frame.name, frame)

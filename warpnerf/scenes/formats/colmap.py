@@ -47,7 +47,11 @@ from warpnerf.scenes.formats.colmap_models import (
 )
 from warpnerf.scenes.formats.colmap_points import UnusablePlyError, read_points
 from warpnerf.scenes.formats.frame import Frame
-from warpnerf.scenes.formats.frame_images import find_photographs, others_there
+from warpnerf.scenes.formats.frame_images import (
+    elsewhere_warnings,
+    find_photographs,
+    others_there,
+)
 from warpnerf.scenes.formats.split_lists import read_split_lists
 from warpnerf.scenes.formats.unnamed_photographs import unnamed_photographs
 from warpnerf.scenes.images.masks import mask_in
@@ -141,14 +145,24 @@ def load_colmap(
         name, pose = names[image.name], _pose(image, field)
         mask = mask_in(folder / "masks", name) or mask_in(folder / "masks", image.name)
         mask = None if mask is None else replace(mask, found=True)
-        frames.append(Frame(name=name, path=path, c2w=pose, lens=lens, mask=mask, called=called))
+        frames.append(
+            Frame(
+                name=name,
+                path=path,
+                c2w=pose,
+                lens=lens,
+                mask=mask,
+                called=called,
+                elsewhere=moved.get(index, False),
+            )
+        )
     if not frames:
         place = folder / "images" if photographs == folder else photographs
         raise InputError(
             f"{image_file}: none of the model's {len(images)} photographs is in {place} (first: "
             f"{missing[0] if missing else 'none'}){others_there(folder)}; put them there."
         )
-    warnings = []
+    warnings = elsewhere_warnings(image_file, frames)
     stated = 0 if kind == "bin" else stated_images(image_file)
     if stated > len(images):
         warnings.append(

@@ -13,7 +13,13 @@ from contextlib import suppress
 from pathlib import Path
 
 from warpnerf.checks import InputError
-from warpnerf.scenes.files import exists, photograph_folder, printable, require_regular_file
+from warpnerf.scenes.files import (
+    exists,
+    is_photograph,
+    photograph_folder,
+    printable,
+    require_regular_file,
+)
 from warpnerf.scenes.formats.colmap_files import (
     ModelImage,
     images_of_bytes,
@@ -219,11 +225,18 @@ def scene_folder(model: Path) -> Path:
     """
     named, model = model.absolute(), model.resolve()
     folders: Sequence[Path] = (model, *list(model.parents)[:3])
+    names = ("colmap", SPARSE)  # of folders in a scene's that lead to its model
+    outer = folders[1:] if is_numbered(model) else folders
+    own = next((folder for folder in outer if folder.name not in names), model)
     # Links may lead to a model elsewhere.
     for folder in (*folders, *list(named.parents)[:3]):
-        if photograph_folder(folder) is not None:
+        if photograph_folder(folder) is not None or (folder == own and _has_photographs(folder)):
             return folder
-    names = ("colmap", SPARSE)  # of folders in a scene's that lead to its model
-    if is_numbered(model):
-        folders = folders[1:]
-    return next((folder for folder in folders if folder.name not in names), model)
+    return own
+
+
+def _has_photographs(folder: Path) -> bool:
+    """Whether there are photographs in a folder, but for folders within it."""
+    with suppress(OSError):
+        return any(is_photograph(path.name) for path in folder.iterdir())
+    return False

@@ -17,7 +17,15 @@ import numpy as np
 
 from warpnerf.checks import InputError
 from warpnerf.scenes.cameras.lens import Lens
-from warpnerf.scenes.files import ENDINGS, exists, is_photograph, printable
+from warpnerf.scenes.files import (
+    ENDINGS,
+    OTHER_IMAGES,
+    REDUCED,
+    exists,
+    is_photograph,
+    printable,
+    resolve_inside,
+)
 from warpnerf.scenes.formats.assemble import POSED, assemble
 from warpnerf.scenes.formats.frame import Frame
 from warpnerf.scenes.formats.left_over import points_beside
@@ -27,9 +35,7 @@ from warpnerf.scenes.images.photographs import Keeping
 from warpnerf.scenes.scene import Scene
 from warpnerf.scenes.split import Split
 
-NO_PHOTOGRAPHS = re.compile(
-    r"(images_\d{1,3}|masks?|depths?|confidence|thumb(nail)?s?)", re.IGNORECASE
-)
+NO_PHOTOGRAPHS = re.compile(rf"{REDUCED.pattern}|{OTHER_IMAGES.pattern}", re.IGNORECASE)
 """Folders within one of photographs whose images are none, or are the same ones reduced."""
 
 UNPOSED = 0.1
@@ -70,22 +76,36 @@ class Photographs:
         Raises:
             InputError: Several photographs have that name.
         """
-        *folders, last = name.replace("\\", "/").split("/")
+        last = name.replace("\\", "/").rpartition("/")[2]
         for key in dict.fromkeys([normalised(last), normalised(without_ending(last))]):
             found = self._by_name.get(key) or self._by_stem.get(key, [])
-            found = [path for path in found if fits(path)]
-            while len(found) > 1 and folders:
-                below = normalised(folders.pop())
-                found = [path for path in found if normalised(path.parent.name) == below] or found
-            if len(found) > 1:
-                first, second = (self.name(path) for path in found[:2])
-                raise InputError(
-                    f"{field}: {printable(name[:80])!r} is the name of {len(found)} photographs "
-                    f"({first}, {second}); give each a name of its own, or leave one of them."
-                )
-            if found:
-                return found[0]
+            path = self.only(name, field, [path for path in found if fits(path)])
+            if path is not None:
+                return path
         return None
+
+    def only(self, name: str, field: str, found: Sequence[Path]) -> Path | None:
+        """The one of some photographs that has a name's folders, too, or else the only one.
+
+        Args:
+            name: To look for, which is that of each of them but for folders.
+            field: That holds it, for messages.
+            found: The photographs.
+
+        Raises:
+            InputError: There are several.
+        """
+        folders = name.replace("\\", "/").split("/")[:-1]
+        while len(found) > 1 and folders:
+            below = normalised(folders.pop())
+            found = [path for path in found if normalised(path.parent.name) == below] or found
+        if len(found) > 1:
+            first, second = (self.name(path) for path in found[:2])
+            raise InputError(
+                f"{field}: {printable(name[:80])!r} is the name of {len(found)} photographs "
+                f"({first}, {second}); give each a name of its own, or leave one of them."
+            )
+        return found[0] if found else None
 
     def name(self, path: Path) -> str:
         """A photograph's path relative to the scene's folder, with /."""
@@ -222,6 +242,7 @@ def scene_of(
         if path is None:
             missing.append(entry.name)
             continue
+        resolve_inside(photographs.folder, photographs.name(path), field=entry.place)
         camera = entry.read(path)
         name, c2w = photographs.name(path), camera.c2w
         frames.append(Frame(name=name, path=path, c2w=c2w, lens=camera.lens, depth=camera.depth))

@@ -44,6 +44,8 @@ class Frame:
     """Depth of the nearest and of the farthest content, scene units; None: not known."""
     called: str = ""
     """What the file calls the image, where no file is at that path; empty: it is there."""
+    elsewhere: bool = False
+    """Whether the image is in a folder that the file does not name, and has its name only."""
 
     def resampling(self, whole: Camera, reduced: Camera) -> Resampling | None:
         """How the photograph is undistorted to a camera that ``lens`` made; None: not at all.
@@ -71,7 +73,7 @@ def photograph_notes(used: Sequence[tuple[Frame, Camera, Resampling | None]]) ->
         used: Frames, the cameras of their whole photographs, and how these are undistorted.
     """
     notes = []
-    named = [frame for frame, *_ in used if frame.called]
+    named = [frame for frame, *_ in used if frame.called and not frame.elsewhere]
     if named:
         notes.append(
             f"{len(named)} of {len(used)} photographs have another path than the file says, and "

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from pathlib import Path
 
 from warpnerf.checks import InputError
 from warpnerf.scenes.files import (
+    REDUCED,
     OutsideError,
     find_image,
     photograph_folder,
@@ -17,14 +18,21 @@ from warpnerf.scenes.files import (
     resolve_inside,
 )
 from warpnerf.scenes.formats.found_photographs import Photographs, normalised, without_ending
+from warpnerf.scenes.formats.frame import Frame
 
-REDUCED = re.compile(r"images_\d{1,3}", re.IGNORECASE)
-"""Folders of a scene's photographs, reduced."""
+OWN = re.compile(rf"images|{REDUCED.pattern}|input", re.IGNORECASE)
+"""Folders of photographs in a scene's folder, as programs call them."""
+RENDERINGS = re.compile(r"(.*[_-])?render(ing)?s?", re.IGNORECASE)
+"""Folders of images that are photographs, as of a synthetic scene, only where a file says so."""
 
 
 def find_images(
-    folder: Path, file: Path, file_paths: Sequence[str], required: bool = True
-) -> tuple[dict[int, Path], list[str], set[int]]:
+    folder: Path,
+    file: Path,
+    file_paths: Sequence[str],
+    required: bool = True,
+    taken: Collection[Path] = (),
+) -> tuple[dict[int, Path], list[str], dict[int, bool]]:
     """Find the images of a scene file's frames; leave out the missing ones and the repeated ones.
 
     Args:
@@ -32,16 +40,17 @@ def find_images(
         file: The scene file, for messages.
         file_paths: Of each frame, as the file has it.
         required: Whether one image at least must be there.
+        taken: Images of other files, which are this one's only where it gives their very paths.
 
     Returns:
-        The image of each frame that is kept, by the frame's index; warnings of the others; and the
-        frames whose images are not where the file says.
+        The image of each frame that is kept, by the frame's index; warnings of the others; and, of
+        frames whose images are not where the file says, as of ``find_photographs``.
 
     Raises:
         InputError: A path leaves the folder, or no image is there though one is required.
     """
     there, moved = find_photographs(
-        folder, folder, file_paths, lambda index: f"{file}: $.frames[{index}].file_path"
+        folder, folder, file_paths, lambda index: f"{file}: $.frames[{index}].file_path", taken
     )
     found: dict[int, Path] = {}
     seen: set[Path] = set()
@@ -64,7 +73,7 @@ def find_images(
                 f"{file.name} is not used: none of the {len(file_paths)} images that it names is "
                 f"in the folder{first}"
             ],
-            set(),
+            {},
         )
     if not file_paths:
         raise InputError(f"{file}: $.frames: is empty; a scene needs posed images.")
@@ -89,24 +98,31 @@ def find_images(
 
 
 def find_photographs(
-    folder: Path, root: Path, names: Sequence[str], field: Callable[[int], str]
-) -> tuple[dict[int, Path], set[int]]:
+    folder: Path,
+    root: Path,
+    names: Sequence[str],
+    field: Callable[[int], str],
+    taken: Collection[Path] = (),
+) -> tuple[dict[int, Path], dict[int, bool]]:
     """Find photographs by their names in a file, also if they were renamed or moved since.
 
     Where no file is at a name's path, it is one in the same folder whose name differs in case or in
     how accents are composed; or in its ending, unless others there have the endings that the file
     says. If none at all is found, photographs anywhere in the scene's folder are, whose path and
-    name agree from their ends as far as both go.
+    name agree from their ends as far as both go; but for those in folders of masks and the like
+    that the name does not have, and with the ending that it has, unless they are in the folder of
+    photographs or in one that it has.
 
     Args:
         folder: The scene's, which nothing is looked for out of.
         root: That names are relative to.
         names: Of photographs, as the file has them.
         field: Of the file that holds the name of an index, for messages.
+        taken: Photographs that are nobody's here but of a name that is their very path.
 
     Returns:
-        The photographs that are there, by index; and which of them have another path than the file
-        says.
+        The photographs that are there, by index; and of those that have another path than the file
+        says, whether they are in a folder that it does not name, nor is one of photographs.
 
     Raises:
         InputError: A name leaves the folder and is not in it either, or what it leads to does by a
@@ -125,10 +141,11 @@ def find_photographs(
             renamed.append(index)
         else:
             found[index] = path
-    owners = dict.fromkeys(found.values(), "")
-    moved: set[int] = set()
+    unchanged = {path.parent for path in found.values()}
+    owners = dict.fromkeys([*found.values(), *taken], "")
+    moved: dict[int, bool] = {}
 
-    def take(index: int, path: Path | None) -> None:
+    def take(index: int, path: Path | None, elsewhere: bool = False) -> None:
         owner = "" if path is None else owners.setdefault(path, names[index])
         if path is None or not owner:
             return
@@ -140,9 +157,8 @@ def find_photographs(
         base = root if path.is_relative_to(root) else folder
         resolve_inside(base, path.relative_to(base).as_posix(), field=field(index))
         found[index] = path
-        moved.add(index)
+        moved[index] = elsewhere
 
-    unchanged = {path.parent for path in owners}
     beside: dict[Path, Photographs] = {}
     for index in renamed:
         path = resolve_inside(root, names[index], field=field(index))
@@ -152,10 +168,12 @@ def find_photographs(
         take(index, beside[path.parent].find(path.name, field(index), fits))
     if found and outside is not None:
         raise outside
-    for among in () if found else dict.fromkeys((photograph_folder(folder) or folder, folder)):
-        there = Photographs(folder, among=among)
+    own = photograph_folder(folder)
+    for among in () if found else dict.fromkeys((own or folder, folder)):
+        there = _ByEnds(Photographs(folder, among=among))
         for index, name in enumerate(names):
-            take(index, there.find(name, field(index), partial(_agree, folder, name)))
+            path = there.find(name, field(index), converted=among == own)
+            take(index, path, path is not None and there.is_elsewhere(name, path))
         if found:
             break
     if not found and outside is not None:
@@ -178,15 +196,66 @@ def others_there(folder: Path) -> str:
     return f", but {len(paths)} others are (first: {first})"
 
 
-def _agree(folder: Path, name: str, path: Path) -> bool:
-    """Whether a name, and a photograph's path in the scene's folder, are one as far as both go."""
-    named, there = _parts(name), _parts(path.relative_to(folder).as_posix())
-    if there[0] == "images" or REDUCED.fullmatch(there[0]):
-        there = there[1:]
-    n = min(len(named), len(there))
-    return n > 0 and named[-n:] == there[-n:]
+def elsewhere_warnings(file: Path, frames: Sequence[Frame]) -> list[str]:
+    """A warning of photographs, if any, in folders that a scene's file does not name."""
+    found = [frame for frame in frames if frame.elsewhere]
+    if not found:
+        return []
+    return [
+        f"{file.name}: {len(found)} of {len(frames)} photographs are found by their names only, in "
+        f"a folder that the file does not name (first: {printable(found[0].name[:80])} for "
+        f"{printable(found[0].called[:80])}): if they are others, put the right ones into images"
+    ]
 
 
-def _parts(name: str) -> list[str]:
+class _ByEnds:
+    """Photographs whose paths in a scene's folder, and names, are one as far as both go."""
+
+    def __init__(self, photographs: Photographs) -> None:
+        self._photographs = photographs
+        self._whole: dict[tuple[str, ...], list[Path]] = {}
+        self._ends: dict[tuple[str, ...], list[Path]] = {}
+        for path in photographs.paths:
+            parts = self._parts_of(path)
+            self._whole.setdefault(parts, []).append(path)
+            for start in range(1, len(parts)):
+                if RENDERINGS.fullmatch(parts[start - 1]):
+                    break
+                self._ends.setdefault(parts[start:], []).append(path)
+        self._deepest = max(map(len, self._whole), default=0)
+
+    def find(self, name: str, field: str, converted: bool) -> Path | None:
+        """The photograph of a name; None: it is not there.
+
+        Args:
+            name: To look for.
+            field: That holds it, for messages.
+            converted: Whether it may have another ending, though it is in no folder of the name's.
+
+        Raises:
+            InputError: Several photographs have that name.
+        """
+        named = _parts(name)
+        agreeing = [(len(named), path) for path in self._ends.get(named, ())]
+        for n in range(1, min(len(named), self._deepest) + 1):
+            agreeing += [(n, path) for path in self._whole.get(named[-n:], ())]
+        last = normalised(plain_name(name).rpartition("/")[2])
+        same = [path for _, path in agreeing if normalised(path.name) == last]
+        converted = converted or normalised(without_ending(last)) == last
+        others = [path for n, path in agreeing if converted or n > 1]
+        return self._photographs.only(name, field, same or others)
+
+    def is_elsewhere(self, name: str, path: Path) -> bool:
+        """Whether a photograph is in a folder that its name does not have, nor is one of
+        photographs."""
+        top = self._photographs.name(path).partition("/")[0]
+        return len(self._parts_of(path)) > len(_parts(name)) and not OWN.fullmatch(top)
+
+    def _parts_of(self, path: Path) -> tuple[str, ...]:
+        parts = _parts(self._photographs.name(path))
+        return parts[1:] if parts[0] == "images" or REDUCED.fullmatch(parts[0]) else parts
+
+
+def _parts(name: str) -> tuple[str, ...]:
     *folders, last = plain_name(name).split("/")
-    return [normalised(part) for part in folders if part] + [normalised(without_ending(last))]
+    return *(normalised(part) for part in folders if part), normalised(without_ending(last))

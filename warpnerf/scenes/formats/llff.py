@@ -16,7 +16,7 @@ import numpy as np
 from warpnerf.checks import InputError
 from warpnerf.scenes.cameras.lens import Lens
 from warpnerf.scenes.cameras.poses import check_pose
-from warpnerf.scenes.files import photograph_folder, printable
+from warpnerf.scenes.files import photograph_folder, printable, resolve_inside
 from warpnerf.scenes.formats.assemble import assemble
 from warpnerf.scenes.formats.found_photographs import Photographs
 from warpnerf.scenes.formats.frame import Frame
@@ -76,6 +76,7 @@ def load_llff(
     frames = []
     for number, (row, path) in enumerate(zip(rows.astype(np.float64), paths, strict=True)):
         place = f"row {number}"
+        resolve_inside(folder, path.relative_to(folder).as_posix(), field=f"{file}: {place}")
         matrix = row[:15].reshape(3, 5)
         down, right, backward, position, size = matrix.T
         height, width, focal = size.tolist()

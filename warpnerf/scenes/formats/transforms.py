@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,13 +22,20 @@ from warpnerf.checks import InputError
 from warpnerf.scenes.cameras.lens import Lens, LensFields, read_lens
 from warpnerf.scenes.cameras.poses import check_pose
 from warpnerf.scenes.extent.points import Points, usable
-from warpnerf.scenes.files import exists, find_image, printable, read_json, resolve_inside
+from warpnerf.scenes.files import (
+    REDUCED,
+    exists,
+    find_image,
+    printable,
+    read_json,
+    resolve_inside,
+)
 from warpnerf.scenes.formats import left_over
 from warpnerf.scenes.formats.assemble import assemble
 from warpnerf.scenes.formats.colmap import points_beside
 from warpnerf.scenes.formats.colmap_models import find_model, size_of
 from warpnerf.scenes.formats.frame import Frame
-from warpnerf.scenes.formats.frame_images import REDUCED, find_images
+from warpnerf.scenes.formats.frame_images import elsewhere_warnings, find_images
 from warpnerf.scenes.formats.ply import read_ply
 from warpnerf.scenes.formats.split_lists import read_split_lists
 from warpnerf.scenes.formats.unnamed_photographs import unnamed_photographs
@@ -196,12 +203,15 @@ def _applied(data: TransformsFile) -> np.ndarray | None:
         return None
 
 
-def read_frames(file: Path, required: bool = True) -> tuple[TransformsFile, list[Frame], list[str]]:
+def read_frames(
+    file: Path, required: bool = True, taken: Collection[Path] = ()
+) -> tuple[TransformsFile, list[Frame], list[str]]:
     """Read a file of frames and check everything but the images' pixels.
 
     Args:
         file: To read.
         required: Whether one of its images at least must be there.
+        taken: Images of other files, which are this one's only where it gives their very paths.
 
     Returns:
         The file's content, the frames whose images are there, and warnings of the others.
@@ -211,7 +221,7 @@ def read_frames(file: Path, required: bool = True) -> tuple[TransformsFile, list
     """
     data = read_json(file, TransformsFile)
     found, warnings, moved = find_images(
-        file.parent, file, [entry.file_path for entry in data.frames], required
+        file.parent, file, [entry.file_path for entry in data.frames], required, taken
     )
     unit = data.depth_unit_scale_factor * data.applied_scale
     if not (unit > 0.0 and math.isfinite(unit)):
@@ -240,8 +250,10 @@ def read_frames(file: Path, required: bool = True) -> tuple[TransformsFile, list
                 mask=None if mask is None else Mask(mask),
                 depth=None if depth is None else DepthFile(depth, unit),
                 called=entry.file_path if index in moved else "",
+                elsewhere=moved.get(index, False),
             )
         )
+    warnings += elsewhere_warnings(file, frames)
     for key, names in lost.items():
         if names:
             warnings.append(
