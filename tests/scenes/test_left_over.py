@@ -153,7 +153,8 @@ def test_points_that_cannot_be_read_are_said(tmp_path: Path) -> None:
 
 def test_photographs_that_transforms_json_does_not_name_are_said(tmp_path: Path) -> None:
     content = write_transforms(tmp_path, 12)
-    Image.fromarray(picture(1)).save(tmp_path / "images" / "001_depth.png")  # of 001.png
+    for name in ("001_depth.png", "depth_002.png", "normal.004.jpg", "005.tif"):  # of 001.png, ...
+        Image.fromarray(picture(1)).save(tmp_path / "images" / name)
     left = content["frames"].pop(3)
     save(tmp_path / "transforms.json", content)
     scene = load_scene(tmp_path)

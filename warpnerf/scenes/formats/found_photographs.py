@@ -21,6 +21,7 @@ from warpnerf.scenes.files import ENDINGS, exists, is_photograph, printable
 from warpnerf.scenes.formats.assemble import POSED, assemble
 from warpnerf.scenes.formats.frame import Frame
 from warpnerf.scenes.formats.left_over import points_beside
+from warpnerf.scenes.formats.unnamed_photographs import photographs_left
 from warpnerf.scenes.images.depths import DepthFile
 from warpnerf.scenes.images.masks import without_masks
 from warpnerf.scenes.images.photographs import Keeping
@@ -31,9 +32,6 @@ NO_PHOTOGRAPHS = re.compile(
     r"(images_\d{1,3}|masks?|depths?|confidence|thumb(nail)?s?)", re.IGNORECASE
 )
 """Folders within one of photographs whose images are none, or are the same ones reduced."""
-
-UNPOSED = 0.1
-"""Share of the photographs without a camera, above which that is a warning."""
 
 
 class Photographs:
@@ -112,14 +110,7 @@ class Photographs:
 
     def unposed(self, file: Path, used: Collection[Path]) -> tuple[list[str], list[str]]:
         """Notes and warnings of photographs that have no camera."""
-        left = [path for path in self.paths if path not in used]
-        if not left:
-            return [], []
-        said = [
-            f"{len(left)} of {len(self.paths)} photographs have no camera in {file.name} (first: "
-            f"{printable(self.name(left[0])[:80])})"
-        ]
-        return ([], said) if len(left) > UNPOSED * len(self.paths) else (said, [])
+        return photographs_left(self.paths, used, self.folder, f"have no camera in {file.name}")
 
 
 def normalised(name: str) -> str:
