@@ -127,6 +127,17 @@ def test_a_single_ply_is_the_scene_s_points(tmp_path: Path, kind: str) -> None:
     assert any("not used as points: cloud.ply, other.ply; beside" in note for note in scene.notes)
 
 
+@pytest.mark.parametrize("kind", ["transforms", "Metashape"])
+def test_points_of_something_else_are_tried_without_a_warning(tmp_path: Path, kind: str) -> None:
+    SCENES[kind][0](tmp_path)
+    before = load_scene(tmp_path).warnings
+    write_ply(tmp_path / "mesh.ply", np.full((500, 3), 90.0))
+    scene = load_scene(tmp_path)
+    assert scene.points is None and scene.warnings == before
+    said = "the points of mesh.ply, the only .ply in the folder, are tried, and not used: they are"
+    assert f"{said} not what the cameras see" in scene.notes
+
+
 @pytest.mark.parametrize("kind", ["COLMAP", "LLFF", "Blender"])
 def test_points_that_are_not_used_are_said(tmp_path: Path, kind: str) -> None:
     SCENES[kind][0](tmp_path)

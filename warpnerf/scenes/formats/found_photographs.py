@@ -20,7 +20,7 @@ from warpnerf.scenes.cameras.lens import Lens
 from warpnerf.scenes.files import ENDINGS, exists, is_photograph, printable
 from warpnerf.scenes.formats.assemble import POSED, assemble
 from warpnerf.scenes.formats.frame import Frame
-from warpnerf.scenes.formats.left_over import points_beside
+from warpnerf.scenes.formats.left_over import only_ply, tried_points
 from warpnerf.scenes.formats.unnamed_photographs import photographs_left
 from warpnerf.scenes.images.depths import DepthFile
 from warpnerf.scenes.images.masks import without_masks
@@ -225,7 +225,7 @@ def scene_of(
     warnings = photographs.missing(file, len(entries), missing)
     few, many = photographs.unposed(file, {frame.path for frame in frames})
     notes, more = say()
-    points, tried = points_beside(photographs.folder)
+    points = only_ply(photographs.folder)
     scene = assemble(
         folder=photographs.folder,
         file=file,
@@ -238,4 +238,5 @@ def scene_of(
         withhold=reading.withhold,
         points=points,
     )
+    tried = tried_points(points, scene)
     return replace(scene, notes=(*notes, *tried, *few, *scene.notes))

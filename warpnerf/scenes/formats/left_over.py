@@ -18,6 +18,7 @@ from warpnerf.scenes.files import printable, resolve_inside
 from warpnerf.scenes.formats.frame import Frame
 from warpnerf.scenes.formats.ply import read_ply
 from warpnerf.scenes.images.masks import SUFFIXES, has_mask_of
+from warpnerf.scenes.scene import Scene
 
 MASKS = re.compile(r"(.*[_-])?masks?", re.IGNORECASE)
 DEPTHS = re.compile(r"(.*[_-])?depths?([_-]?maps?)?", re.IGNORECASE)
@@ -69,27 +70,34 @@ def unused_depths(folder: Path, frames: Sequence[Frame]) -> list[str]:
     ]
 
 
-def points_beside(folder: Path) -> tuple[Points | None, list[str]]:
-    """The points of the only PLY file in a scene's folder, for a scene that names none.
+def only_ply(folder: Path) -> Points | None:
+    """The points of the only PLY file in a scene's folder, to be tried where a scene names none.
 
     Args:
         folder: The scene's.
 
     Returns:
-        The points, not checked, and a note of that; None where there is no such file, or it cannot
-        be read.
+        The points, not checked; None where there is no such file, or it cannot be read.
     """
     files = [path for path in _clouds(folder) if path.suffix.lower() == ".ply"]
     if len(files) != 1 or files[0].stat().st_size > MAX_PLY_BYTES:
-        return None, []
+        return None
     name = files[0].name
     try:
         positions = read_ply(resolve_inside(folder, name, field=name))
     except InputError:
-        return None, []
-    said = f"the points of {printable(name)}, the only .ply in the folder, are tried"
+        return None
     positions = positions[usable(positions)]
-    return Points(positions=positions, tracks=None, source=printable(name)), [said]
+    return Points(positions=positions, tracks=None, source=printable(name), tried=True)
+
+
+def tried_points(points: Points | None, scene: Scene) -> list[str]:
+    """A note of points that were only tried: whether the scene has them."""
+    if points is None or not points.tried:
+        return []
+    said = f"the points of {points.source}, the only .ply in the folder, are tried"
+    unfit = "" if scene.points is not None else ", and not used: they are not what the cameras see"
+    return [said + unfit]
 
 
 def unused_points(folder: Path) -> list[str]:
