@@ -152,7 +152,7 @@ def files_in(folder: Path) -> list[Path]:
 
 
 def _files(folder: Path) -> Iterator[os.DirEntry[str]]:
-    """As ``files_in``, in any order: what they are is asked for links only."""
+    """As ``files_in``, in any order; only links cost a look at the disk each."""
     with suppress(OSError), os.scandir(folder) as entries:
         for entry in entries:
             regular = entry.is_file(follow_symlinks=False) or os.path.isfile(entry)  # noqa: PTH113
