@@ -40,6 +40,7 @@ LEFT, UNNAMED, LISTS, MODELS, CONTENTS, TRANSFORMS_FILE = (
         "transforms",
     )
 )
+CONVENTIONS = "scenes/extent/conventions.py"
 LEFT_TESTS = "scenes/test_left_over.py::test_"
 LISTS_TESTS = "scenes/test_split_lists.py::test_"
 MODELS_TESTS = "scenes/test_colmap_models.py::test_"
@@ -399,14 +400,14 @@ MUTANTS = [
     of_host(
         "unnamed: always a note",
         UNNAMED,
-        "> UNPOSED * len(there)",
-        "> len(there)",
+        "> UNPOSED * len(own)",
+        "> len(own)",
         f"{LEFT_TESTS}photographs_that_transforms_json_does_not_name_are_said",
     ),
     of_host(
         "unnamed: what is called after a photograph, too",
         UNNAMED,
-        "or not stems.intersection(_beginnings(path.stem))",
+        "or stems.get(path.parent, set()).isdisjoint(_called_after(path.stem))",
         "or True",
         f"{LEFT_TESTS}photographs_that_transforms_json_does_not_name_are_said",
     ),
@@ -423,6 +424,34 @@ MUTANTS = [
         "if len(of) == 1",
         "if of",
         f"{LISTS_TESTS}a_short_name_of_two_photographs_is_that_of_none",
+    ),
+    of_host(
+        "lists: any share of the lines",
+        LISTS,
+        "BELIEVED = 0.9",
+        "BELIEVED = 0.8",
+        f"{LISTS_TESTS}a_text_that_names_some_photographs_only_is_no_list",
+    ),
+    of_host(
+        "lists: of all places",
+        LISTS,
+        "        if splits:\n            aside",
+        "        if False:\n            aside",
+        f"{LISTS_TESTS}lists_of_two_places_or_programs_are_not_combined",
+    ),
+    of_host(
+        "left over: a warning of points that were tried",
+        CONVENTIONS,
+        "if points.tried:",
+        "if False:",
+        "scenes/test_conventions.py::test_points_that_fit_in_no_way_are_left_out",
+    ),
+    of_host(
+        "masks: one of its name in another folder",
+        "scenes/images/masks.py",
+        "folder = str(path).removesuffix(path.name)",
+        "folder = 'a/'",
+        "scenes/test_masks.py::test_masks_among_images_are_told_by_their_names_alone",
     ),
     of_host(
         "lists: over those of transforms.json",
@@ -453,17 +482,24 @@ MUTANTS = [
         f"{MODELS_TESTS}photographs_in_the_folder_itself_are_not_those_of_the_one_above",
     ),
     of_host(
-        "models: the smaller form",
+        "models: as text, always",
         MODELS,
-        "return max(kinds, key=",
-        "return min(kinds, key=",
-        f"{MODELS_TESTS}of_a_model_in_both_forms_the_larger_is_read",
+        "(n or 0) < CLEARLY_SMALLER * (_listed(text) or 0)",
+        "True",
+        f"{MODELS_TESTS}a_text_that_only_states_more_images_is_not_read",
+    ),
+    of_host(
+        "models: as text, if a few more",
+        MODELS,
+        "CLEARLY_SMALLER = 0.8",
+        "CLEARLY_SMALLER = 1.0",
+        f"{MODELS_TESTS}a_text_of_a_few_images_more_is_not_read",
     ),
     of_host(
         "models: a copy is out of date",
         MODELS,
-        "not in (0, n)",
-        "!= 0",
+        "if listed == n:",
+        "if False:",
         f"{MODELS_TESTS}a_copy_of_a_model_in_the_other_form_needs_no_word",
     ),
     of_host(

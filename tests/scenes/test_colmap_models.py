@@ -78,10 +78,12 @@ def test_of_a_model_in_both_forms_the_larger_is_read(tmp_path: Path, larger: str
 
 
 def test_a_copy_of_a_model_in_the_other_form_needs_no_word(tmp_path: Path) -> None:
-    in_both_forms(tmp_path, 9, 9)
+    text = in_both_forms(tmp_path, 9, 9) / "images.txt"
     found = inspect(tmp_path)
     assert found.format == "COLMAP (sparse/0, binary)"
     assert not any("is read" in said for said in found.diagnostics)
+    text.write_text("".join(text.read_text().splitlines(keepends=True)[1:]))  # no comment
+    assert not any("is read" in said for said in load_scene(tmp_path).warnings)
 
 
 def test_a_model_at_another_place_is_named(tmp_path: Path) -> None:
@@ -201,3 +203,40 @@ def test_one_model_of_all_photographs_needs_no_word(tmp_path: Path) -> None:
     scene_with_model(tmp_path)
     scene = load_scene(tmp_path)
     assert not any("model" in text for text in (*scene.notes, *scene.warnings))
+
+
+@pytest.mark.parametrize(
+    "text", ["# Number of images: 400, mean\n", "# Number of images: 400\n9 9"]
+)
+def test_a_text_that_only_states_more_images_is_not_read(tmp_path: Path, text: str) -> None:
+    model = in_both_forms(tmp_path, 9, 4)
+    (model / "images.txt").write_text(text)
+    scene = load_scene(tmp_path)
+    assert len(scene.views) == 9
+    size = "is damaged" if "9 9" in text else "has 0"
+    assert any(
+        f"images.bin of 9 images is read, and not images.txt, which {size};" in said
+        for said in scene.warnings
+    )
+
+
+def test_a_text_of_a_few_images_more_is_not_read(tmp_path: Path) -> None:
+    in_both_forms(tmp_path, 8, 9)
+    scene = load_scene(tmp_path)
+    assert len(scene.views) == 8
+    assert any("not images.txt, which has 9;" in said for said in scene.warnings)
+
+
+def test_a_text_is_read_where_the_binary_form_cannot_be(tmp_path: Path) -> None:
+    model = in_both_forms(tmp_path, 9, 4)
+    data = (model / "images.bin").read_bytes()
+    (model / "images.bin").write_bytes(data[:-9])
+    scene = load_scene(tmp_path)
+    assert len(scene.views) == 4
+    assert any(
+        "of 4 images is read, and not images.bin, which is damaged;" in said
+        for said in scene.warnings
+    )
+    (model / "images.txt").write_text("9 9")
+    with pytest.raises(InputError, match=r"images\.bin: is damaged"):
+        load_scene(tmp_path)

@@ -197,6 +197,8 @@ def test_points_that_fit_in_no_way_are_left_out(
     _, points, said = held(room, replace(right, positions=wrong(right.positions)))
     assert points is None
     assert "points.ply are not used" in said and "export them together with the poses" in said
+    tried = replace(right, positions=wrong(right.positions), tried=True)
+    assert held(room, tried)[1:] == (None, "")
 
 
 def test_poses_and_points_may_both_be_in_other_axes(room: list[View]) -> None:

@@ -127,6 +127,17 @@ def test_a_single_ply_is_the_scene_s_points(tmp_path: Path, kind: str) -> None:
     assert any("not used as points: cloud.ply, other.ply; beside" in note for note in scene.notes)
 
 
+@pytest.mark.parametrize("kind", ["transforms", "Metashape"])
+def test_points_of_something_else_are_tried_without_a_warning(tmp_path: Path, kind: str) -> None:
+    SCENES[kind][0](tmp_path)
+    before = load_scene(tmp_path).warnings
+    write_ply(tmp_path / "mesh.ply", np.full((500, 3), 90.0))
+    scene = load_scene(tmp_path)
+    assert scene.points is None and scene.warnings == before
+    said = "the points of mesh.ply, the only .ply in the folder, are tried, and not used: they are"
+    assert f"{said} not what the cameras see" in scene.notes
+
+
 @pytest.mark.parametrize("kind", ["COLMAP", "LLFF", "Blender"])
 def test_points_that_are_not_used_are_said(tmp_path: Path, kind: str) -> None:
     SCENES[kind][0](tmp_path)
@@ -153,7 +164,8 @@ def test_points_that_cannot_be_read_are_said(tmp_path: Path) -> None:
 
 def test_photographs_that_transforms_json_does_not_name_are_said(tmp_path: Path) -> None:
     content = write_transforms(tmp_path, 12)
-    Image.fromarray(picture(1)).save(tmp_path / "images" / "001_depth.png")  # of 001.png
+    for name in ("001_depth.png", "depth_002.png", "normal.004.jpg", "005.tif"):  # of 001.png, ...
+        Image.fromarray(picture(1)).save(tmp_path / "images" / name)
     left = content["frames"].pop(3)
     save(tmp_path / "transforms.json", content)
     scene = load_scene(tmp_path)

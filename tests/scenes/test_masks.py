@@ -31,7 +31,7 @@ from warpnerf.inspection.inspection import inspect
 from warpnerf.scenes.builtin.room import room_scene
 from warpnerf.scenes.formats.contents import photographs_in
 from warpnerf.scenes.formats.load import load_scene
-from warpnerf.scenes.images.masks import Mask, read_mask
+from warpnerf.scenes.images.masks import Mask, read_mask, without_masks
 from warpnerf.scenes.scene import Scene, View
 from warpnerf.training.state import scene_digest
 
@@ -191,6 +191,13 @@ def test_what_only_has_a_masks_name_and_does_not_fit_is_left_aside(
     assert not load_scene(tmp_path, downscale=2).warnings  # it is as large as photographs then are
     (tmp_path / place).write_text("no image")
     assert load_scene(tmp_path).warnings == (warning,)
+
+
+def test_masks_among_images_are_told_by_their_names_alone() -> None:
+    names = ("a/1.jpg", "a/1.jpg.mask.png", "a/2.png", "a/2_mask.jpg", "a/dynamic_mask_2.png")
+    paths = [Path(name) for name in (*names, "b/1.mask.png", "b/2.png", "b/2_mask.png")]
+    left = [path.as_posix() for path in without_masks(paths)]
+    assert left == ["a/1.jpg", "a/2.png", "a/2_mask.jpg", "b/1.mask.png", "b/2.png"]
 
 
 def test_a_photograph_may_be_called_a_mask(tmp_path: Path) -> None:

@@ -149,3 +149,33 @@ def test_a_short_name_of_two_photographs_is_that_of_none(tmp_path: Path) -> None
     scene = load_scene(tmp_path)
     assert names_of(scene)["test"] == ["images/000.png", "more/001.png"]
     assert "1 of 3 photographs are not in the scene (first: 001)" in " ".join(scene.warnings)
+
+
+def test_a_text_that_names_some_photographs_only_is_no_list(tmp_path: Path) -> None:
+    write_transforms(tmp_path, 12)
+    lines = [f"{k:03}" for k in range(9)]
+    (tmp_path / "train.txt").write_text("\n".join([*lines, "epoch"]))
+    scene = load_scene(tmp_path)
+    assert len(names_of(scene)["train"]) == 9
+    assert "train.txt: 1 of 10 photographs are not in the scene (first: epoch)" in scene.warnings
+    (tmp_path / "train.txt").write_text("\n".join([*lines, "epoch", "loss"]))
+    scene = load_scene(tmp_path)
+    assert len(names_of(scene)["train"]) == 10
+    said = "train.txt: names no photograph of the scene in 2 of 11 lines (first: epoch), and is not"
+    assert f"{said} used" in scene.warnings
+    (tmp_path / "train.txt").rename(tmp_path / "train_list.txt")
+    assert len(names_of(load_scene(tmp_path))["train"]) == 9
+
+
+def test_lists_of_two_places_or_programs_are_not_combined(tmp_path: Path) -> None:
+    scene_with_model(tmp_path)
+    (tmp_path / "train_list.txt").write_text("000.png\n001.png\n")
+    for other in ("test.txt", "sparse/0/test_list.txt"):
+        (tmp_path / other).write_text("001.png\n")
+    scene = load_scene(tmp_path)
+    assert names_of(scene) == {"train": ["000.png", "001.png"], "test": ["002.png", "003.png"]}
+    assert "not used, beside these lists: test.txt, sparse/0/test_list.txt" in scene.notes
+    (tmp_path / "train_list.txt").rename(tmp_path / "train.txt")
+    (tmp_path / "test.txt").write_text("remember the milk\n")
+    (tmp_path / "train.txt").write_text("step 1\n")
+    assert names_of(load_scene(tmp_path))["test"] == ["001.png"]  # of the model's folder

@@ -103,7 +103,8 @@ def check_against_photographs(
             nothing to ask.
 
     Returns:
-        The views and points that fit, and warnings of what was changed or left out.
+        The views and points that fit, and warnings of what was changed or left out, but for points
+        that were only tried.
     """
     if is_object and points is None and _look_at_one_thing([views[i].camera for i in training]):
         return list(views), None, []
@@ -201,6 +202,8 @@ def _believed(
             ]
     if good and share >= UNSEEN and (near or support is not None):
         return points, []
+    if points.tried:
+        return None, []
     return None, [
         f"points of {points.source} are not used: they are not what these cameras photographed, so "
         "their axes, units or scale are likely others than those of the poses; export them "

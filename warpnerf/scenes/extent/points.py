@@ -54,6 +54,8 @@ class Points:
     known."""
     source: str
     """The file, relative to the scene's folder."""
+    tried: bool = False
+    """Whether no file of the scene names them, so that they may be of something else."""
 
     def seen_by(self, name: str, camera: Camera) -> np.ndarray:
         """The points that a camera sees.

@@ -34,7 +34,7 @@ a folder sparse, or of one with photographs of which these have none."""
 
 CLEARLY_SMALLER = 0.8
 """Share of the images of the largest model that can be read, below which a damaged one is a
-fragment that nobody misses; above it, it may be what was meant."""
+fragment that nobody misses; above it, it may be what was meant. So it is of a model's two forms."""
 
 
 def find_model(folder: Path) -> Path | None:
@@ -88,8 +88,13 @@ def _has_none_of(model: Path) -> bool:
 
 def size_of(model: Path) -> int | None:
     """How many images a model has; None where it cannot be read."""
+    return _listed(model / f"images.{model_kind(model)}")
+
+
+def _listed(file: Path) -> int | None:
+    """How many images a file of them lists, whatever it states; None where it cannot be read."""
     try:
-        return len(images_of(model))
+        return len(_images_in(file))
     except (InputError, OSError):
         return None
 
@@ -140,10 +145,12 @@ def _may_have_had(model: Path, other: Path, n: int) -> float:
 
 def images_of(model: Path) -> list[ModelImage]:
     """The images of a model; InputError where it is damaged."""
-    kind = model_kind(model)
-    file = model / f"images.{kind}"
+    return _images_in(model / f"images.{model_kind(model)}")
+
+
+def _images_in(file: Path) -> list[ModelImage]:
     require_regular_file(file)
-    return (images_of_bytes if kind == "bin" else images_of_text)(file)
+    return (images_of_bytes if file.suffix == ".bin" else images_of_text)(file)
 
 
 def other_models(model: Path, n: int, folder: Path) -> tuple[list[str], list[str]]:
@@ -165,9 +172,9 @@ def other_models(model: Path, n: int, folder: Path) -> tuple[list[str], list[str
     kind = model_kind(model)
     stale = [
         f"{name(model / f'images.{kind}')} of {n} images is read, and not images.{other}, which "
-        f"has {stated}; remove the files of the one that is out of date"
+        f"{size}; remove the files of the one that is out of date"
         for other in _kinds(model)
-        if other != kind and (stated := _stated(model / f"images.{other}")) not in (0, n)
+        if other != kind and (size := _otherwise(model / f"images.{other}", n))
     ]
     if not sizes:
         return [], stale
@@ -190,11 +197,18 @@ def beside(model: Path) -> list[Path]:
 
 
 def model_kind(folder: Path) -> str | None:
-    """Whether a folder holds a model: "bin", "txt" or None; of both the one of more images."""
+    """Whether a folder holds a model: "bin", "txt" or None.
+
+    Of both it is "bin", as in other programs, unless that is damaged or clearly smaller.
+    """
     kinds = _kinds(folder)
     if len(kinds) < 2:
         return kinds[0] if kinds else None
-    return max(kinds, key=lambda kind: _stated(folder / f"images.{kind}"))
+    binary, text = (folder / f"images.{kind}" for kind in kinds)
+    n = _listed(binary)
+    if n is not None and n >= CLEARLY_SMALLER * _stated(text):  # saves reading a long text
+        return "bin"
+    return "txt" if (n or 0) < CLEARLY_SMALLER * (_listed(text) or 0) else "bin"
 
 
 def _kinds(folder: Path) -> list[str]:
@@ -206,16 +220,23 @@ def _kinds(folder: Path) -> list[str]:
     ]
 
 
-def _stated(file: Path) -> int:
-    """How many images a file of them says that it has; 0 where that cannot be read."""
+def _stated(text: Path) -> int:
+    """How many images a text of them says that it has; 0 where it does not."""
     try:
-        require_regular_file(file)
-        if file.suffix == ".txt":
-            return stated_images(file)
-        with file.open("rb") as opened:
-            return int.from_bytes(opened.read(8), "little")
+        require_regular_file(text)
+        return stated_images(text)
     except (InputError, OSError, UnicodeDecodeError):
         return 0
+
+
+def _otherwise(file: Path, n: int) -> str:
+    """What a file of images has other than n of them, in words; empty: nothing, as it seems."""
+    if file.suffix == ".txt" and _stated(file) == n:
+        return ""
+    listed = _listed(file)
+    if listed == n:
+        return ""
+    return "is damaged" if listed is None else f"has {listed}"
 
 
 def scene_folder(model: Path) -> Path:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import re
 import shlex
 from contextlib import suppress
@@ -145,11 +146,8 @@ def _what_is_there(folder: Path) -> str:
         return f"it holds the video {videos[0].name}; make a scene of it by {pose_command(first)}"
     if unread:
         return f"it holds {len(unread)} photographs as {_kind(unread[0])}; convert them to JPEG"
-    deeper = {
-        path: len(photographs_in(path))
-        for path in inner
-        if photographs_in(path) and not is_written(path)
-    }
+    counts = {path: len(photographs_in(path)) for path in inner if not is_written(path)}
+    deeper = {path: n for path, n in counts.items() if n}
     if deeper:
         largest = max(deeper, key=lambda path: deeper[path])
         command = pose_command(shlex.quote(str(largest)))
@@ -273,11 +271,13 @@ def _lacking(folder: Path, places: tuple[str, ...]) -> str | None:
 
 def _entries(folder: Path) -> list[Path]:
     try:
-        return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
+        with os.scandir(folder) as entries:
+            names = sorted(entry.name for entry in entries)  # paths take ten times as long to sort
     except OSError as error:
         raise InputError(
             f"{folder}: the folder cannot be read ({error.strerror}); give access to it."
         ) from None
+    return [folder / name for name in names if not name.startswith(".")]
 
 
 def _folders(place: Path) -> list[Path]:

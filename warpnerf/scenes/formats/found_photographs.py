@@ -28,7 +28,8 @@ from warpnerf.scenes.files import (
 )
 from warpnerf.scenes.formats.assemble import POSED, assemble
 from warpnerf.scenes.formats.frame import Frame
-from warpnerf.scenes.formats.left_over import points_beside
+from warpnerf.scenes.formats.left_over import only_ply, tried_points
+from warpnerf.scenes.formats.unnamed_photographs import photographs_left
 from warpnerf.scenes.images.depths import DepthFile
 from warpnerf.scenes.images.masks import without_masks
 from warpnerf.scenes.images.photographs import Keeping
@@ -37,9 +38,6 @@ from warpnerf.scenes.split import Split
 
 NO_PHOTOGRAPHS = re.compile(rf"{REDUCED.pattern}|{OTHER_IMAGES.pattern}", re.IGNORECASE)
 """Folders within one of photographs whose images are none, or are the same ones reduced."""
-
-UNPOSED = 0.1
-"""Share of the photographs without a camera, above which that is a warning."""
 
 
 class Photographs:
@@ -132,14 +130,7 @@ class Photographs:
 
     def unposed(self, file: Path, used: Collection[Path]) -> tuple[list[str], list[str]]:
         """Notes and warnings of photographs that have no camera."""
-        left = [path for path in self.paths if path not in used]
-        if not left:
-            return [], []
-        said = [
-            f"{len(left)} of {len(self.paths)} photographs have no camera in {file.name} (first: "
-            f"{printable(self.name(left[0])[:80])})"
-        ]
-        return ([], said) if len(left) > UNPOSED * len(self.paths) else (said, [])
+        return photographs_left(self.paths, used, self.folder, f"have no camera in {file.name}")
 
 
 def normalised(name: str) -> str:
@@ -255,7 +246,7 @@ def scene_of(
     warnings = photographs.missing(file, len(entries), missing)
     few, many = photographs.unposed(file, {frame.path for frame in frames})
     notes, more = say()
-    points, tried = points_beside(photographs.folder)
+    points = only_ply(photographs.folder)
     scene = assemble(
         folder=photographs.folder,
         file=file,
@@ -268,4 +259,5 @@ def scene_of(
         withhold=reading.withhold,
         points=points,
     )
+    tried = tried_points(points, scene)
     return replace(scene, notes=(*notes, *tried, *few, *scene.notes))

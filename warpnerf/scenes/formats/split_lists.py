@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -9,16 +10,18 @@ from pathlib import Path
 from warpnerf.checks import InputError
 from warpnerf.scenes.files import exists, plain_name, printable, read_names
 
-LISTS = {
-    "train": ("train_list.txt", "train.txt"),
-    "test": ("test_list.txt", "test.txt"),
-    "val": ("validation_list.txt", "val.txt"),
-}
-"""Files that hold each split, as nerfstudio names them, and as 3DGS does, also in the folder of a
+LISTS = (
+    {"train": "train_list.txt", "test": "test_list.txt", "val": "validation_list.txt"},
+    {"train": "train.txt", "test": "test.txt", "val": "val.txt"},
+)
+"""Files that hold each split, as nerfstudio names them, and as 3DGS does; also in the folder of a
 COLMAP model. Another program's train.txt may be no list of photographs."""
 
 NERFSTUDIO = "_list.txt"
 """How the names end that nothing else has."""
+
+BELIEVED = 0.9
+"""Share of the lines of another file that must name photographs."""
 
 WORDS = {"train": "training", "test": "test", "val": "validation"}
 
@@ -29,7 +32,7 @@ def read_split_lists(
     of_model: Collection[str],
     model: Path | None = None,
 ) -> tuple[dict[str, set[str]], list[str], list[str]]:
-    """Read the lists of a scene's folder.
+    """Read the lists of a scene's folder: those of one place and of one program.
 
     With a list of training photographs and none of test photographs, the others are for testing.
 
@@ -46,56 +49,85 @@ def read_split_lists(
         InputError: A list cannot be read, or none of its lines names a photograph.
     """
     splits: dict[str, set[str]] = {}
-    warnings, told = [], []
+    warnings: list[str] = []
+    told: list[str] = []
+    aside: list[str] = []
     known = _known(of_model)
     whole = "the scene" if model is None else "the model"
-    for split, names in LISTS.items():
-        places = [folder, folder if model is None else model]
-        path = next((p / name for p in places for name in names if exists(p / name)), None)
-        if path is None:
+    places = [folder] if model is None or model.samefile(folder) else [folder, model]
+    for place, names in itertools.product(places, LISTS):
+        paths = {split: place / name for split, name in names.items() if exists(place / name)}
+        files = {split: _shown(path, folder) for split, path in paths.items()}
+        if splits:
+            aside += files.values()
             continue
-        file = printable(Path(os.path.relpath(path, folder)).as_posix())
-        try:
-            listed = {_named(line, known) for line in read_names(path)}
-        except InputError:
-            if path.name.endswith(NERFSTUDIO):
-                raise
-            warnings.append(f"{file}: cannot be read as text, and is not used")
-            continue
-        if not listed:
-            warnings.append(f"{file}: is empty, and not used")
-            continue
-        lost = sorted(listed.difference(of_model))
-        if len(lost) == len(listed):
-            first = printable(lost[0][:80])
-            if not path.name.endswith(NERFSTUDIO):
-                warnings.append(
-                    f"{file}: names no photograph of {whole} (first: {first}), and is not used"
-                )
+        for split, path in paths.items():
+            listed, warning = _read_list(path, files[split], known, whole)
+            warnings += warning
+            if not listed:
                 continue
-            raise InputError(
-                f"{path}: names no photograph of {whole} (first: {first}); name them as "
-                f"{whole} does, one a line, or remove the file."
-            )
-        if lost:
-            warnings.append(
-                f"{file}: {len(lost)} of {len(listed)} photographs are not in {whole} (first: "
-                f"{printable(lost[0][:80])})"
-            )
-        splits[split] = listed.intersection(there)
-        if not splits[split]:
-            first = printable(min(listed.intersection(of_model))[:80])
-            raise InputError(
-                f"{path}: none of the model's photographs that it names is there (first: {first}); "
-                "put them there, or remove the file."
-            )
-        told.append(f"{WORDS[split]} photographs are those of {file}")
+            splits[split] = listed.intersection(there)
+            if not splits[split]:
+                raise InputError(
+                    f"{path}: none of {whole}'s photographs that it names is there (first: "
+                    f"{printable(min(listed)[:80])}); put them there, or remove the file."
+                )
+            told.append(f"{WORDS[split]} photographs are those of {files[split]}")
     if "train" in splits and "test" not in splits:
         rest = set(there).difference(*splits.values())
         if rest:
             splits["test"] = rest
             told.append("all others are for testing")
-    return splits, [", ".join(told)] if told else [], warnings
+    notes = [", ".join(told)] if told else []
+    if aside:
+        notes.append(f"not used, beside these lists: {', '.join(aside)}")
+    return splits, notes, warnings
+
+
+def _shown(path: Path, folder: Path) -> str:
+    return printable(Path(os.path.relpath(path, folder)).as_posix())
+
+
+def _read_list(
+    path: Path, file: str, known: Mapping[str, str], whole: str
+) -> tuple[set[str], list[str]]:
+    """The photographs that a list names, and warnings; none where it is not used.
+
+    Args:
+        path: Of the list.
+        file: Its name for messages.
+        known: Photographs by what a line may call them.
+        whole: What has them, in words.
+
+    Raises:
+        InputError: As ``read_split_lists``.
+    """
+    certain = path.name.endswith(NERFSTUDIO)
+    try:
+        lines = set(read_names(path))
+    except InputError:
+        if certain:
+            raise
+        return set(), [f"{file}: cannot be read as text, and is not used"]
+    if not lines:
+        return set(), [f"{file}: is empty, and not used"]
+    found = {line: _named(line, known) for line in lines}
+    listed = {name for name in found.values() if name is not None}
+    lost = sorted(line for line, name in found.items() if name is None)
+    if not lost:
+        return listed, []
+    first = printable(lost[0][:80])
+    share = f"{len(lost)} of {len(lines)}"
+    if not certain and len(lines) - len(lost) < BELIEVED * len(lines):
+        where = f" in {share} lines" if listed else ""
+        said = f"names no photograph of {whole}{where} (first: {first}), and is not used"
+        return set(), [f"{file}: {said}"]
+    if not listed:
+        raise InputError(
+            f"{path}: names no photograph of {whole} (first: {first}); name them as {whole} does, "
+            "one a line, or remove the file."
+        )
+    return listed, [f"{file}: {share} photographs are not in {whole} (first: {first})"]
 
 
 def _known(names: Collection[str]) -> dict[str, str]:
@@ -112,7 +144,7 @@ def _known(names: Collection[str]) -> dict[str, str]:
     return alone | {plain_name(name): name for name in names}
 
 
-def _named(line: str, known: Mapping[str, str]) -> str:
-    """The photograph that a line names, by the scene's name; the line itself where it is none."""
+def _named(line: str, known: Mapping[str, str]) -> str | None:
+    """The photograph that a line names, by the scene's name; None: none."""
     name = plain_name(line)
-    return known.get(name) or known.get(name.removeprefix("images/")) or line
+    return known.get(name) or known.get(name.removeprefix("images/"))

@@ -27,7 +27,7 @@ SHOWN = 3
 
 WITHOUT_EFFECT = {
     *("aabb_scale", "scale", "offset", "up", "n_frames", "sharpness", "colmap_im_id", "rotation"),
-    *("applied_transform", "orientation_override", "time"),
+    *("orientation_override", "time"),
     *("camera_id", "image_id"),
 }
 """Keys that are not read and do not change the picture."""

@@ -141,9 +141,8 @@ def load_transforms(
     points, why_not = _points(file, data, frames)
     if why_not:
         warnings.append(why_not)
-    tried: list[str] = []
     if points is None:
-        points, tried = left_over.points_beside(folder)
+        points = left_over.only_ply(folder)
     scene = assemble(
         folder=folder,
         file=file,
@@ -156,6 +155,7 @@ def load_transforms(
         withhold=withhold,
         points=points,
     )
+    tried = left_over.tried_points(points, scene)
     return replace(scene, notes=(*few, *listed_in, *tried, *scene.notes))
 
 

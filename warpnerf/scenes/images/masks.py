@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
@@ -14,6 +14,9 @@ from warpnerf.scenes.images.images import image_size, read_image
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 """Of masks, which are named after a photograph or its stem."""
+
+DYNAMIC = "dynamic_mask_"
+"""What the names of instant-ngp's masks begin with."""
 
 
 @dataclass(frozen=True)
@@ -54,22 +57,31 @@ class PackedMask:
 def mask_beside(photograph: Path) -> Mask | None:
     """The mask of a photograph in the same folder, by its name: dynamic_mask_NAME.png, as of
     instant-ngp; NAME.jpg.mask.png or NAME.mask.png, as of RealityScan; or NAME_mask.png."""
-    path = photograph.with_name(f"dynamic_mask_{photograph.stem}.png")
-    if os.path.isfile(path):  # noqa: PTH113, never raises
-        return Mask(path, white_counts=False, found=True)
-    stems = (f"{photograph.name}.mask", f"{photograph.stem}.mask", f"{photograph.stem}_mask")
-    for name in (f"{stem}{suffix}" for stem in stems for suffix in SUFFIXES):
+    for index, name in enumerate(_names_beside(photograph)):
         path = photograph.with_name(name)
-        if os.path.isfile(path):  # noqa: PTH113
-            return Mask(path, found=True)
+        if os.path.isfile(path):  # noqa: PTH113, never raises
+            return Mask(path, white_counts=index > 0, found=True)
     return None
+
+
+def _names_beside(photograph: Path) -> Iterator[str]:
+    """What a mask in the folder of its photograph is called; first as of instant-ngp."""
+    name, stem = photograph.name, photograph.stem
+    yield f"{DYNAMIC}{stem}.png"
+    for named in (f"{name}.mask", f"{stem}.mask", f"{stem}_mask"):
+        yield from (named + suffix for suffix in SUFFIXES)
 
 
 def without_masks(paths: Sequence[Path]) -> list[Path]:
     """Those of some images that are no mask of another one of them, in the same order."""
-    found = (mask_beside(path) for path in paths if not path.name.startswith("dynamic_mask_"))
-    masks = {mask.path for mask in found if mask is not None}
-    return [p for p in paths if p not in masks and not p.name.startswith("dynamic_mask_")]
+    there = set(map(str, paths))  # asking the disk for each name takes long
+    masks = set()
+    images = [path for path in paths if not path.name.startswith(DYNAMIC)]
+    for path in images:
+        folder = str(path).removesuffix(path.name)
+        beside = (folder + name for name in _names_beside(path))
+        masks.add(next(filter(there.__contains__, beside), None))
+    return [path for path in images if str(path) not in masks]
 
 
 def mask_in(folder: Path, name: str) -> Mask | None:
@@ -109,12 +121,7 @@ def masks_of_folder(folder: Path, names: Sequence[str]) -> list[Mask | None]:
         raise InputError(f"--masks {folder}: is no folder; name the folder of the masks.")
     if not os.access(folder, os.R_OK | os.X_OK):
         raise InputError(f"--masks {folder}: cannot be read; give access to it.")
-    parents = {PurePosixPath(name).parent.as_posix() for name in names}
-    common = os.path.commonpath(parents).replace(os.sep, "/")
-    found = []
-    for name in names:
-        inside = PurePosixPath(name).relative_to(common).as_posix()
-        found.append(mask_in(folder, inside) or mask_in(folder, name))
+    found = list(_found_in(folder, names))
     if not any(found):
         stem = PurePosixPath(names[0]).stem
         raise InputError(
@@ -122,6 +129,19 @@ def masks_of_folder(folder: Path, names: Sequence[str]) -> list[Mask | None]:
             f"name them after the photographs: {PurePosixPath(names[0]).name}.png or {stem}.png."
         )
     return found
+
+
+def has_mask_of(folder: Path, names: Sequence[str]) -> bool:
+    """Whether ``masks_of_folder`` would find one at least."""
+    return any(_found_in(folder, names))
+
+
+def _found_in(folder: Path, names: Sequence[str]) -> Iterator[Mask | None]:
+    parents = {PurePosixPath(name).parent.as_posix() for name in names}
+    common = os.path.commonpath(parents).replace(os.sep, "/")
+    for name in names:
+        inside = PurePosixPath(name).relative_to(common).as_posix()
+        yield mask_in(folder, inside) or mask_in(folder, name)
 
 
 def fits(mask: Mask, *, width: int, height: int, downscale: int = 1) -> bool:
