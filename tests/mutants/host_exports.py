@@ -56,6 +56,8 @@ MUTANTS = [
     of_host("holes: fans inside out", HOLES, "[np.roll(border, -1), border, middle]", "[border, np.roll(border, -1), middle]",
             CLOSED),
     # writing.py, filming.py
+    of_host("writing: through a link", "writing.py", "            temporary.unlink(missing_ok=True)  # a link, or of a process that had this number\n            flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL", "            flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC",
+            "project/test_writing.py::test_a_link_in_place_of_a_temporary_file_is_not_followed"),
     of_host("writing: the end of a name alone", "writing.py", "{zlib.crc32(whole):08x}-", "", LONG_NAMES),
     of_host("writing: long names are added to", "writing.py", "if len(whole) > LONGEST_NAME:", "if False:", LONG_NAMES),
     of_host("writing: the last error is told", "writing.py", "suppress(OSError)", "suppress(KeyError)",

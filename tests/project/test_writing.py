@@ -85,3 +85,13 @@ def test_a_loop_of_links_is_to_be_removed(tmp_path: Path) -> None:
         "--output loop cannot be written: File exists; remove the file or the link of that name, "
         "or name another place."
     )
+
+
+def test_a_link_in_place_of_a_temporary_file_is_not_followed(tmp_path: Path) -> None:
+    """Its name can be known: numbers of processes come again."""
+    precious, path = tmp_path / "precious", tmp_path / "a.json"
+    precious.write_bytes(b"old")
+    (tmp_path / f".a.json.{os.getpid()}.tmp").symlink_to(precious)
+    write_atomically(path, b"new")
+    assert precious.read_bytes() == b"old"
+    assert path.read_bytes() == b"new" and not path.is_symlink()

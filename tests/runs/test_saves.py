@@ -40,7 +40,10 @@ def test_all_of_a_save_goes_through_the_calls_that_fail_below(tmp_path: Path) ->
         run.save_checkpoint(state)
     n_writes = faults.calls.count("write")
     assert n_writes > 5
-    before, after = ["open", *n_writes * ["write"], "fsync", "close"], ["open", "fsync", "close"]
+    before, after = (
+        ["unlink", "open", *n_writes * ["write"], "fsync", "close"],
+        ["open", "fsync", "close"],
+    )
     assert faults.calls == [*before, "replace", *after, "unlink"]
     assert faults.written == run.checkpoints[0].read_bytes()
 
