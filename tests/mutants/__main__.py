@@ -29,6 +29,7 @@ import hashed
 import heads
 import host_command
 import host_exports
+import host_folders
 import host_formats
 import host_measures
 import host_output
@@ -65,6 +66,7 @@ MUTANTS = (
     *resampled.MUTANTS,
     *host_training.MUTANTS,
     *host_scenes.MUTANTS,
+    *host_folders.MUTANTS,
     *host_formats.MUTANTS,
     *host_output.MUTANTS,
     *host_measures.MUTANTS,

@@ -121,16 +121,21 @@ def test_photographs_of_other_names_are_mentioned(tmp_path: Path, said: str, the
         load_scene(tmp_path)
 
 
+def without_photographs(folder: Path, model: bool) -> None:
+    """A scene of four photographs that are not there, by a COLMAP model or a transforms.json."""
+    if model:
+        scene_with_model(folder)
+        shutil.rmtree(folder / "images")
+    else:
+        named(folder, four("{}.png"))
+
+
 @pytest.mark.parametrize("ending", ["png", "PNG"])
 @pytest.mark.parametrize("model", [False, True])
 def test_photographs_of_a_folder_of_any_name_are_warned_of(
     tmp_path: Path, model: bool, ending: str
 ) -> None:
-    if model:
-        scene_with_model(tmp_path)
-        shutil.rmtree(tmp_path / "images")
-    else:
-        named(tmp_path, four("{}.png"))
+    without_photographs(tmp_path, model)
     photographs(tmp_path, four(f"rgb/{{}}.{ending}"))
     scene = load_scene(tmp_path)
     assert_read(scene)
@@ -150,11 +155,7 @@ def test_photographs_of_a_folder_of_any_name_are_warned_of(
 def test_images_that_are_named_after_photographs_are_none(
     tmp_path: Path, model: bool, place: str
 ) -> None:
-    if model:
-        scene_with_model(tmp_path)
-        shutil.rmtree(tmp_path / "images")
-    else:
-        named(tmp_path, four("{}.png"))
+    without_photographs(tmp_path, model)
     photographs(tmp_path, four(place + "/{}.png"))
     with pytest.raises(InputError, match=r"no image of 4 frames|none of the model's 4"):
         load_scene(tmp_path)
