@@ -25,16 +25,16 @@ INTERVAL = 1.0 / 25.0
 """Seconds from one warped picture to the next."""
 WARP_SECONDS = 0.05
 """That warping and encoding one may take; on slower machines it is smaller."""
-HOLE_SECONDS = 0.005
+HOLE_SECONDS = 0.003
 """That rays may take which fill its holes."""
-KEY_SECONDS = 0.4
+KEY_SECONDS = 0.2
 """That the whole picture may take which is warped next."""
 NEXT_SHARE = 0.4
 """Of the time to the next warped picture, that a band of the next whole one may take: on a busy
 machine it takes longer than it should."""
 BAND_SECONDS = 0.04
 """That a band may take: how long a moving camera waits for it, at most."""
-REST_SECONDS = 0.15
+REST_SECONDS = 0.2
 """Without a change, after which the fine picture begins."""
 SHOW_EVERY = 0.4
 """Seconds from one look at an unfinished fine picture to the next."""
