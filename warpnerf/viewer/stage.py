@@ -178,7 +178,7 @@ class Pyramids:
         self._pyramids: Any = None  # all of them, in one call of the page's graphics
         self._photographs: list[tuple[int, Any]] = []  # indices of cameras, and what shows them
         self._folder: Any = None
-        self._hidden: frozenset[int] | None = None  # None: to be said anew
+        self._hidden: frozenset[int] | None = None  # None: to be told again
         self._position = np.full(3, np.inf)
         self._begun = False
         self._lock = threading.Lock()
