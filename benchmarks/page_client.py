@@ -90,10 +90,16 @@ class PageClient:
             return
 
     def _take(self, raw: Any) -> None:
-        compressed = int.from_bytes(raw[8:16], "little")
-        content = zstandard.ZstdDecompressor().decompress(raw[16 : 16 + compressed])
+        end = 16 + int.from_bytes(raw[8:16], "little")
+        content = msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(raw[16:end]))
+        arrays = []
+        for length in content.get("binaryBufferLengths", ()):
+            begin = -(-end // 8) * 8
+            end = begin + length
+            arrays.append(raw[begin:end])
         with self._news:
-            for message in msgspec.msgpack.decode(content)["messages"]:
+            for message in content["messages"]:
+                message = _with_arrays(message, arrays)
                 if message.get("rgb_data") is not None:  # a BackgroundImageMessage
                     picture = Image.open(io.BytesIO(message["rgb_data"])).convert("RGB")
                     self.pictures.append(np.asarray(picture))
@@ -102,3 +108,12 @@ class PageClient:
                     message["n_pictures"] = len(self.pictures)  # that came before
                     self.messages.setdefault(message["type"], []).append(message)
             self._news.notify_all()
+
+
+def _with_arrays(said: Any, arrays: list[bytes]) -> Any:
+    """What was said, with flat arrays in place of their numbers."""
+    if not isinstance(said, dict):
+        return said
+    if "__binary_index" in said:
+        return np.frombuffer(arrays[said["__binary_index"]], said["dtype"])
+    return {key: _with_arrays(value, arrays) for key, value in said.items()}

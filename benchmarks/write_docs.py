@@ -291,6 +291,7 @@ def exports(records: Records) -> str:
 
 def served(records: Records) -> str:
     viewer, client = records["viewer"], records["nerfbaselines_client"]
+    dragging = records["dragging"]
     ratio = viewer["training"]["ratios"]["nobody looks"]
     width, height = viewer["window"]
     compared = "; ".join(
@@ -302,15 +303,19 @@ def served(records: Records) -> str:
         text(
             f"""The page of `warpnerf view` in a window of {width} x {height} pixels: a fine picture
             takes {show(viewer["painting"]["whole"]["seconds"], 2)} s, and is there
-            {show(viewer["fine_picture_seconds"], 2)} s after the last move. While the camera moves
-            there are {show(viewer["moving_pictures_per_second"], 1)} pictures a second. The first
+            {show(viewer["fine_picture_seconds"], 2)} s after the last move. The first
             comes {show(viewer["first_picture_seconds"], 2)} s after the page has said where its
-            camera is; in Chromium, which draws by software on the same cores,
-            {show(viewer["browser"]["first_picture_seconds"], 2)} s after the load event. A training
+            camera is; in Chromium, drawing on the same cores,
+            {show(viewer["browser"]["first_picture_seconds"], 2)} s after the load event.
+            A mouse that drags a window of {dragging["window"][0]} x {dragging["window"][1]} pixels sees
+            {show(dragging["pictures_per_second"], 1)} pictures a second,
+            and the fine one
+            {show(dragging["fine_picture_seconds"], 2)} s after the last move. A training
             with a page at which nobody looks takes {show(ratio, 2)} of the time without.
             Metrics by nerfbaselines of its own pictures, and by warpnerf of the same field
-            after {client["steps"]} steps: {compared}. The rest is rounding to bytes.""",
+            after {client["steps"]} steps: {compared}. The rest is rounding.""",
             records.source("viewer"),
+            records.source("dragging"),
             records.source("nerfbaselines_client"),
         ),
     )

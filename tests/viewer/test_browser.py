@@ -141,10 +141,11 @@ def test_what_is_chosen_in_the_panel_is_shown(chromium: Any, field: Field, scene
         page.close()
 
 
+@pytest.mark.parametrize("along", [0.4, 1.0], ids=["side", "photograph"])
 def test_a_training_camera_is_stood_in_by_a_click(
-    chromium: Any, field: Field, scene: Scene
+    chromium: Any, field: Field, scene: Scene, along: float
 ) -> None:
-    """Of the frustum that viser draws where that camera is; so its place on the screen is right."""
+    """On the pyramid that is drawn where that camera is; so its place on the screen is right."""
     with serving(field, scene=scene) as session:
         page = opened(chromium, session)
         (looking,) = session._pages.values()
@@ -155,8 +156,8 @@ def test_a_training_camera_is_stood_in_by_a_click(
         stand_in(looking.client, camera, world)
         eventually(lambda: looking.viewpoint is not begun and at_rest(session))
         target, view = scene.cameras[4], looking.viewpoint.camera(WIDTH, HEIGHT)
-        # The middle of its photograph, on the pyramid's base.
-        point = target.position + session._stage.length / world.scale * target.forward
+        # 1: the middle of its photograph, on the pyramid's base.
+        point = target.position + along * session._stage.length / world.scale * target.forward
         local = view.c2w[:, :3].T @ (point - view.position)
         x = view.cx - view.fx * local[0] / local[2]
         y = view.cy + view.fy * local[1] / local[2]

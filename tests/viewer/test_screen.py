@@ -143,7 +143,7 @@ def test_a_drag_shows_the_last_whole_picture_warped(watched: Watched, share: flo
     assert {picture.shape for picture in watched.shown[-50:]} == {(150, 200, 3)}
     looks = [id(look) for look, _, _ in watched.painter.warped]
     assert watched.painter.warped[0][0] is fine
-    assert 4 <= len(set(looks)) <= 30  # a new one to be warped twice a second or oftener
+    assert 4 <= len(set(looks)) < 0.7 * len(looks)  # each is warped several times
     assert all(n >= 1 for _, _, n in watched.painter.warped)
     last = watched.painter.warped[-1][0].viewpoint
     assert fine is not None and last is not fine.viewpoint

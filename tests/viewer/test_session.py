@@ -166,7 +166,7 @@ def test_one_stands_in_a_camera_without_seeing_it(field: Field) -> None:
         PageClient(session.server.get_port()) as page,
     ):
         page.look_from(opencv(poses[1]))
-        page.wait(lambda page: len(page.messages.get("CameraFrustumMessage", [])) == 4)
+        page.wait(lambda page: page.messages.get("BatchedMeshesMessage"))
         page.wait(lambda page: visible(page) == {0, 2, 3})
         page.look_from(opencv(ring(5, radius=1.0)[2]))
         page.wait(lambda page: visible(page) == {0, 1, 2, 3})
@@ -238,20 +238,23 @@ def test_each_page_gets_its_cameras_after_its_picture(field: Field) -> None:
             with PageClient(session.server.get_port()) as page:
                 page.look_from(opencv(poses[1]))
                 page.wait(lambda page: visible(page) == {0, 2, 3})
-                first = page.messages["CameraFrustumMessage"][0]
+                first = page.messages["BatchedMeshesMessage"][0]
                 assert first["n_pictures"] >= 2  # a coarse one and a fine one
                 session._stage.show_cameras(visible=False, scale=2.0)
                 page.wait(lambda page: visible(page) == set())
                 session._stage.show_cameras(visible=True, scale=1.0)
+                page.wait(lambda page: visible(page) == {0, 2, 3})
         page.wait(lambda _: not session._stage._pages)
     assert len(session._stage._photographs) == 4
 
 
 def visible(page: PageClient) -> set[int]:
     """The cameras that a page shows, by what it was told last."""
-    told = page.messages.get("SetSceneNodeVisibilityMessage", [])
-    shown = {message["name"]: message["visible"] for message in told}
-    return {int(n.rpartition("/")[2]) for n, v in shown.items() if v and n.startswith("/cameras/")}
+    told = page.messages.get("SceneNodeUpdateMessage", [])
+    scales = [m["updates"]["batched_scales"] for m in told if m["name"] == "/cameras"]
+    if not scales:
+        return set()
+    return set(np.flatnonzero(scales[-1].reshape(-1, 3).all(axis=1)).tolist())
 
 
 def trained(config: TrainConfig, looking: bool) -> tuple[bytes, int]:

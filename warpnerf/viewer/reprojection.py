@@ -6,6 +6,8 @@ moves, until the next picture has been rendered.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import warp as wp
 from warpnerf_kernels.base.types import mat33, real, vec2, vec3
@@ -47,16 +49,20 @@ class Reprojector:
         )
         distances = _lent(np.minimum(distance, far), real)
         pixels = _lent(picture, wp.uint8)
-        depths = np.full(size, kernels.NOTHING, np.float32)
+        buffer = _coarser(target)
+        depths = np.full((buffer.height, buffer.width), kernels.NOTHING, np.float32)
         warped, seen = np.zeros((*size, 3), np.uint8), np.empty(size, np.uint8)
         depth_buffer = _lent(depths, real)
         self._workers.launch(
-            kernels.splat_depths, source.height, *views, distances, depth_buffer, cache=self._cache
+            kernels.splat_depths,
+            -(-source.height // kernels.COARSE),
+            *(views[0], _pinhole(buffer), distances, depth_buffer),
+            cache=self._cache,
         )
         self._workers.launch(
             kernels.inverse_warp,
             target.height,
-            *(*views, pixels, distances, depth_buffer),
+            *(*views, _pinhole(buffer), pixels, distances, depth_buffer),
             *(_lent(warped, wp.uint8), _lent(seen, wp.uint8)),
             cache=self._cache,
         )
@@ -67,6 +73,20 @@ def _lent(values: np.ndarray, dtype: type) -> wp.array:
     """Values of whatever shape as a flat array of kernels, without a copy."""
     flat = np.ascontiguousarray(values).reshape(-1)
     return wp.array(flat, dtype=dtype, device="cpu", copy=False)
+
+
+def _coarser(camera: Camera) -> Camera:
+    """The camera with the larger pixels of the depth buffer."""
+    share = 1.0 / kernels.COARSE
+    return replace(
+        camera,
+        width=-(-camera.width // kernels.COARSE),
+        height=-(-camera.height // kernels.COARSE),
+        fx=share * camera.fx,
+        fy=share * camera.fy,
+        cx=share * camera.cx,
+        cy=share * camera.cy,
+    )
 
 
 def _pinhole(camera: Camera) -> kernels.Pinhole:

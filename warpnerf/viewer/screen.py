@@ -21,17 +21,20 @@ from warpnerf.viewer.viewpoint import Viewpoint
 
 MOVING_SECONDS = 1.0 / 15.0
 """That a rendered picture may take while the camera moves."""
-INTERVAL = 1.0 / 20.0
+INTERVAL = 1.0 / 25.0
 """Seconds from one warped picture to the next."""
-WARP_SECONDS = 0.03
+WARP_SECONDS = 0.05
 """That warping and encoding one may take; on slower machines it is smaller."""
-HOLE_SECONDS = 0.01
+HOLE_SECONDS = 0.003
 """That rays may take which fill its holes."""
-KEY_SECONDS = 0.4
+KEY_SECONDS = 0.2
 """That the whole picture may take which is warped next."""
+NEXT_SHARE = 0.4
+"""Of the time to the next warped picture, that a band of the next whole one may take: on a busy
+machine it takes longer than it should."""
 BAND_SECONDS = 0.04
 """That a band may take: how long a moving camera waits for it, at most."""
-REST_SECONDS = 0.15
+REST_SECONDS = 0.2
 """Without a change, after which the fine picture begins."""
 SHOW_EVERY = 0.4
 """Seconds from one look at an unfinished fine picture to the next."""
@@ -226,7 +229,7 @@ class Screen:
             budget = max(MIN_PIXELS, self._paces.fine.pixels(share * KEY_SECONDS))
             size = _shrunk(self._warped_size(viewpoint), budget)
             self._begin(viewpoint, settings, size)
-        self._draw_band(min(seconds, BAND_SECONDS))
+        self._draw_band(min(NEXT_SHARE * seconds, BAND_SECONDS))
 
     def _draw_fine(self, viewpoint: Viewpoint, settings: Settings) -> None:
         """A band of the picture at rest."""

@@ -32,12 +32,20 @@ EYES = 2.0
 AMONG = 8.0
 """Lengths of a pyramid from the nearest camera, within which one stands among them."""
 
-CAMERA_COLOUR = (235, 120, 30)
+CAMERA_COLOUR = (255, 60, 0)
+"""Which the page's tone mapping turns to orange."""
 BOX_COLOUR = (60, 140, 240)
 PATH_COLOUR = (70, 180, 90)
 
 CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 EDGES = [(a, b) for a in range(8) for b in range(a) if np.abs(CORNERS[a] - CORNERS[b]).sum() == 1]
+
+PYRAMID = np.array(
+    [[0, 0, 0], [-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1], [0, -1, 1], [0, -1.2, 1]]
+)
+"""Vertices: the apex, the corners of the base, and a line that says where up is; y is down."""
+SIDES = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1], [5, 6, 6]])
+"""The triangles of which the edges are drawn, and by which a pyramid is clicked on."""
 
 
 class Stage:
@@ -50,8 +58,12 @@ class Stage:
         self._pages: dict[int, Pyramids] = {}
         self.cameras: dict[str, Camera] = {}
         """Those that are shown, by the names of their photographs."""
-        self.pyramids: list[dict[str, Any]] = []
-        """How each is drawn: what viser is told of it."""
+        self.orientations = np.empty((0, 4))
+        """Of the pyramids, [n, 4] quaternions in viser's axes, w first."""
+        self.apexes = np.empty((0, 3))
+        """Where they begin, [n, 3] in viser's units."""
+        self.extents = np.empty((0, 3))
+        """Half the width and the height of their bases, and their length, [n, 3], viser's units."""
         self._views: list[View] = []
         self._photographs: dict[int, np.ndarray | None] = {}
         self._places = np.empty((0, 3))
@@ -68,7 +80,11 @@ class Stage:
             cameras = list(self.cameras.values())
             self._places = np.array([camera.position for camera in cameras])
             self.length = _length(cameras, world)
-            self.pyramids = [_pyramid(camera, world, self.length) for camera in cameras]
+            poses = [world.pose(camera.c2w) for camera in cameras]
+            self.orientations = np.array([wxyz for wxyz, _ in poses])
+            self.apexes = np.array([position for _, position in poses])
+            slopes = [[c.width / (2.0 * c.fx), c.height / (2.0 * c.fy), 1.0] for c in cameras]
+            self.extents = self.length * np.array(slopes)
 
     def welcome(self, client: viser.ClientHandle) -> Pyramids:
         """The cameras for a new page."""
@@ -117,10 +133,9 @@ class Stage:
 
     def base(self, index: int) -> tuple[float, float, np.ndarray]:
         """Width, height and middle [3] of the base of a pyramid, in viser's units."""
-        camera = self.cameras[self._views[index].name]
-        length = self.scale * self.length
-        middle = self._world.scale * camera.position + length * camera.forward
-        return length * camera.width / camera.fx, length * camera.height / camera.fy, middle
+        width, height, length = self.scale * self.extents[index]
+        forward = self.cameras[self._views[index].name].forward
+        return 2.0 * width, 2.0 * height, self.apexes[index] + length * forward
 
     def clicked(self, index: int, client: viser.ClientHandle) -> None:
         """Have a page stand in a camera."""
@@ -160,10 +175,10 @@ class Pyramids:
         """None is shown before ``put_up``."""
         self._client = client
         self._stage = stage
-        self._handles: list[Any] = []
+        self._pyramids: Any = None  # all of them, in one call of the page's graphics
         self._photographs: list[tuple[int, Any]] = []  # indices of cameras, and what shows them
         self._folder: Any = None
-        self._hidden = frozenset(range(len(stage.pyramids)))
+        self._hidden: frozenset[int] | None = None  # None: to be told again
         self._position = np.full(3, np.inf)
         self._begun = False
         self._lock = threading.Lock()
@@ -172,7 +187,7 @@ class Pyramids:
 
     def put_up(self) -> None:
         """Begin to put them up, then their photographs, in a thread; once."""
-        if self._stage.pyramids and not self._begun:
+        if self._stage.cameras and not self._begun:
             self._begun = True
             threading.Thread(target=self._put_up, daemon=True).start()
 
@@ -180,18 +195,27 @@ class Pyramids:
         with self._lock, self._client.atomic():
             if self.gone:
                 return
-            for index, looks in enumerate(self._stage.pyramids):
-                handle = self._client.scene.add_camera_frustum(
-                    f"/cameras/{index:04}", **looks, visible=False
-                )
-                handle.on_click(lambda event, index=index: self._stage.clicked(index, event.client))
-                self._handles.append(handle)
+            self._pyramids = self._client.scene.add_batched_meshes_simple(
+                "/cameras",
+                PYRAMID.astype(np.float32),
+                SIDES.astype(np.uint32),
+                self._stage.orientations,
+                self._stage.apexes,
+                batched_scales=np.zeros_like(self._stage.extents),
+                batched_colors=CAMERA_COLOUR,
+                lod="off",
+                wireframe=True,
+                side="double",
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+            self._pyramids.on_click(self._clicked)
             # All photographs are shown and hidden by one message.
             self._folder = self._client.scene.add_frame(
                 "/photographs", show_axes=False, visible=False
             )
         self.refresh()
-        for index in range(len(self._handles)):
+        for index in range(len(self._stage.cameras)):
             photograph = self._stage.photograph(index)
             with self._lock:
                 if self.gone:
@@ -200,7 +224,6 @@ class Pyramids:
                     self._add_photograph(index, photograph)
 
     def _add_photograph(self, index: int, photograph: np.ndarray) -> None:
-        looks = self._stage.pyramids[index]
         width, height, position = self._stage.base(index)
         handle = self._client.scene.add_image(
             f"/photographs/{index:04}",
@@ -208,13 +231,19 @@ class Pyramids:
             width,
             height,
             format="jpeg",
-            wxyz=looks["wxyz"],
+            wxyz=self._stage.orientations[index],
             position=position,
             cast_shadow=False,
             receive_shadow=False,
         )
         handle.on_click(lambda event: self._stage.clicked(index, event.client))
         self._photographs.append((index, handle))
+
+    def _clicked(self, event: Any) -> None:
+        """Have the page stand in a camera: a page says which, and may say anything."""
+        index = event.instance_index
+        if isinstance(index, int) and 0 <= index < len(self._stage.cameras):
+            self._stage.clicked(index, event.client)
 
     def stand_at(self, position: np.ndarray) -> None:
         """Hide those in front of one's eyes at a position [3], scene units, and photographs there.
@@ -228,8 +257,7 @@ class Pyramids:
         """Show what is to be shown, as large as it is to be."""
         stage = self._stage
         with self._lock:
-            for index, handle in enumerate(self._handles):
-                handle.scale = stage.scale * stage.pyramids[index]["scale"]
+            self._hidden = None
             for index, handle in self._photographs:
                 handle.render_width, handle.render_height, handle.position = stage.base(index)
         self._hide()
@@ -240,15 +268,17 @@ class Pyramids:
         hidden = (
             stage.in_the_way(self._position)
             if stage.visible
-            else frozenset(range(len(stage.pyramids)))
+            else frozenset(range(len(stage.cameras)))
         )
         with self._lock:
             if self._folder is None:
                 return
             self._folder.visible = stage.visible and stage.photographs_from(self._position)
-            for index in hidden ^ self._hidden:
-                self._handles[index].visible = index not in hidden
-            self._hidden = hidden
+            if hidden != self._hidden:
+                extents = stage.scale * stage.extents
+                extents[list(hidden)] = 0.0
+                self._pyramids.batched_scales = extents
+                self._hidden = hidden
 
 
 def stand_in(client: viser.ClientHandle, camera: Camera, world: World) -> None:
@@ -275,29 +305,6 @@ def thumbnail(image: np.ndarray) -> np.ndarray:
 def _straight(camera: Camera) -> Camera:
     """A camera of straight lines, as viser's are, that sees about as much."""
     return path_lens([camera], None) if camera.fisheye else camera
-
-
-def _pyramid(camera: Camera, world: World, length: float) -> dict[str, Any]:
-    """What viser is told of a camera's pyramid, of a length in its units."""
-    wxyz, position = world.pose(camera.c2w)
-    return {
-        "fov": 2.0 * float(np.arctan(0.5 * camera.height / camera.fy)),
-        "aspect": camera.width / camera.fx * camera.fy / camera.height,
-        "scale": _frustum_scale(camera, length),
-        "thickness": 1.5,
-        "thickness_units": "screen",
-        "color": CAMERA_COLOUR,
-        "format": "jpeg",
-        "wxyz": wxyz,
-        "position": position,
-        "cast_shadow": False,
-        "receive_shadow": False,
-    }
-
-
-def _frustum_scale(camera: Camera, length: float) -> float:
-    """What viser calls the scale of a pyramid of some length: its volume sets it."""
-    return length * float(np.cbrt(camera.width / camera.fx * camera.height / camera.fy / 12.0))
 
 
 def _length(cameras: Sequence[Camera], world: World) -> float:

@@ -99,6 +99,10 @@ class World:
         _, position = self.pose(look.c2w)
         x, y, z = look.up
         server.scene.set_up_direction((float(x), float(y), float(z)))
+        # What stands in the scene has no shading: light from all sides costs a page the least.
+        server.scene.configure_default_lights(enabled=False)
+        server.scene.configure_environment_map(hdri=None)
+        server.scene.add_light_ambient("/light", intensity=math.pi)
         start = server.initial_camera
         start.position, start.look_at = position, position - DISTANCE * look.c2w[:, 2]
         start.up, start.fov = look.up, look.fov

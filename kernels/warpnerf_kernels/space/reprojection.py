@@ -24,8 +24,11 @@ TOLERANCE = 0.04
 NOTHING = 1.0e30
 """What the depth buffer holds where no point was splatted."""
 
-CRACK = 3
-"""Pixels: how far from a splatted point a stretched surface may show none."""
+COARSE = 2
+"""Pixels along the edge of one of the depth buffer, and from one splatted point to the next."""
+
+CRACK = 2
+"""Pixels of the depth buffer: how far from a splatted point a stretched surface may show none."""
 
 
 @wp.struct
@@ -53,39 +56,40 @@ def project(view: Pinhole, local: vec3) -> vec2:
 @wp.kernel
 def splat_depths(
     # launch
-    first: int,  # an item is a row of the source
+    first: int,  # an item is a row of the source, of every COARSE-th
     # scene
     source: Pinhole,
-    target: Pinhole,
+    buffer: Pinhole,  # the target's camera, with the pixels of the depth buffer
     distances: wp.array(dtype=real),  # [H * W] of the source, along rays, scene units; <= 0: none
     # out
-    out_depths: wp.array(dtype=real),  # [h * w] of the target, along its axis; NOTHING before
+    out_depths: wp.array(dtype=real),  # [h * w] of the buffer, along its axis; NOTHING before
 ):
     """The depth buffer of the target: each point of the source covers the four nearest pixels."""
-    row = first + wp.tid()
+    row = wp.static(COARSE) * (first + wp.tid()) + wp.static(COARSE // 2)
+    row = wp.min(row, source.height - 1)
     # In the target's axes: rays of this row, 1 long along the source's axis, and where they begin.
-    turn = wp.transpose(target.rotation) * source.rotation
-    shift = wp.transpose(target.rotation) * (source.position - target.position)
+    turn = wp.transpose(buffer.rotation) * source.rotation
+    shift = wp.transpose(buffer.rotation) * (source.position - buffer.position)
     across = real(1.0) / source.focal[0]
     y = (source.principal[1] - real(row) - real(0.5)) / source.focal[1]
-    for column in range(source.width):
+    for column in range(wp.static(COARSE // 2), source.width, wp.static(COARSE)):
         distance = distances[row * source.width + column]
         if distance > real(0.0):
             x = (real(column) + real(0.5) - source.principal[0]) * across
             along = distance / wp.sqrt(x * x + y * y + real(1.0))
             local = along * (turn * vec3(x, y, real(-1.0))) + shift
             if local[2] < real(0.0):
-                at = project(target, local)
-                if at[0] > real(-1.0) and at[0] < real(target.width + 1):
-                    if at[1] > real(-1.0) and at[1] < real(target.height + 1):
+                at = project(buffer, local)
+                if at[0] > real(-1.0) and at[0] < real(buffer.width + 1):
+                    if at[1] > real(-1.0) and at[1] < real(buffer.height + 1):
                         # Rounded down: what is rounded towards 0 is made positive before.
                         left = int(at[0] + real(1.5)) - 2
                         above = int(at[1] + real(1.5)) - 2
                         for corner in range(4):
                             u = left + corner % 2
                             v = above + corner // 2
-                            if u >= 0 and u < target.width and v >= 0 and v < target.height:
-                                wp.atomic_min(out_depths, v * target.width + u, -local[2])
+                            if u >= 0 and u < buffer.width and v >= 0 and v < buffer.height:
+                                wp.atomic_min(out_depths, v * buffer.width + u, -local[2])
 
 
 @wp.func
@@ -155,9 +159,10 @@ def inverse_warp(
     # scene
     source: Pinhole,
     target: Pinhole,
+    buffer: Pinhole,  # the target's camera, with the pixels of the depth buffer
     pixels: wp.array(dtype=wp.uint8),  # [H * W * 3] of the source
     distances: wp.array(dtype=real),  # [H * W] of the source, as of splat_depths
-    depths: wp.array(dtype=real),  # [h * w] of the target, by splat_depths
+    depths: wp.array(dtype=real),  # of the buffer, by splat_depths
     # out
     out_pixels: wp.array(dtype=wp.uint8),  # [h * w * 3]
     out_seen: wp.array(dtype=wp.uint8),  # [h * w] 1: the source shows it; 0: it is made up
@@ -172,13 +177,13 @@ def inverse_warp(
     for column in range(target.width):
         i = row * target.width + column
         seen = wp.uint8(0)
-        depth = depths[i]
+        near = (row // wp.static(COARSE)) * buffer.width + column // wp.static(COARSE)
+        depth = depths[near]
         if depth >= real(wp.static(NOTHING)):
-            depth = depth_beside(depths, target, i)
+            depth = depth_beside(depths, buffer, near)
         if depth < real(wp.static(NOTHING)):
             x = (real(column) + real(0.5) - target.principal[0]) * across
             ray = turn * vec3(x, y, real(-1.0))
-            stretch = wp.sqrt(x * x + y * y + real(1.0))
             for _ in range(wp.static(TRIES)):
                 point = depth * ray + shift
                 if point[2] >= real(0.0):
@@ -188,17 +193,19 @@ def inverse_warp(
                     break
                 if at[1] < real(0.0) or at[1] >= real(source.height):
                     break
-                expected = wp.length(point)
                 between = distances_around(distances, source, at[0], at[1])
                 if between[0] <= real(0.0):
                     break
-                slack = real(wp.static(TOLERANCE)) * expected
-                if expected > between[0] - slack and expected < between[1] + slack:
-                    colour = mixed(pixels, source, at[0], at[1])
-                    for channel in range(3):
-                        out_pixels[3 * i + channel] = wp.uint8(colour[channel] + real(0.5))
-                    seen = wp.uint8(1)
-                    break
+                # Squares: a root takes as long as all else.
+                square = wp.dot(point, point)
+                if square * real(wp.static((1.0 + TOLERANCE) ** 2)) > between[0] * between[0]:
+                    if square * real(wp.static((1.0 - TOLERANCE) ** 2)) < between[1] * between[1]:
+                        colour = mixed(pixels, source, at[0], at[1])
+                        for channel in range(3):
+                            out_pixels[3 * i + channel] = wp.uint8(colour[channel] + real(0.5))
+                        seen = wp.uint8(1)
+                        break
                 there = distances[int(at[1]) * source.width + int(at[0])]
-                depth = wp.max(depth + (there - expected) / stretch, real(1.0e-6))
+                nearer = (there - wp.sqrt(square)) / wp.length(ray)
+                depth = wp.max(depth + nearer, real(1.0e-6))
         out_seen[i] = seen
