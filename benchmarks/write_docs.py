@@ -307,9 +307,8 @@ def served(records: Records) -> str:
             comes {show(viewer["first_picture_seconds"], 2)} s after the page has said where its
             camera is; in Chromium, drawing on the same cores,
             {show(viewer["browser"]["first_picture_seconds"], 2)} s after the load event.
-            A mouse that drags a window of {dragging["window"][0]} x {dragging["window"][1]} pixels sees
-            {show(dragging["pictures_per_second"], 1)} pictures a second,
-            and the fine one
+            A mouse that drags a window of {dragging["window"][0]} x {dragging["window"][1]} pixels
+            sees {show(dragging["pictures_per_second"], 1)} pictures a second, and the fine one
             {show(dragging["fine_picture_seconds"], 2)} s after the last move. A training
             with a page at which nobody looks takes {show(ratio, 2)} of the time without.
             Metrics by nerfbaselines of its own pictures, and by warpnerf of the same field
