@@ -19,6 +19,20 @@ FOLDERS = "scenes/test_contents.py::test_what_a_folder_without_a_scene_holds"
 MUTANTS = [
     of_host("names: no normal form", FOUND, 'unicodedata.normalize("NFC", name)', "name", NAMED),
     of_host(
+        "names: only the original",
+        FRAME_IMAGES,
+        "or path.suffix.lower() in UNREAD_ENDINGS",
+        "",
+        f"{IMAGES}photographs_that_were_converted_are_found",
+    ),
+    of_host(
+        "names: all are converted or none",
+        FRAME_IMAGES,
+        "name.lower().endswith(ENDINGS) and not converted",
+        "without_ending(name) != name and not converted",
+        f"{IMAGES}photographs_that_were_converted_are_found",
+    ),
+    of_host(
         "names: of any folder",
         FRAME_IMAGES,
         "self._whole.setdefault(parts, [])",

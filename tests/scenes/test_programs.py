@@ -84,7 +84,10 @@ def test_photographs_without_cameras_and_cameras_without_photographs(
     assert f"1 of 4 photographs have no camera in {there.name} (first: " in said
     for path in tmp_path.rglob("*.png"):
         path.unlink()
-    with pytest.raises(InputError, match=r"none of its 4 photographs is in .*; put them there"):
+    with pytest.raises(InputError, match=r"none of its 4 photographs is in .*\); put them there"):
+        load_scene(tmp_path)
+    Image.new("RGB", (8, 6)).save(first.with_name("unknown.png"))
+    with pytest.raises(InputError, match=r"in .*, but 1 other is \(first: .*unknown.png\); put"):
         load_scene(tmp_path)
 
 

@@ -184,7 +184,8 @@ def _look(view: View) -> _Look:
 def _share_still(looks: Sequence[_Look]) -> tuple[float, int]:
     """The share of pixels that are the same in all photographs of the commonest size, and how many
     these are, each once. White ones count only if all corners are still: else they may be a sky."""
-    (most, _), *_ = Counter(look.size for look in looks).most_common(1) or [(None, 0)]
+    sizes = Counter(look.size for look in looks)
+    most = max(sizes, key=lambda size: sizes[size], default=())
     alike = list({look.sample.tobytes(): look for look in looks if look.size == most}.values())
     n = len(alike)
     if n < ENOUGH_STILL:

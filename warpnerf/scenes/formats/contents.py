@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from warpnerf.checks import InputError
-from warpnerf.scenes.files import ENDINGS, exists, printable
+from warpnerf.scenes.files import ENDINGS, UNREAD_ENDINGS, exists, printable
 from warpnerf.scenes.formats import llff
 from warpnerf.scenes.formats.blender import SPLITS, other_transforms, split_file
 from warpnerf.scenes.formats.colmap_models import find_model, model_kind
@@ -18,9 +18,6 @@ from warpnerf.scenes.formats.found_photographs import is_written
 from warpnerf.scenes.formats.npz import is_scene_file, single_npz
 from warpnerf.scenes.formats.programs import exports_in
 from warpnerf.scenes.images.masks import without_masks
-
-UNREAD_PHOTOGRAPHS = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf")
-"""Endings of photographs that phones and cameras write and that are not read."""
 
 VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
 
@@ -83,7 +80,7 @@ def photographs_in(folder: Path) -> list[Path]:
 def unread_photographs(folder: Path) -> list[Path]:
     """Photographs in the same places whose formats are not read."""
     places = (folder, folder / "images")
-    return [path for place in places for path in _with_endings(place, UNREAD_PHOTOGRAPHS)]
+    return [path for place in places for path in _with_endings(place, UNREAD_ENDINGS)]
 
 
 def is_unposed(path: Path) -> bool:
