@@ -243,6 +243,20 @@ MUTANTS = [
         FOLDERS,
     ),
     of_host(
+        "contents: scenes two folders deep",
+        CONTENTS,
+        "\nDEEPEST = 3",
+        "\nDEEPEST = 2",
+        FOLDERS,
+    ),
+    of_host(
+        "contents: any file of frames has poses",
+        "scenes/formats/blender.py",
+        """b'"frames"' in head and b'"transform_matrix"' in head""",
+        """b'"frames"' in head""",
+        FOLDERS,
+    ),
+    of_host(
         "contents: pictures on top, however few",
         CONTENTS,
         "and len(more) > n",
