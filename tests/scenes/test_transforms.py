@@ -139,12 +139,17 @@ def test_keys_that_change_the_picture_are_named(tmp_path: Path) -> None:
         content["frames"][2]["white_transparent"] = True
         content["frames"][2]["depth_file_path"] = "depth/002.png"
         content |= {"aabb_scale": 4, "scale": 0.33, "offset": [0.5, 0.5, 0.5]}
+        content |= {"rolling_shutter": [0, 0.0, 0, 0], "mask_color": []}
         content["applied_transform"] = np.eye(4)[:3].tolist()
 
     scene = load_changed(tmp_path, change)
     assert [note for note in scene.warnings if "is not used" in note] == [
         "transforms.json: white_transparent is not used: white stays opaque"
     ]
+    scene = load_changed(tmp_path / "b", lambda c: c.update(rolling_shutter=[0, 0, 0.1, 0]))
+    assert scene.warnings == (
+        "transforms.json: rolling_shutter is not used: each image is taken at one instant",
+    )
     assert scene.content_distance == pytest.approx(np.sqrt(10.0))
 
 
