@@ -227,6 +227,17 @@ def test_reality_focal_length_is_by_the_longer_side(tmp_path: Path) -> None:
     assert (camera.cx, camera.cy) == pytest.approx((3.25, 3.75))
 
 
+def test_reality_does_not_say_whether_photographs_are_turned(tmp_path: Path) -> None:
+    file = write_reality(tmp_path)
+    exif = Image.Exif()
+    exif[274] = 6
+    file.write_text(file.read_text().replace(".png", ".jpg"))
+    for path in (tmp_path / "images").iterdir():
+        Image.open(path).save(path.with_suffix(".jpg"), exif=exif)
+        path.unlink()
+    assert any("stored turned, with an EXIF rotation" in w for w in load_scene(file).warnings)
+
+
 @pytest.mark.parametrize("delimiter", [";", "\t"])
 def test_reality_decimal_commas(tmp_path: Path, delimiter: str) -> None:
     file = write_reality(tmp_path)
