@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -92,6 +93,26 @@ def test_photographs_without_cameras_and_cameras_without_photographs(
 
 
 # --- Polycam ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("n", "warns"), [(20, None), (18, False), (17, True)])
+def test_polycam_keyframes_that_were_not_corrected_are_said(
+    tmp_path: Path, n: int, warns: bool | None
+) -> None:
+    write_polycam(tmp_path, 20, corrected=False)
+    shutil.rmtree(tmp_path / "keyframes/depth")
+    write_polycam(tmp_path, n)
+    scene = load_scene(tmp_path)
+    assert len(scene.views) == n
+    said = (
+        f"corrected_cameras has {n} of the 20 keyframes of cameras, which are read where "
+        "corrected_cameras is not in the folder"
+    )
+    assert (said in scene.warnings, said in scene.notes) == (warns is True, warns is False)
+    shutil.rmtree(tmp_path / "keyframes/corrected_images")
+    scene = load_scene(tmp_path)
+    said = "corrected_cameras are used with images, as there are no corrected_images"
+    assert said in scene.notes
 
 
 def test_polycam_depth_is_in_millimetres(tmp_path: Path) -> None:
