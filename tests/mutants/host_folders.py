@@ -243,6 +243,20 @@ MUTANTS = [
         FOLDERS,
     ),
     of_host(
+        "models: poses of the other form to the bit",
+        MODELS,
+        "\nROUNDED = 1e-4",
+        "\nROUNDED = 1e-12",
+        f"{MODELS_TESTS}a_model_in_the_other_form_that_has_other_poses_is_said",
+    ),
+    of_host(
+        "models: -q is another rotation",
+        MODELS,
+        "r if q @ r > 0.0 else -r",
+        "r",
+        f"{MODELS_TESTS}a_model_in_the_other_form_that_has_other_poses_is_said",
+    ),
+    of_host(
         "contents: scenes two folders deep",
         CONTENTS,
         "\nDEEPEST = 3",
