@@ -185,6 +185,29 @@ def test_one_lens_for_images_of_other_sizes_is_told(tmp_path: Path) -> None:
     assert with_sizes(tmp_path / "cropped", (8, 4), camera_angle_x=np.pi / 2) == []
 
 
+@pytest.mark.parametrize(
+    ("height", "lens", "says"),
+    [
+        (12, {}, True),
+        (8, {}, False),
+        (12, {"camera_angle_y": 2.0}, False),
+        (12, {"fl_x": 4.0}, False),
+    ],
+)
+def test_an_angle_across_the_width_of_portraits_is_said(
+    tmp_path: Path, height: int, lens: dict[str, float], says: bool
+) -> None:
+    with_sizes(tmp_path, (8, 6), camera_angle_x=np.pi / 2, **lens)
+    for k in range(4):
+        Image.fromarray(picture(k, width=8, height=height)).save(tmp_path / f"images/{k:03d}.png")
+    said = (
+        "transforms.json: camera_angle_x is taken to be across the width of all images, which "
+        "stand upright (first: images/000.png): 4 pixels; that of Blender, with sensor fit Auto, "
+        "is along the height: give fl_x, 6, if so"
+    )
+    assert [w for w in load_scene(tmp_path).warnings if "upright" in w] == [said] * says
+
+
 def test_a_lens_that_contradicts_itself_is_told_once(tmp_path: Path) -> None:
     (told,) = with_sizes(tmp_path, (8, 6), camera_angle_x=np.pi / 2, fl_x=8.0)
     assert told.startswith(

@@ -131,7 +131,7 @@ def _odd_images(scene: Scene, threads: int | None) -> list[str]:
             f"(first: {frozen[0][1]} is {frozen[0][0]} again), of which one at most can be right; "
             "leave out the others"
         )
-    still, n = _share_still(list(shown.values()))
+    still, n = _share_still([look for look in shown.values() if look.brightest > DARK])
     if still > MANY_STILL:
         odd.append(
             f"the same in all photographs, wherever these were taken from: {still:.1%} of the "
