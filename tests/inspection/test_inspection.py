@@ -147,6 +147,20 @@ def test_pixels_that_are_the_same_in_all_photographs_are_said(
     assert f"{share} of the pixels of {n} of {n} images" in found or not share
 
 
+@pytest.mark.parametrize(("step", "says"), [(2, True), (3, False)])
+def test_where_cameras_look_the_same_way_less_is_still(
+    tmp_path: Path, step: int, says: bool
+) -> None:
+    """There plain walls hardly change either."""
+    poses = [look_at((0.1 * k, 0.0, 0.0), (0.1 * k, 5.0, 0.0)) for k in range(10)]
+    scene_with(tmp_path, poses)
+    for k in range(10):
+        pixels = picture(k, width=16, height=12)
+        pixels[:2] = 20 + step * (k % 2)
+        Image.fromarray(pixels).save(tmp_path / f"images/{k:03d}.png")
+    assert ("the same in all photographs" in odd(inspect(tmp_path))) == says
+
+
 def test_still_pixels_that_are_masked_or_transparent_are_not_said(tmp_path: Path) -> None:
     scene_with(tmp_path / "masks", ring(10))
     mask = np.full((12, 16), 255, np.uint8)

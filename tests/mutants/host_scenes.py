@@ -27,7 +27,9 @@ UNIT = "scenes/test_given_depths.py::test_depth_maps_in_other_units_are_told"
 FROZEN = "inspection/test_inspection.py::test_the_same_photograph_at_other_poses_is_said"
 NEARLY_BLACK = "inspection/test_inspection.py::test_photographs_that_are_nearly_black_are_said"
 STILL = "inspection/test_inspection.py::test_pixels_that_are_the_same_in_all_photographs_are_said"
-NOT_SEEN = "inspection/test_inspection.py::test_still_pixels_that_are_masked_or_transparent_are_not_said"
+NOT_SEEN = (
+    "inspection/test_inspection.py::test_still_pixels_that_are_masked_or_transparent_are_not_said"
+)
 LOST = "scenes/test_focus.py::test_a_few_cameras_far_away_from_all_others_do_not_count"
 PLACES = "scenes/test_focus.py::test_cameras_far_away_count_where_they_are_many_or_the_others_are_in_one_place"
 UP = "scenes/test_focus.py::test_up_is_found_in_upright_photographs_that_all_look_down"
@@ -185,6 +187,8 @@ MUTANTS = [
     of_host("photographs: some are dark", DIAGNOSTICS, "> 0.5 * len(scene.views)", "> 0.3 * len(scene.views)", NEARLY_BLACK),
     of_host("photographs: still to the bit", DIAGNOSTICS, "\nSTILL = 3.0", "\nSTILL = 1.0", STILL),
     of_host("photographs: nine tell what is still", DIAGNOSTICS, "ENOUGH_STILL = 10", "ENOUGH_STILL = 9", STILL),
+    of_host("photographs: still as any, where all look the same way", DIAGNOSTICS, "< SAME_WAY", "< 2.0",
+            "inspection/test_inspection.py::test_where_cameras_look_the_same_way_less_is_still"),
     of_host("photographs: a sky is still", DIAGNOSTICS, "if not still[[", "if 0 and not still[[", STILL),
     of_host("photographs: no white is still", DIAGNOSTICS, "if not still[[", "if 1 or not still[[", STILL),
     of_host("photographs: masked ones are still", DIAGNOSTICS, "if mask is None else mask[every]", "if True else mask[every]", NOT_SEEN),

@@ -28,6 +28,10 @@ SATURATED = 250
 STILL = 3.0
 """Of 255, by which a pixel that is the same in all photographs varies, as a standard deviation:
 bars of a video in JPEG have less, a place that two views see rarely."""
+STILL_OF_SAME_WAY = 1.0
+"""Such a deviation where cameras look the same way: there plain walls vary as little as that."""
+SAME_WAY = 0.966
+"""Length of the mean of the optical axes from which on that is so: 15 degrees from their middle."""
 MANY_STILL = 0.01
 """Share of such pixels from which on they are something: real captures have up to 0.005."""
 ENOUGH_STILL = 10
@@ -131,7 +135,7 @@ def _odd_images(scene: Scene, threads: int | None) -> list[str]:
             f"(first: {frozen[0][1]} is {frozen[0][0]} again), of which one at most can be right; "
             "leave out the others"
         )
-    still, n = _share_still([look for look in shown.values() if look.brightest > DARK])
+    still, n = _share_still({v: look for v, look in shown.items() if look.brightest > DARK})
     if still > MANY_STILL:
         odd.append(
             f"the same in all photographs, wherever these were taken from: {still:.1%} of the "
@@ -181,19 +185,22 @@ def _look(view: View) -> _Look:
     )
 
 
-def _share_still(looks: Sequence[_Look]) -> tuple[float, int]:
+def _share_still(looks: Mapping[View, _Look]) -> tuple[float, int]:
     """The share of pixels that are the same in all photographs of the commonest size, and how many
     these are, each once. White ones count only if all corners are still: else they may be a sky."""
-    sizes = Counter(look.size for look in looks)
+    sizes = Counter(look.size for look in looks.values())
     most = max(sizes, key=lambda size: sizes[size], default=())
-    alike = list({look.sample.tobytes(): look for look in looks if look.size == most}.values())
+    of_size = [look for look in looks.values() if look.size == most]
+    alike = list({look.sample.tobytes(): look for look in of_size}.values())
     n = len(alike)
     if n < ENOUGH_STILL:
         return 0.0, n
     alike = alike[:: -(-n // MOST_STILL)]
     samples = np.stack([look.sample[..., :3] for look in alike])
     seen = np.all([look.counts for look in alike], axis=0)
-    still = (samples.std(axis=0, dtype=np.float32) <= STILL).all(axis=-1) & seen
+    axes = np.mean([view.camera.c2w[:, 2] for view in looks], axis=0)
+    most_apart = STILL if np.linalg.norm(axes) < SAME_WAY else STILL_OF_SAME_WAY
+    still = (samples.std(axis=0, dtype=np.float32) <= most_apart).all(axis=-1) & seen
     if not still[[0, 0, -1, -1], [0, -1, 0, -1]].all():
         still &= samples.min(axis=(0, -1)) < SATURATED
     return float(still.mean()), n
