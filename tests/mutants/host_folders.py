@@ -98,7 +98,7 @@ MUTANTS = [
     of_host(
         "names: always of another format",
         FRAME_IMAGES,
-        "return converted or",
+        "return not as_it_is or",
         "return True or",
         f"{IMAGES}another_format_is_not_taken_where_others_have_the_files",
     ),
