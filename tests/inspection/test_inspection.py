@@ -119,6 +119,67 @@ def test_photographs_that_are_nearly_black_are_said(
     assert (f"nearly black: {n} of 9 images (first: images/000.png)" in found) == says
 
 
+@pytest.mark.parametrize(
+    ("n", "value", "rows", "share"),
+    [
+        (10, 0, slice(0, 2), "16.7%"),  # a bar
+        (9, 0, slice(0, 2), ""),  # too few to tell
+        (10, 255, slice(0, 2), ""),  # a sky
+        (10, 249, slice(0, 2), "16.7%"),
+        (10, 255, None, "27.1%"),  # all around
+    ],
+)
+def test_pixels_that_are_the_same_in_all_photographs_are_said(
+    tmp_path: Path, n: int, value: int, rows: slice | None, share: str
+) -> None:
+    """As bars of a video are; those that differ by a few, as in JPEG, are the same, too."""
+    scene_with(tmp_path, ring(n))
+    for k in range(n):
+        pixels = picture(k, width=16, height=12)
+        if rows is None:
+            pixels[[0, -1]] = value
+            pixels[:, [0, -1]] = value
+        else:
+            pixels[rows] = value + (k % 2) * (4 if value < 128 else -4)
+        Image.fromarray(pixels).save(tmp_path / f"images/{k:03d}.png")
+    found = odd(inspect(tmp_path))
+    assert ("the same in all photographs" in found) == bool(share)
+    assert f"{share} of the pixels of {n} of {n} images" in found or not share
+
+
+@pytest.mark.parametrize(("step", "says"), [(2, True), (3, False)])
+def test_where_cameras_look_the_same_way_less_is_still(
+    tmp_path: Path, step: int, says: bool
+) -> None:
+    """There plain walls hardly change either."""
+    poses = [look_at((0.1 * k, 0.0, 0.0), (0.1 * k, 5.0, 0.0)) for k in range(10)]
+    scene_with(tmp_path, poses)
+    for k in range(10):
+        pixels = picture(k, width=16, height=12)
+        pixels[:2] = 20 + step * (k % 2)
+        Image.fromarray(pixels).save(tmp_path / f"images/{k:03d}.png")
+    assert ("the same in all photographs" in odd(inspect(tmp_path))) == says
+
+
+def test_still_pixels_that_are_masked_or_transparent_are_not_said(tmp_path: Path) -> None:
+    scene_with(tmp_path / "masks", ring(10))
+    mask = np.full((12, 16), 255, np.uint8)
+    mask[:2] = 0
+    for k in range(10):
+        pixels = picture(k, width=16, height=12)
+        pixels[:2] = 0
+        Image.fromarray(pixels).save(tmp_path / f"masks/images/{k:03d}.png")
+        Image.fromarray(mask).save(tmp_path / f"masks/images/{k:03d}_mask.png")
+    assert "the same in all" not in odd(inspect(tmp_path / "masks"))
+    write_blender(tmp_path / "alpha", "train", ring(10))
+    for k in range(10):
+        pixels = picture(k, channels=4)
+        pixels[[0, -1]] = pixels[:, [0, -1]] = 0
+        Image.fromarray(pixels).save(tmp_path / f"alpha/train/r_{k}.png")
+    assert load_scene(tmp_path / "alpha").views[0].image.shape[2] == 4
+    assert "the same in all" not in odd(inspect(tmp_path / "alpha"))
+
+
 def test_alpha_in_only_some_images_is_said(tmp_path: Path) -> None:
     folder = scene_with(tmp_path, ring(9))
     for number in (2, 5):

@@ -19,6 +19,20 @@ FOLDERS = "scenes/test_contents.py::test_what_a_folder_without_a_scene_holds"
 MUTANTS = [
     of_host("names: no normal form", FOUND, 'unicodedata.normalize("NFC", name)', "name", NAMED),
     of_host(
+        "names: only the original",
+        FRAME_IMAGES,
+        "or path.suffix.lower() in UNREAD_ENDINGS",
+        "",
+        f"{IMAGES}photographs_that_were_converted_are_found",
+    ),
+    of_host(
+        "names: all are converted or none",
+        FRAME_IMAGES,
+        "name.lower().endswith(ENDINGS) and not converted",
+        "without_ending(name) != name and not converted",
+        f"{IMAGES}photographs_that_were_converted_are_found",
+    ),
+    of_host(
         "names: of any folder",
         FRAME_IMAGES,
         "self._whole.setdefault(parts, [])",
@@ -84,7 +98,7 @@ MUTANTS = [
     of_host(
         "names: always of another format",
         FRAME_IMAGES,
-        "return converted or",
+        "return not as_it_is or",
         "return True or",
         f"{IMAGES}another_format_is_not_taken_where_others_have_the_files",
     ),
@@ -226,6 +240,34 @@ MUTANTS = [
         CONTENTS,
         "largest = max(deeper",
         "largest = min(deeper",
+        FOLDERS,
+    ),
+    of_host(
+        "models: poses of the other form to the bit",
+        MODELS,
+        "\nROUNDED = 1e-4",
+        "\nROUNDED = 1e-12",
+        f"{MODELS_TESTS}a_model_in_the_other_form_that_has_other_poses_is_said",
+    ),
+    of_host(
+        "models: -q is another rotation",
+        MODELS,
+        "r if q @ r > 0.0 else -r",
+        "r",
+        f"{MODELS_TESTS}a_model_in_the_other_form_that_has_other_poses_is_said",
+    ),
+    of_host(
+        "contents: scenes two folders deep",
+        CONTENTS,
+        "\nDEEPEST = 3",
+        "\nDEEPEST = 2",
+        FOLDERS,
+    ),
+    of_host(
+        "contents: any file of frames has poses",
+        "scenes/formats/blender.py",
+        """b'"frames"' in head and b'"transform_matrix"' in head""",
+        """b'"frames"' in head""",
         FOLDERS,
     ),
     of_host(

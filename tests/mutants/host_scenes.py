@@ -26,6 +26,10 @@ BOUNDS = "scenes/test_given_depths.py::test_bounds_in_other_units_are_not_used"
 UNIT = "scenes/test_given_depths.py::test_depth_maps_in_other_units_are_told"
 FROZEN = "inspection/test_inspection.py::test_the_same_photograph_at_other_poses_is_said"
 NEARLY_BLACK = "inspection/test_inspection.py::test_photographs_that_are_nearly_black_are_said"
+STILL = "inspection/test_inspection.py::test_pixels_that_are_the_same_in_all_photographs_are_said"
+NOT_SEEN = (
+    "inspection/test_inspection.py::test_still_pixels_that_are_masked_or_transparent_are_not_said"
+)
 LOST = "scenes/test_focus.py::test_a_few_cameras_far_away_from_all_others_do_not_count"
 PLACES = "scenes/test_focus.py::test_cameras_far_away_count_where_they_are_many_or_the_others_are_in_one_place"
 UP = "scenes/test_focus.py::test_up_is_found_in_upright_photographs_that_all_look_down"
@@ -148,6 +152,9 @@ MUTANTS = [
     of_host("up: the cameras' own", FOCUS, "return normal if level and normal @ mean > 0.5 else mean", "return mean", UP),
     of_host("aimed: the whole picture", FOCUS, "u < -0.25 * camera.width * z", "u < -0.5 * camera.width * z", AIMED),
     of_host("lens: an angle beside a right one", LENS, "            if values.get(\"fl_y\") == used:  # Blender's angle_y may be that of its sensor\n                break\n", "", CONTRADICTS),
+    of_host("lens: no angle along the longer side", LENS, "if axis == \"x\" else other", "if axis == \"z\" else other", CONTRADICTS),
+    of_host("lens: squares stand upright", LENS, "if height <= width or", "if height < width or",
+            "scenes/test_transforms.py::test_an_angle_across_the_width_of_portraits_is_said"),
     of_host("lens: any angle is right", LENS, "MAX_DIFFERENCE = 0.01", "MAX_DIFFERENCE = 10.0", CONTRADICTS),
     of_host("lens: an angle of another level", LENS, "angles |= {name", "angles |= {} and {name", CONTRADICTS),
     of_host("lens: is_fisheye decides", LENS, "            fisheye = level.camera_model == FISHEYE\n",
@@ -178,6 +185,18 @@ MUTANTS = [
     of_host("photographs: one colour is the same", DIAGNOSTICS, " if not look.is_of_one_colour}\n", "}\n", FROZEN),
     of_host("photographs: dark", DIAGNOSTICS, "DARK = 16", "DARK = 17", NEARLY_BLACK),
     of_host("photographs: some are dark", DIAGNOSTICS, "> 0.5 * len(scene.views)", "> 0.3 * len(scene.views)", NEARLY_BLACK),
+    of_host("photographs: still to the bit", DIAGNOSTICS, "\nSTILL = 3.0", "\nSTILL = 1.0", STILL),
+    of_host("photographs: nine tell what is still", DIAGNOSTICS, "ENOUGH_STILL = 10", "ENOUGH_STILL = 9", STILL),
+    of_host("photographs: still as any, where all look the same way", DIAGNOSTICS, "< SAME_WAY", "< 2.0",
+            "inspection/test_inspection.py::test_where_cameras_look_the_same_way_less_is_still"),
+    of_host("photographs: a sky is still", DIAGNOSTICS, "if not still[[", "if 0 and not still[[", STILL),
+    of_host("photographs: no white is still", DIAGNOSTICS, "if not still[[", "if 1 or not still[[", STILL),
+    of_host("photographs: masked ones are still", DIAGNOSTICS, "if mask is None else mask[every]", "if True else mask[every]", NOT_SEEN),
+    of_host("photographs: transparent ones are still", DIAGNOSTICS, "counts &= sample[..., 3] > 0", "counts &= sample[..., 3] >= 0", NOT_SEEN),
+    of_host("depths: instant-ngp's in millimetres", "scenes/formats/transforms.py", "depth_unit = unit_of_ngp", "depth_unit = unit",
+            "scenes/test_depths.py::test_depth_is_read_as_instant_ngp_names_it"),
+    of_host("depths: depth_path comes first", "scenes/formats/transforms.py", "if not entry.depth_file_path:", "if entry.depth_path:",
+            "scenes/test_depths.py::test_depth_is_read_as_instant_ngp_names_it"),
     of_host("masks: half is little", MASKED, "HALF = 0.5", "HALF = 0.7", LEFT),
     of_host("masks: a third is enough", MASKED, "share >= HALF or", "share >= 0.3 or", LEFT),
     of_host("masks: any focus", MASKED, "    if focus.guessed:\n        return True\n", "", LEFT),

@@ -86,6 +86,27 @@ def test_a_copy_of_a_model_in_the_other_form_needs_no_word(tmp_path: Path) -> No
     assert not any("is read" in said for said in load_scene(tmp_path).warnings)
 
 
+@pytest.mark.parametrize(
+    ("times", "sign", "says"), [(1.0 + 5e-5, 1.0, False), (1.01, 1.0, True), (1.0, -1.0, False)]
+)
+def test_a_model_in_the_other_form_that_has_other_poses_is_said(
+    tmp_path: Path, times: float, sign: float, says: bool
+) -> None:
+    """As where images.txt was edited; q and -q are one rotation."""
+    text = in_both_forms(tmp_path, 9, 9) / "images.txt"
+    lines = text.read_text().splitlines()
+    for k in range(2, len(lines), 2):
+        number, *pose = lines[k].split()[:8]
+        values = [value * (sign if i < 4 else times) for i, value in enumerate(map(float, pose))]
+        lines[k] = " ".join([number, *map(repr, values), *lines[k].split()[8:]])
+    text.write_text("\n".join(lines) + "\n")
+    said = (
+        "sparse/0/images.bin of 9 images is read, and not images.txt, which has other poses; "
+        "remove the files of the one that is out of date"
+    )
+    assert (said in load_scene(tmp_path).warnings) == says
+
+
 def test_a_model_at_another_place_is_named(tmp_path: Path) -> None:
     two_models(tmp_path, False)
     (tmp_path / "colmap" / "sparse").mkdir(parents=True)

@@ -78,6 +78,12 @@ def a_model_below_sparse(folder: Path) -> None:
     assert not is_unposed(folder)
 
 
+def test_frames_of_any_name_are_read_where_they_are_named(tmp_path: Path) -> None:
+    renamed("cam1.json")(tmp_path)
+    assert len(load_scene(tmp_path / "cam1.json").views) == 4
+    assert survey(tmp_path / "cam1.json").format == "instant-ngp / nerfstudio (cam1.json)"
+
+
 def two_npz(folder: Path) -> None:
     for name in ("a", "b"):
         np.savez(folder / f"{name}.npz", images=np.zeros(1), poses=np.zeros(1))
@@ -107,12 +113,20 @@ UNREAD = r"holds poses in a form that is not read \({}\); .*, or .* `warpnerf po
     [
         (renamed("transforms_all.json"), "it holds transforms_all.json; use .*/transforms_all.js"),
         (renamed("transforms_test.json", "transforms_val.json"), "test.json, transforms_val.json;"),
+        (renamed("cam1.json", "cam2.json"), r"it holds cam1\.json, cam2\.json; use .*/cam1\.json"),
         (a_model_below_sparse, "its COLMAP model is in sparse/mine; use .*/s/sparse/mine"),
         (two_npz, r"it holds a\.npz, b\.npz; use .*/s/a\.npz"),
         (beside_photographs("scene.nvm"), UNREAD.format(r"scene\.nvm")),
         (beside_photographs("images/0.xmp", '<a xcr:Rotation="1">'), UNREAD.format(".*0.xmp")),
         (beside_photographs("a.csv", "#name,x,y,heading,pitch,roll"), UNREAD.format(".*a.csv")),
         (beside_photographs("a.txt", "# X, Y, Z, Omega, Phi, Kappa"), UNREAD.format(".*a.txt")),
+        (beside_photographs("images/0.XMP", "<xcr:Position>"), UNREAD.format(".*0.XMP")),
+        (beside_photographs("a.xml", "<?xml?>\n<BlocksExchange "), UNREAD.format("a.xml")),
+        (
+            beside_photographs("params/a.txt", "imageName X Y Z Omega Phi Kappa"),
+            UNREAD.format("params/a.txt"),
+        ),
+        (beside_photographs("a.json", '{"frames": []}'), "it holds 4 photographs without"),
         (beside_photographs("images/0.xmp", "<crs:Exposure/>"), "it holds 4 photographs without"),
         (empty_file("camera/0.json"), r"that is not read \(camera/0\.json\); export"),
         (photographs_and_heic, "it holds 4 photographs without poses, and 1 as HEIC, to be conv"),
@@ -126,6 +140,11 @@ UNREAD = r"holds poses in a form that is not read \({}\); .*, or .* `warpnerf po
         (empty_file("walk.MOV"), r"holds the video walk\.MOV; .*`warpnerf pose .*walk\.MOV "),
         (empty_file("a.HEIC"), "holds 1 photographs as HEIC; convert them to JPEG"),
         (lambda f: write_transforms(f / "room"), "its folder room holds one; use .*s/room"),
+        (
+            lambda f: write_transforms(f / "home/capture 1/a"),
+            r"its folder home/capture 1/a holds o",
+        ),
+        (lambda f: write_transforms(f / "a/b/c/d"), "neither poses nor photographs nor a video"),
         (two_scenes, r"2 of its folders hold one each \(first: a\); use .*s/a"),
         (empty_file("sparse/0/cameras.bin"), "its COLMAP model lacks sparse/0/images.bin"),
         (half_a_model, r"lacks sparse/0/images\.bin; .* again, or .* `warpnerf pose .*s --output"),

@@ -18,6 +18,7 @@ from warpnerf.checks import InputError
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.cameras.undistort import directions
 from warpnerf.scenes.formats.load import load_scene
+from warpnerf.scenes.formats.survey import survey
 from warpnerf.scenes.images.depths import DepthFile, read_depth
 
 VALUES = np.random.default_rng(0).integers(500, 60000, (6, 8), dtype=np.uint16)
@@ -166,11 +167,38 @@ def test_units_are_those_of_the_file(tmp_path: Path, keys: dict[str, float], uni
     assert "the depth_file_path of 1 of 4 frames leads to no file (first: e.png)" in warning
 
 
-@pytest.mark.parametrize("keys", [{"applied_scale": 0.0}, {"depth_unit_scale_factor": -1.0}])
+def test_depth_is_read_as_instant_ngp_names_it(tmp_path: Path) -> None:
+    """In scene units, whatever applied_scale is; depth_file_path comes first."""
+    content = write_transforms(tmp_path)
+    Image.fromarray(VALUES).save(tmp_path / "d.png")
+    content["frames"][1]["depth_path"] = "d.png"
+    content["frames"][2] |= {"depth_path": "gone.png", "depth_file_path": "d.png"}
+    content |= {"enable_depth_loading": True, "integer_depth_scale": 5e-5, "applied_scale": 0.5}
+    save(tmp_path / "transforms.json", content)
+    scene = load_scene(tmp_path)
+    for index, unit in ((1, 5e-5), (2, 5e-4)):
+        view = scene.views[index]
+        expected = read_depth(DepthFile(tmp_path / "d.png", unit), view.camera).read()
+        assert np.array_equal(view.depth, expected)
+    assert scene.warnings == ()
+    assert survey(tmp_path).diagnostics == ()
+
+
+@pytest.mark.parametrize("ending", ["exr", "EXR", "pfm", "npz"])
+def test_depth_in_a_form_that_is_not_read_is_refused(tmp_path: Path, ending: str) -> None:
+    (tmp_path / f"d.{ending}").write_bytes(b"v/1\x01")
+    with pytest.raises(InputError, match=rf"d\.{ending}: depth is read from images of one channel"):
+        read_depth(DepthFile(tmp_path / f"d.{ending}", 1.0), camera_at(np.eye(4)))
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [{"applied_scale": 0.0}, {"integer_depth_scale": 0.0}, {"depth_unit_scale_factor": -1.0}],
+)
 def test_units_that_are_none_are_refused(tmp_path: Path, keys: dict[str, float]) -> None:
     content = write_transforms(tmp_path)
     save(tmp_path / "transforms.json", content | keys)
-    with pytest.raises(InputError, match=r"is no unit of depth; give numbers above 0"):
+    with pytest.raises(InputError, match=r"is no unit of depth; give .* above 0"):
         load_scene(tmp_path)
 
 

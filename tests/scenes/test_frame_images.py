@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.scenes.test_colmap import change, scene_with_model
+from tests.scenes.test_colmap import change, scene_with_model, write_model
 from tests.support.tiny_scenes import (
     picture,
     ring,
@@ -217,6 +217,37 @@ def test_photographs_elsewhere_are_not_taken_for_a_few_that_are_missing(tmp_path
     (tmp_path / "002.png").rename(tmp_path / "blurred/002.png")
     named(tmp_path, four("{}.png"))
     assert len(load_scene(tmp_path).views) == 3
+
+
+@pytest.mark.parametrize("model", [False, True])
+@pytest.mark.parametrize("kept", [False, True])
+def test_photographs_that_were_converted_are_found(tmp_path: Path, model: bool, kept: bool) -> None:
+    """Of formats that are not read, with or without the originals beside, and a few were not."""
+    photographs(tmp_path, ["images/000.jpeg", *four("images/{}.png")[1:]])
+    (tmp_path / "images/000.jpeg").rename(tmp_path / "images/000.png")
+    if kept:
+        for name in four("images/{}.HEIC"):
+            (tmp_path / name).write_bytes(b"\0\0\0\x18ftypheic")
+    names = [*four("{}.HEIC")[:3], "003.png"]
+    if model:
+        write_model(tmp_path, text=True)
+        for old, new in zip(four("{}.png"), names, strict=True):
+            change(tmp_path / "sparse/0/images.txt", old, new)
+    else:
+        named(tmp_path, [f"images/{name}" for name in names])
+    scene = load_scene(tmp_path)
+    assert sorted(view.name.rpartition("/")[2] for view in scene.views) == four("{}.png")
+    assert any("3 of 4 photographs have another path than the file says" in n for n in scene.notes)
+
+
+def test_photographs_that_are_to_be_converted_are_named(tmp_path: Path) -> None:
+    named(tmp_path, four("images/{}.HEIC"))
+    (tmp_path / "images").mkdir()
+    for name in four("images/{}.HEIC"):
+        (tmp_path / name).write_bytes(b"\0\0\0\x18ftypheic")
+    says = r"but 4 as HEIC, to be converted to JPEG, are \(first: images/000.HEIC\); put the images"
+    with pytest.raises(InputError, match=says):
+        load_scene(tmp_path)
 
 
 def both_endings(folder: Path) -> None:

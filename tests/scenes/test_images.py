@@ -211,7 +211,11 @@ def test_cut_image_is_refused(tmp_path: Path, suffix: str, share: float) -> None
     [
         (b"", "is empty"),
         (b"hello", "is not an image"),
-        (b"<html></html>", "is not an image"),
+        (b"<html></html>", "is an HTML file, and no image"),
+        (b"\0\0\0\x18ftypheic\0\0\0\0mif1heic", "is a HEIC file, and no image"),
+        (b"\0\0\0\x1cftypavif\0\0\0\0avifmif1", "is an AVIF file, and no image"),
+        (b"\0\0\0\x1cftypisom\0\0\0\0isommp42", "is a video file, and no image"),
+        (b"\xff\x0a\xfa\x7f", "is a JPEG XL file, and no image"),
         (b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n", "is not an image"),
         (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "git lfs pull"),
     ],

@@ -67,6 +67,9 @@ def test_a_focal_length_and_an_angle_that_contradict_each_other_are_told() -> No
         == ""
     )
     assert "$.camera_angle_y" in told(none, LensFields(fl_x=4.0, fl_y=4.0, camera_angle_y=1.0))
+    # Blender's angle_x is that of the longer side.
+    lens = read_lens(FILE, [("$", LensFields(fl_x=4.0, fl_y=4.0, camera_angle_x=np.pi / 2))])
+    assert lens.contradiction(6, 8) == "" and "$.camera_angle_x" in lens.contradiction(6, 10)
     # What a frame says is what holds of it, whatever the file says of others.
     assert told(LensFields(fl_x=8.0), LensFields(**right)) == ""
     assert told(LensFields(camera_angle_x=1.0), LensFields(fl_x=4.0)) == ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -84,11 +85,34 @@ def test_photographs_without_cameras_and_cameras_without_photographs(
     assert f"1 of 4 photographs have no camera in {there.name} (first: " in said
     for path in tmp_path.rglob("*.png"):
         path.unlink()
-    with pytest.raises(InputError, match=r"none of its 4 photographs is in .*; put them there"):
+    with pytest.raises(InputError, match=r"none of its 4 photographs is in .*\); put them there"):
+        load_scene(tmp_path)
+    Image.new("RGB", (8, 6)).save(first.with_name("unknown.png"))
+    with pytest.raises(InputError, match=r"in .*, but 1 other is \(first: .*unknown.png\); put"):
         load_scene(tmp_path)
 
 
 # --- Polycam ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("n", "warns"), [(20, None), (18, False), (17, True)])
+def test_polycam_keyframes_that_were_not_corrected_are_said(
+    tmp_path: Path, n: int, warns: bool | None
+) -> None:
+    write_polycam(tmp_path, 20, corrected=False)
+    shutil.rmtree(tmp_path / "keyframes/depth")
+    write_polycam(tmp_path, n)
+    scene = load_scene(tmp_path)
+    assert len(scene.views) == n
+    said = (
+        f"corrected_cameras has {n} of the 20 keyframes of cameras, which are read where "
+        "corrected_cameras is not in the folder"
+    )
+    assert (said in scene.warnings, said in scene.notes) == (warns is True, warns is False)
+    shutil.rmtree(tmp_path / "keyframes/corrected_images")
+    scene = load_scene(tmp_path)
+    said = "corrected_cameras are used with images, as there are no corrected_images"
+    assert said in scene.notes
 
 
 def test_polycam_depth_is_in_millimetres(tmp_path: Path) -> None:
@@ -222,6 +246,17 @@ def test_reality_focal_length_is_by_the_longer_side(tmp_path: Path) -> None:
     camera = load_scene(file).views[0].camera
     assert (camera.width, camera.height, camera.fx) == (6, 8, pytest.approx(10.0))
     assert (camera.cx, camera.cy) == pytest.approx((3.25, 3.75))
+
+
+def test_reality_does_not_say_whether_photographs_are_turned(tmp_path: Path) -> None:
+    file = write_reality(tmp_path)
+    exif = Image.Exif()
+    exif[274] = 6
+    file.write_text(file.read_text().replace(".png", ".jpg"))
+    for path in (tmp_path / "images").iterdir():
+        Image.open(path).save(path.with_suffix(".jpg"), exif=exif)
+        path.unlink()
+    assert any("stored turned, with an EXIF rotation" in w for w in load_scene(file).warnings)
 
 
 @pytest.mark.parametrize("delimiter", [";", "\t"])

@@ -139,12 +139,17 @@ def test_keys_that_change_the_picture_are_named(tmp_path: Path) -> None:
         content["frames"][2]["white_transparent"] = True
         content["frames"][2]["depth_file_path"] = "depth/002.png"
         content |= {"aabb_scale": 4, "scale": 0.33, "offset": [0.5, 0.5, 0.5]}
+        content |= {"rolling_shutter": [0, 0.0, 0, 0], "mask_color": []}
         content["applied_transform"] = np.eye(4)[:3].tolist()
 
     scene = load_changed(tmp_path, change)
     assert [note for note in scene.warnings if "is not used" in note] == [
         "transforms.json: white_transparent is not used: white stays opaque"
     ]
+    scene = load_changed(tmp_path / "b", lambda c: c.update(rolling_shutter=[0, 0, 0.1, 0]))
+    assert scene.warnings == (
+        "transforms.json: rolling_shutter is not used: each image is taken at one instant",
+    )
     assert scene.content_distance == pytest.approx(np.sqrt(10.0))
 
 
@@ -178,6 +183,29 @@ def test_one_lens_for_images_of_other_sizes_is_told(tmp_path: Path) -> None:
     ]
     assert with_sizes(tmp_path / "reduced", (4, 3), camera_angle_x=np.pi / 2) == []
     assert with_sizes(tmp_path / "cropped", (8, 4), camera_angle_x=np.pi / 2) == []
+
+
+@pytest.mark.parametrize(
+    ("height", "lens", "says"),
+    [
+        (12, {}, True),
+        (8, {}, False),
+        (12, {"camera_angle_y": 2.0}, False),
+        (12, {"fl_x": 4.0}, False),
+    ],
+)
+def test_an_angle_across_the_width_of_portraits_is_said(
+    tmp_path: Path, height: int, lens: dict[str, float], says: bool
+) -> None:
+    with_sizes(tmp_path, (8, 6), camera_angle_x=np.pi / 2, **lens)
+    for k in range(4):
+        Image.fromarray(picture(k, width=8, height=height)).save(tmp_path / f"images/{k:03d}.png")
+    said = (
+        "transforms.json: camera_angle_x is taken to be across the width of all images, which "
+        "stand upright (first: images/000.png): 4 pixels; that of Blender, with sensor fit Auto, "
+        "is along the height: give fl_x, 6, if so"
+    )
+    assert [w for w in load_scene(tmp_path).warnings if "upright" in w] == [said] * says
 
 
 def test_a_lens_that_contradicts_itself_is_told_once(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -21,6 +22,22 @@ MANY_TIMES = 20.0
 
 DARK = 16
 """Of 255, which a photograph's brightest pixel does not exceed that fills 12 of 16 bits."""
+
+SATURATED = 250
+"""Of 255, from which on a pixel is white."""
+STILL = 3.0
+"""Of 255, by which a pixel that is the same in all photographs varies, as a standard deviation:
+bars of a video in JPEG have less, a place that two views see rarely."""
+STILL_OF_SAME_WAY = 1.0
+"""Such a deviation where cameras look the same way: there plain walls vary as little as that."""
+SAME_WAY = 0.966
+"""Length of the mean of the optical axes from which on that is so: 15 degrees from their middle."""
+MANY_STILL = 0.01
+"""Share of such pixels from which on they are something: real captures have up to 0.005."""
+ENOUGH_STILL = 10
+"""Photographs of one size, at least, by which that can be told."""
+MOST_STILL = 200
+"""Of them, at most, that are compared."""
 
 OFF_CENTRE = 0.3
 """Of the image's width or height, from the middle to the principal point: no lens is so far off."""
@@ -111,12 +128,20 @@ def _odd_images(scene: Scene, threads: int | None) -> list[str]:
             f"brightest pixel is at most {DARK} of 255; numbers of 12 bits in files of 16 bits are "
             "to be multiplied by 16"
         )
-    frozen = _frozen({view: look.sample for view, look in shown.items()})
+    frozen = _frozen({view: look.sample.tobytes() for view, look in shown.items()})
     if frozen:
         odd.append(
             f"the same photograph at different poses: {len(frozen)} of {len(scene.views)} images "
             f"(first: {frozen[0][1]} is {frozen[0][0]} again), of which one at most can be right; "
             "leave out the others"
+        )
+    still, n = _share_still({v: look for v, look in shown.items() if look.brightest > DARK})
+    if still > MANY_STILL:
+        odd.append(
+            f"the same in all photographs, wherever these were taken from: {still:.1%} of the "
+            f"pixels of {n} of {len(scene.views)} images, as of borders, black bars, a logo, or a "
+            "backdrop that does not turn with what stands before it; ignore them by masks, or cut "
+            "out an object by alpha"
         )
     if scene.splits.get("test"):
         try:
@@ -133,18 +158,52 @@ class _Look:
     is_of_one_colour: bool
     brightest: int
     """The largest value of a channel of colour."""
-    sample: bytes
-    """Some of its pixels."""
+    size: tuple[int, ...]
+    """H, W."""
+    sample: np.ndarray
+    """Some of its pixels, [h, w, 3 or 4] uint8."""
+    counts: np.ndarray
+    """[h, w] bool, which of these are neither masked nor transparent."""
 
 
 def _look(view: View) -> _Look:
-    image = view.image
-    sample = image[:: max(1, len(image) // 32), :: max(1, image.shape[1] // 32)]
+    image, mask = view.image, view.mask
+    every = (
+        slice(None, None, max(1, len(image) // 32)),
+        slice(None, None, max(1, image.shape[1] // 32)),
+    )
+    sample = image[every]
+    counts = np.ones(sample.shape[:2], bool) if mask is None else mask[every].copy()
+    if image.shape[2] == 4:
+        counts &= sample[..., 3] > 0
     return _Look(
         is_of_one_colour=bool((sample == image[0, 0]).all() and (image == image[0, 0]).all()),
         brightest=int(image[..., :3].max()),
-        sample=sample.tobytes(),
+        size=image.shape[:2],
+        sample=sample.copy(),
+        counts=counts,
     )
+
+
+def _share_still(looks: Mapping[View, _Look]) -> tuple[float, int]:
+    """The share of pixels that are the same in all photographs of the commonest size, and how many
+    these are, each once. White ones count only if all corners are still: else they may be a sky."""
+    sizes = Counter(look.size for look in looks.values())
+    most = max(sizes, key=lambda size: sizes[size], default=())
+    of_size = [look for look in looks.values() if look.size == most]
+    alike = list({look.sample.tobytes(): look for look in of_size}.values())
+    n = len(alike)
+    if n < ENOUGH_STILL:
+        return 0.0, n
+    alike = alike[:: -(-n // MOST_STILL)]
+    samples = np.stack([look.sample[..., :3] for look in alike])
+    seen = np.all([look.counts for look in alike], axis=0)
+    axes = np.mean([view.camera.c2w[:, 2] for view in looks], axis=0)
+    most_apart = STILL if np.linalg.norm(axes) < SAME_WAY else STILL_OF_SAME_WAY
+    still = (samples.std(axis=0, dtype=np.float32) <= most_apart).all(axis=-1) & seen
+    if not still[[0, 0, -1, -1], [0, -1, 0, -1]].all():
+        still &= samples.min(axis=(0, -1)) < SATURATED
+    return float(still.mean()), n
 
 
 def _frozen(samples: Mapping[View, bytes]) -> list[tuple[str, str]]:

@@ -30,6 +30,11 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 ENDINGS = (*IMAGE_SUFFIXES, ".webp", ".tif", ".tiff", ".bmp", ".ppm")
 """Of photographs that are read, lower case."""
+UNREAD_ENDINGS = (
+    *(".heic", ".heif", ".avif", ".jxl", ".jp2", ".exr"),
+    *(".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"),
+)
+"""Of those that phones, cameras and renderers write and that are not read."""
 
 REDUCED = re.compile(r"images_\d{1,3}", re.IGNORECASE)
 """Names of folders of a scene's photographs, reduced."""
@@ -271,9 +276,9 @@ def photograph_folder(folder: Path) -> Path | None:
     return next(filter(_holds_photographs, places), places[0] if places else None)
 
 
-def is_photograph(name: str) -> bool:
+def is_photograph(name: str, endings: tuple[str, ...] = ENDINGS) -> bool:
     """Whether a file has a photograph's name; macOS keeps other things in ._NAME.jpg."""
-    return name.lower().endswith(ENDINGS) and not name.startswith(".")
+    return name.lower().endswith(endings) and not name.startswith(".")
 
 
 def _holds_photographs(folder: Path) -> bool:

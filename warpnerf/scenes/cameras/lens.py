@@ -194,7 +194,8 @@ class Lens:
         for place, angle in sorted(self.angles.items()):
             axis, size = ("x", width) if place.endswith("x") else ("y", height)
             used, other = values[f"fl_{axis}"], _focal_length(angle, size)
-            if abs(other - used) > MAX_DIFFERENCE * used:
+            of_blender = _focal_length(angle, max(width, height)) if axis == "x" else other
+            if min(abs(other - used), abs(of_blender - used)) > MAX_DIFFERENCE * used:
                 return (
                     f"{self.fields[f'fl_{axis}']} is {used:.4g} pixels, which is used, but by "
                     f"{place}, {math.degrees(angle):.4g} degrees of {size} pixels, it is "
@@ -203,6 +204,16 @@ class Lens:
             if values.get("fl_y") == used:  # Blender's angle_y may be that of its sensor
                 break
         return self.doubt
+
+    def other_focal_length(self, width: int, height: int) -> float | None:
+        """That of a portrait by the only angle, were it Blender's, of the longer side; else None.
+
+        Blender's angle_x is that of the sensor's width, and its sensor fit Auto lays that along the
+        longer side.
+        """
+        if height <= width or self.values.keys() & {"fl_x", "fl_y", "camera_angle_y"}:
+            return None
+        return _focal_length(self.values["camera_angle_x"], height)
 
     def was_for(self, width: int, height: int) -> tuple[float, float] | None:
         """The size that the file states, where an image is one of that size that was resized; else

@@ -19,6 +19,11 @@ from warpnerf.scenes.split import Split
 
 SPLITS = ("train", "val", "test")
 
+LOOKED_AT = 65536
+"""Bytes at the beginning of a file by which it is recognised."""
+MOST = 64
+"""Files of JSON of any names, at most, that are looked at."""
+
 
 def split_file(split: str) -> str:
     """Return the file name that holds a split."""
@@ -32,14 +37,30 @@ def is_split(file: Path) -> bool:
 
 
 def other_transforms(folder: Path) -> list[Path]:
-    """Files of frames in a folder that are read only where they are named, by name."""
+    """Files of frames in a folder, called transforms*.json or not, that are read only where they
+    are named, by name."""
     names = {"transforms.json"}
     if exists(folder / split_file("train")):
         names.update(map(split_file, SPLITS))
     try:
-        return sorted(path for path in folder.glob("transforms*.json") if path.name not in names)
+        files = sorted(folder.glob("[!.]*.json"))
     except OSError:
         return []
+    called = [path for path in files if path.name.startswith("transforms")]
+    others = filter(is_frames, [path for path in files if path not in called][:MOST])
+    return [path for path in [*called, *others] if path.name not in names]
+
+
+def is_frames(file: Path) -> bool:
+    """Whether a file of JSON, of whatever name, begins as one of posed frames."""
+    try:
+        if not file.is_file():
+            return False
+        with file.open("rb") as stream:
+            head = stream.read(LOOKED_AT)
+    except OSError:
+        return False
+    return b'"frames"' in head and b'"transform_matrix"' in head
 
 
 def load_blender(

@@ -188,7 +188,7 @@ def load_colmap(
             f"{image_file.name}: left out {len(missing)} of {len(images)} images for want of a "
             f"photograph (first: {missing[0]})"
         )
-    notes, larger = other_models(model, len(images), folder)
+    notes, larger = other_models(model, images, folder)
     few, many = unnamed_photographs(photographs, {frame.path for frame in frames}, "the model")
     used = {frame.name for frame in frames}
     there = {name for name in names if names[name] in used}

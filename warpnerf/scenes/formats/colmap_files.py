@@ -224,6 +224,18 @@ def stated_images(file: Path) -> int:
     return int(comment[1]) if comment else 0
 
 
+def first_of_text(file: Path) -> ModelImage | None:
+    """The first image of images.txt; None where it is none. No more than its head is read."""
+    try:
+        if not file.is_file():
+            return None
+        with file.open(encoding="utf-8-sig") as opened:
+            lines = opened.read(HEAD).splitlines()
+        return _image(next(line for line in lines if line.strip() and line.lstrip()[0] != "#"))
+    except (OSError, ValueError, IndexError, StopIteration):
+        return None
+
+
 def images_of_text(file: Path) -> list[ModelImage]:
     """Images of images.txt, in its order: a line of the pose each, and one of its keypoints.
 

@@ -12,6 +12,8 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
+
 from warpnerf.checks import InputError
 from warpnerf.scenes.files import (
     exists,
@@ -22,6 +24,7 @@ from warpnerf.scenes.files import (
 )
 from warpnerf.scenes.formats.colmap_files import (
     ModelImage,
+    first_of_text,
     images_of_bytes,
     images_of_text,
     stated_images,
@@ -31,6 +34,9 @@ SPARSE = "sparse"
 MODEL_FOLDERS = (SPARSE, f"colmap/{SPARSE}", ".")
 """Where models are looked for in a scene's folder, in this order: there, and first in 0, 1, ... of
 a folder sparse, or of one with photographs of which these have none."""
+
+ROUNDED = 1e-4
+"""By which numbers of a pose differ in a model's two forms, at most: as a share of their norm."""
 
 CLEARLY_SMALLER = 0.8
 """Share of the images of the largest model that can be read, below which a damaged one is a
@@ -153,14 +159,17 @@ def _images_in(file: Path) -> list[ModelImage]:
     return (images_of_bytes if file.suffix == ".bin" else images_of_text)(file)
 
 
-def other_models(model: Path, n: int, folder: Path) -> tuple[list[str], list[str]]:
+def other_models(
+    model: Path, images: Sequence[ModelImage], folder: Path
+) -> tuple[list[str], list[str]]:
     """Notes and warnings of other models of a scene, and of this one in its other form.
 
     Args:
         model: Which is read.
-        n: How many images it has.
+        images: Of it.
         folder: The scene's, which the others are named from.
     """
+    n = len(images)
     elsewhere = [path for place in MODEL_FOLDERS for path in _models_in(folder / place)]
     others = {path.resolve(): path for path in [*elsewhere, *beside(model)]}
     sizes = {path: size_of(path) for place, path in others.items() if place != model.resolve()}
@@ -174,7 +183,7 @@ def other_models(model: Path, n: int, folder: Path) -> tuple[list[str], list[str
         f"{name(model / f'images.{kind}')} of {n} images is read, and not images.{other}, which "
         f"{size}; remove the files of the one that is out of date"
         for other in _kinds(model)
-        if other != kind and (size := _otherwise(model / f"images.{other}", n))
+        if other != kind and (size := _otherwise(model / f"images.{other}", images))
     ]
     if not sizes:
         return [], stale
@@ -229,14 +238,28 @@ def _stated(text: Path) -> int:
         return 0
 
 
-def _otherwise(file: Path, n: int) -> str:
-    """What a file of images has other than n of them, in words; empty: nothing, as it seems."""
-    if file.suffix == ".txt" and _stated(file) == n:
-        return ""
+def _otherwise(file: Path, images: Sequence[ModelImage]) -> str:
+    """What a file of images has other than these, in words; empty: nothing, as it seems."""
+    n = len(images)
+    if file.suffix == ".txt":
+        first = first_of_text(file)
+        twins = [image for image in images if first is not None and image.name == first.name]
+        if first is not None and not all(_same_pose(first, image) for image in twins):
+            return "has other poses"
+        if _stated(file) == n:
+            return ""
     listed = _listed(file)
     if listed == n:
         return ""
     return "is damaged" if listed is None else f"has {listed}"
+
+
+def _same_pose(one: ModelImage, other: ModelImage) -> bool:
+    """Whether two images are of one pose, but for how it is rounded; q and -q are one rotation."""
+    q, r = np.array(one.rotation), np.array(other.rotation)
+    at, there = np.array(one.translation), np.array(other.translation)
+    turned = np.linalg.norm(q - (r if q @ r > 0.0 else -r)) > ROUNDED * np.linalg.norm(r)
+    return not turned and bool(np.linalg.norm(at - there) <= ROUNDED * np.linalg.norm(there))
 
 
 def scene_folder(model: Path) -> Path:

@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from warpnerf.checks import InputError
-from warpnerf.scenes.files import ENDINGS, exists, printable
+from warpnerf.scenes.files import ENDINGS, UNREAD_ENDINGS, exists, printable
 from warpnerf.scenes.formats import llff
 from warpnerf.scenes.formats.blender import SPLITS, other_transforms, split_file
 from warpnerf.scenes.formats.colmap_models import find_model, model_kind
@@ -18,9 +18,6 @@ from warpnerf.scenes.formats.found_photographs import is_written
 from warpnerf.scenes.formats.npz import is_scene_file, single_npz
 from warpnerf.scenes.formats.programs import exports_in
 from warpnerf.scenes.images.masks import without_masks
-
-UNREAD_PHOTOGRAPHS = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf")
-"""Endings of photographs that phones and cameras write and that are not read."""
 
 VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
 
@@ -35,12 +32,15 @@ UNREAD_POSES = (
 """Files of poses that are not read: of VisualSFM, Bundler, OpenMVG, Meshroom, 3DGS, Metashape,
 RealityCapture, RealityScan, OpenSfM, NSVF and Nerfies."""
 
-PLACES_OF_TEXTS = ("*.csv", "*.txt", "*.xmp", "images/*.csv", "images/*.txt", "images/*.xmp")
+TEXTS = (".csv", ".txt", ".xmp", ".xml")
+PLACES_OF_TEXTS = (".", "images", "params", "1_initial/params")
 POSES_IN_TEXT = re.compile(
-    rb"omega\W+phi\W+kappa|heading\W+pitch\W+roll|yaw\W+pitch\W+roll|xcr:(rotation|position)",
+    rb"omega\W+phi\W+kappa|heading\W+pitch\W+roll|yaw\W+pitch\W+roll|xcr:(rotation|position)|"
+    rb"<BlocksExchange",
     re.IGNORECASE,
 )
-"""Texts in which poses are recognised by what they begin with, of Metashape and RealityCapture."""
+"""Texts in which poses are recognised by what they begin with, of Metashape, RealityCapture, Pix4D,
+and, for exchange between programs, of ContextCapture."""
 LOOKED_AT = 4096
 """Bytes at the beginning of a text, and texts at a place, at most, that are looked at."""
 
@@ -49,6 +49,10 @@ IMAGES = re.compile(r"images?(_\d{1,3})?|input|rgb|train|test|val", re.IGNORECAS
 
 NEEDED = 3
 """Photographs, at least, whose poses can be estimated."""
+
+DEEPEST = 3
+MOST = 200
+"""How deep in a folder without photographs scenes are looked for, and in how many folders."""
 
 
 def holds_scene(folder: Path) -> bool:
@@ -83,7 +87,7 @@ def photographs_in(folder: Path) -> list[Path]:
 def unread_photographs(folder: Path) -> list[Path]:
     """Photographs in the same places whose formats are not read."""
     places = (folder, folder / "images")
-    return [path for place in places for path in _with_endings(place, UNREAD_PHOTOGRAPHS)]
+    return [path for place in places for path in _with_endings(place, UNREAD_ENDINGS)]
 
 
 def is_unposed(path: Path) -> bool:
@@ -115,14 +119,14 @@ def _what_is_there(folder: Path) -> str:
     inner = [path for path in _entries(folder) if path.is_dir() and _readable(path)]
     scenes = [path for path in inner if holds_scene(path)]
     if scenes:
-        first = shlex.quote(str(scenes[0]))
-        if len(scenes) == 1:
-            return f"its folder {scenes[0].name} holds one; use {first}"
-        return f"{len(scenes)} of its folders hold one each (first: {scenes[0].name}); use {first}"
+        return _scenes(folder, scenes)
     nearby = _poses_nearby(folder)
     if nearby is not None:
         return nearby
     photographs = photographs_in(folder)
+    scenes = [] if photographs else _scenes_below(folder)
+    if scenes:
+        return _scenes(folder, scenes)
     unread = unread_photographs(folder)
     if photographs:
         n = len(photographs)
@@ -171,6 +175,26 @@ def _what_is_there(folder: Path) -> str:
     return "it holds neither poses nor photographs nor a video"
 
 
+def _scenes(folder: Path, scenes: list[Path]) -> str:
+    """What to say of folders that hold a scene each."""
+    use = f"use {_quoted(scenes[0])}"
+    name = printable(scenes[0].relative_to(folder).as_posix())
+    if len(scenes) == 1:
+        return f"its folder {name} holds one; {use}"
+    return f"{len(scenes)} of its folders hold one each (first: {name}); {use}"
+
+
+def _scenes_below(folder: Path) -> list[Path]:
+    """Folders that hold scenes, not as deep in a folder as others; none where it has too many."""
+    places = [folder]
+    for _ in range(DEEPEST):
+        places = [inner for place in places for inner in _folders(place) if not is_written(inner)]
+        scenes = [path for path in places[:MOST] if holds_scene(path)]
+        if scenes or len(places) > MOST:
+            return scenes
+    return []
+
+
 def _poses_nearby(folder: Path) -> str | None:
     """What to say of poses that can be read, where the folder that was named leads to none."""
     others = [*other_transforms(folder), *_scenes_as_npz(folder)]
@@ -215,12 +239,13 @@ def _unposed(folder: Path, photographs: list[Path], unread: list[Path]) -> str:
 def _unread_poses(folder: Path) -> str:
     """What to say of poses in forms that are not read; empty: there are none."""
     found: list[Path] = []
-    with suppress(OSError):
+    with suppress(OSError, InputError):
         for pattern in UNREAD_POSES:
             found += sorted(folder.glob(pattern))[:1]
-        for pattern in PLACES_OF_TEXTS:
-            texts = sorted(folder.glob(pattern))[:LOOKED_AT]
-            found += [path for path in texts if _begins_with_poses(path)][:1]
+        for place in PLACES_OF_TEXTS:
+            for ending in TEXTS:
+                texts = _with_endings(folder / place, (ending,))[:LOOKED_AT]
+                found += [path for path in texts if _begins_with_poses(path)][:1]
     if not found:
         return ""
     named = ", ".join(printable(path.relative_to(folder).as_posix()) for path in found[:3])

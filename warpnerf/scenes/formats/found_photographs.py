@@ -21,6 +21,7 @@ from warpnerf.scenes.files import (
     ENDINGS,
     OTHER_IMAGES,
     REDUCED,
+    UNREAD_ENDINGS,
     exists,
     is_photograph,
     printable,
@@ -120,13 +121,26 @@ class Photographs:
         first = printable(names[0][:80])
         if len(names) == n:
             raise InputError(
-                f"{file}: none of its {n} photographs is in {self.root} (first: {first}); put them "
-                "there."
+                f"{file}: none of its {n} photographs is in {self.root} (first: {first})"
+                f"{self.others()}; put them there."
             )
         return [
             f"{file.name}: left out {len(names)} of {n} cameras for want of a photograph (first: "
             f"{first})"
         ]
+
+    def others(self) -> str:
+        """Half a sentence on photographs that are there under other names, or are not read."""
+        unread = [] if self.paths else _photographs_below(self.root, True, UNREAD_ENDINGS)
+        paths = self.paths or unread
+        if not paths:
+            return ""
+        kind = paths[0].suffix.lstrip(".").upper()
+        what = f"as {kind}, to be converted to JPEG," if unread else f"other{'s'[: len(paths) - 1]}"
+        is_there = "are" if len(paths) > 1 else "is"
+        return (
+            f", but {len(paths)} {what} {is_there} (first: {printable(self.name(paths[0])[:80])})"
+        )
 
     def unposed(self, file: Path, used: Collection[Path]) -> tuple[list[str], list[str]]:
         """Notes and warnings of photographs that have no camera."""
@@ -139,9 +153,9 @@ def normalised(name: str) -> str:
 
 
 def without_ending(name: str) -> str:
-    """A photograph's name without the ending of its format, if it has one."""
+    """A photograph's name without the ending of its format, read or not, if it has one."""
     stem, dot, ending = name.rpartition(".")
-    return stem if dot and f".{ending.lower()}" in ENDINGS else name
+    return stem if dot and f".{ending.lower()}" in (*ENDINGS, *UNREAD_ENDINGS) else name
 
 
 def is_written(folder: Path) -> bool:
@@ -153,7 +167,7 @@ def is_written(folder: Path) -> bool:
     return is_run or exists(folder / POSED)
 
 
-def _photographs_below(root: Path, within: bool) -> list[Path]:
+def _photographs_below(root: Path, within: bool, endings: tuple[str, ...] = ENDINGS) -> list[Path]:
     """All photographs in a folder and in folders within it, by name, but those in runs."""
     found: list[Path] = []
     for place, folders, names in os.walk(root):
@@ -165,7 +179,7 @@ def _photographs_below(root: Path, within: bool) -> list[Path]:
             and not NO_PHOTOGRAPHS.fullmatch(name)
             and not is_written(Path(place) / name)
         )
-        found += [Path(place) / name for name in filter(is_photograph, names)]
+        found += [Path(place) / name for name in names if is_photograph(name, endings)]
     return sorted(without_masks(found))
 
 

@@ -122,6 +122,17 @@ def lens_warnings(used: Sequence[tuple[Frame, Camera]]) -> list[str]:
             f"{frame.lens.file.name}: the lens of {len(doubted)} of {len(used)} images (first: "
             f"{frame.name}) contradicts itself: {text}"
         )
+    others = [
+        (frame, camera, frame.lens.other_focal_length(camera.width, camera.height))
+        for frame, camera in used
+    ]
+    if all(other is not None for *_, other in others):
+        frame, camera, other = others[0]
+        warnings.append(
+            f"{frame.lens.file.name}: camera_angle_x is taken to be across the width of all "
+            f"images, which stand upright (first: {frame.name}): {camera.fx:.4g} pixels; that of "
+            f"Blender, with sensor fit Auto, is along the height: give fl_x, {other:.4g}, if so"
+        )
     shared: dict[tuple[tuple[str, float], ...], dict[tuple[int, int], tuple[Frame, Camera]]] = {}
     for frame, camera in used:
         sizes = shared.setdefault(tuple(frame.lens.values.items()), {})

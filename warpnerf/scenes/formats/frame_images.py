@@ -9,7 +9,9 @@ from pathlib import Path
 
 from warpnerf.checks import InputError
 from warpnerf.scenes.files import (
+    ENDINGS,
     REDUCED,
+    UNREAD_ENDINGS,
     OutsideError,
     find_image,
     photograph_folder,
@@ -137,7 +139,7 @@ def find_photographs(
         except OutsideError as error:
             outside = outside or error
             continue
-        if path is None:
+        if path is None or path.suffix.lower() in UNREAD_ENDINGS:
             renamed.append(index)
         else:
             found[index] = path
@@ -183,17 +185,13 @@ def find_photographs(
 
 def _is_named(name: str, converted: bool, path: Path) -> bool:
     """Whether a photograph of some name may be one of that name, perhaps in another format."""
-    has_ending = without_ending(name) != name
-    return converted or not has_ending or normalised(path.name) == normalised(name)
+    as_it_is = name.lower().endswith(ENDINGS) and not converted
+    return not as_it_is or normalised(path.name) == normalised(name)
 
 
 def others_there(folder: Path) -> str:
     """Half a sentence on photographs of other names in a scene's folder, if there are some."""
-    paths = Photographs(folder, among=photograph_folder(folder)).paths
-    if not paths:
-        return ""
-    first = printable(paths[0].relative_to(folder).as_posix()[:80])
-    return f", but {len(paths)} others are (first: {first})"
+    return Photographs(folder, among=photograph_folder(folder)).others()
 
 
 def elsewhere_warnings(file: Path, frames: Sequence[Frame]) -> list[str]:
@@ -241,7 +239,7 @@ class _ByEnds:
             agreeing += [(n, path) for path in self._whole.get(named[-n:], ())]
         last = normalised(plain_name(name).rpartition("/")[2])
         same = [path for _, path in agreeing if normalised(path.name) == last]
-        converted = converted or normalised(without_ending(last)) == last
+        converted = converted or not last.endswith(ENDINGS)
         others = [path for n, path in agreeing if converted or n > 1]
         return self._photographs.only(name, field, same or others)
 

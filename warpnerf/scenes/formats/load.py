@@ -14,7 +14,7 @@ from warpnerf.checks import InputError, require_one_of
 from warpnerf.runtime.memory import require_threads
 from warpnerf.scenes.files import exists, printable
 from warpnerf.scenes.formats import llff
-from warpnerf.scenes.formats.blender import is_split, load_blender, split_file
+from warpnerf.scenes.formats.blender import is_frames, is_split, load_blender, split_file
 from warpnerf.scenes.formats.colmap import load_colmap
 from warpnerf.scenes.formats.colmap_models import find_model
 from warpnerf.scenes.formats.contents import VIDEOS, is_unposed, pose_command, what_is_there
@@ -117,6 +117,8 @@ def load_scene(
     export = export_of(path)
     if export is not None:
         return export.load(path, Reading(**how))
+    if path.suffix.lower() == ".json" and is_frames(path):
+        return load_transforms(path, **how)
     if path.suffix.lower() in VIDEOS:
         command = pose_command(shlex.quote(str(path)))
         raise InputError(f"{path}: is a video, not a scene; make one of it by {command}.")

@@ -22,6 +22,7 @@ from warpnerf.scenes.formats.found_photographs import (
     Reading,
     scene_of,
 )
+from warpnerf.scenes.formats.unnamed_photographs import UNPOSED
 from warpnerf.scenes.images.depths import DepthFile
 from warpnerf.scenes.images.images import image_size
 from warpnerf.scenes.scene import Scene
@@ -118,15 +119,37 @@ def load_polycam(cameras: Path, reading: Reading) -> Scene:
         return Entry(name=file.stem, place=f"{file}", read=read)
 
     def say() -> tuple[list[str], list[str]]:
-        if not other_depth:
-            return [], []
-        return [], [
-            f"keyframes/depth: left out {len(other_depth)} depth maps of another shape than their "
-            f"photographs (first: {other_depth[0]})"
-        ]
+        notes, warnings = _uncorrected(cameras, images, len(files))
+        if other_depth:
+            warnings.append(
+                f"keyframes/depth: left out {len(other_depth)} depth maps of another shape than "
+                f"their photographs (first: {other_depth[0]})"
+            )
+        return notes, warnings
 
-    files = sorted(path for path in cameras.iterdir() if path.suffix == ".json")
+    files = _files(cameras)
     return scene_of(cameras, [entry(file) for file in files], photographs, reading, say)
+
+
+def _files(cameras: Path) -> list[Path]:
+    return sorted(path for path in cameras.iterdir() if path.suffix == ".json")
+
+
+def _uncorrected(cameras: Path, images: Path, n: int) -> tuple[list[str], list[str]]:
+    """Notes and warnings of corrected cameras, n, that other keyframes or photographs lack."""
+    notes, every = [], cameras.with_name(FOLDERS[-1])
+    if cameras.name != every.name and images.name == IMAGES[every.name][0]:
+        notes.append(
+            f"{cameras.name} are used with {images.name}, as there are no {IMAGES[cameras.name][0]}"
+        )
+    whole = len(_files(every)) if every.is_dir() else 0
+    if n >= whole:
+        return notes, []
+    said = (
+        f"{cameras.name} has {n} of the {whole} keyframes of {every.name}, which are read where "
+        f"{cameras.name} is not in the folder"
+    )
+    return (notes, [said]) if whole - n > UNPOSED * whole else ([*notes, said], [])
 
 
 KEYS = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", "w": "width", "h": "height"}

@@ -179,9 +179,7 @@ def _lens(file: Path, place: str, row: Mapping[str, float], size: tuple[int, int
             "fl_y": focal,
             "cx": 0.5 * size[0] + row["px"] * longer,
             "cy": 0.5 * size[1] + row["py"] * longer,
-            "w": size[0],
-            "h": size[1],
-        },
+        },  # the file does not say of what size photographs are, nor so whether they were turned
         radial=[row[f"k{i}"] for i in (1, 2, 3, 4)],
         tangential=[row["t1"], row["t2"], 0.0, 0.0],
     )

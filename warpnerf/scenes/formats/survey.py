@@ -27,7 +27,7 @@ SHOWN = 3
 
 WITHOUT_EFFECT = {
     *("aabb_scale", "scale", "offset", "up", "n_frames", "sharpness", "colmap_im_id", "rotation"),
-    *("orientation_override", "time"),
+    *("orientation_override", "time", "enable_depth_loading"),
     *("camera_id", "image_id"),
 }
 """Keys that are not read and do not change the picture."""

@@ -70,6 +70,8 @@ class FrameEntry(PictureKeys, kw_only=True):
     transform_matrix: list[list[float]]
     mask_path: str | None = None
     depth_file_path: str | None = None
+    depth_path: str | None = None
+    """As instant-ngp calls it."""
 
 
 class TransformsFile(PictureKeys, kw_only=True):
@@ -81,6 +83,8 @@ class TransformsFile(PictureKeys, kw_only=True):
     mask_path: str | None = None
     depth_unit_scale_factor: float = DEFAULT_UNIT
     applied_scale: float = 1.0
+    integer_depth_scale: float | None = None
+    """Of instant-ngp's depth_path: scene units in one of its units."""
     train_filenames: list[str] | None = None
     val_filenames: list[str] | None = None
     test_filenames: list[str] | None = None
@@ -224,13 +228,19 @@ def read_frames(
         file.parent, file, [entry.file_path for entry in data.frames], required, taken
     )
     unit = data.depth_unit_scale_factor * data.applied_scale
+    unit_of_ngp = unit if data.integer_depth_scale is None else data.integer_depth_scale
     if not (unit > 0.0 and math.isfinite(unit)):
         raise InputError(
             f"{file}: $.depth_unit_scale_factor: {data.depth_unit_scale_factor:g} with an "
             f"applied_scale of {data.applied_scale:g} is no unit of depth; give numbers above 0."
         )
+    if not unit_of_ngp > 0.0:
+        raise InputError(
+            f"{file}: $.integer_depth_scale: {unit_of_ngp:g} is no unit of depth; give a number "
+            "above 0."
+        )
     frames = []
-    lost: dict[str, list[str]] = {"mask_path": [], "depth_file_path": []}
+    lost: dict[str, list[str]] = {"mask_path": [], "depth_file_path": [], "depth_path": []}
     for index, path in found.items():
         entry = data.frames[index]
         place = f"$.frames[{index}]"
@@ -238,6 +248,10 @@ def read_frames(
         if mask is None and not entry.mask_path:
             mask = _named_file(file, "$", "mask_path", data.mask_path, lost)
         depth = _named_file(file, place, "depth_file_path", entry.depth_file_path, lost)
+        depth_unit = unit
+        if not entry.depth_file_path:
+            depth = _named_file(file, place, "depth_path", entry.depth_path, lost)
+            depth_unit = unit_of_ngp
         lens = read_lens(file, [(place, entry), ("$", data)])
         if index in moved:
             _require_size(file, place, lens, path)
@@ -248,7 +262,7 @@ def read_frames(
                 c2w=check_pose(entry.transform_matrix, field=f"{file}: {place}.transform_matrix"),
                 lens=lens,
                 mask=None if mask is None else Mask(mask),
-                depth=None if depth is None else DepthFile(depth, unit),
+                depth=None if depth is None else DepthFile(depth, depth_unit),
                 called=entry.file_path if index in moved else "",
                 elsewhere=moved.get(index, False),
             )
@@ -261,9 +275,14 @@ def read_frames(
                 f"file (first: {names[0]})"
             )
     for key, consequence in IGNORED.items():
-        if getattr(data, key) or any(getattr(entry, key) for entry in data.frames):
+        if any(_is_set(getattr(level, key)) for level in (data, *data.frames)):
             warnings.append(f"{file.name}: {key} is not used: {consequence}")
     return data, frames, warnings
+
+
+def _is_set(value: object) -> bool:
+    """Whether a value of a key that is not used means something: not of zeros only."""
+    return any(map(_is_set, value)) if isinstance(value, list) else bool(value)
 
 
 def _require_size(file: Path, place: str, lens: Lens, path: Path) -> None:

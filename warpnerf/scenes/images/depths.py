@@ -10,11 +10,15 @@ import numpy as np
 from warpnerf.checks import InputError
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.cameras.undistort import axis_cosines
+from warpnerf.scenes.files import UNREAD_ENDINGS
 from warpnerf.scenes.images.arrays import read_npy
 from warpnerf.scenes.images.images import read_values
 
 DEFAULT_UNIT = 1e-3
 """Metres in one of a depth file's units: millimetres, as nerfstudio has it."""
+
+UNREAD_DEPTHS = (".pfm", ".npz", ".depth")
+"""Endings of depth maps that are not read, besides those of photographs."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +84,11 @@ def read_depth(file: DepthFile, camera: Camera, downscale: int = 1) -> Depth:
     Raises:
         InputError: The file cannot be read, or is of another shape than the photograph.
     """
+    if file.path.suffix.lower() in (*UNREAD_ENDINGS, *UNREAD_DEPTHS):
+        raise InputError(
+            f"{file.path}: depth is read from images of one channel, usually of 16 bits, and from "
+            ".npy; convert it to one of these, or remove what names it."
+        )
     values = read_npy(file.path) if file.path.suffix == ".npy" else read_values(file.path)
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[:, :, 0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -28,6 +29,17 @@ OTHER_BYTE = {
 }
 """Raw modes of 16-bit colour, of which Pillow keeps one byte without a word, and those by which it
 keeps the other byte: L, B and N stand for little-endian, big-endian and this machine's."""
+
+OTHER_KINDS = {
+    "a HEIC": rb".{4}ftyp(hei|hev|mif1|msf1)",
+    "an AVIF": rb".{4}ftypavi",
+    "a video": rb".{4}ftyp|\x1aE\xdf\xa3",
+    "a JPEG XL": rb"\xff\x0a|\0\0\0\x0cJXL ",
+    "a JPEG 2000": rb"\0\0\0\x0cjP  |\xff\x4f\xff\x51",
+    "an OpenEXR": rb"v/1\x01",
+    "an HTML": rb"\s*<(!doctype html|html)",
+}
+"""Files that may be called as photographs, by what they begin with."""
 
 T = TypeVar("T")
 
@@ -201,9 +213,12 @@ def _read(path: Path, look: Callable[[ImageFile.ImageFile], T]) -> T:
         raise _too_large(path) from None
     except UnidentifiedImageError:
         known = ", ".join(IMAGE_FORMATS)
+        kind = _other_kind(path)
+        said = f"is {kind} file, and no" if kind else "is not an"
+        damaged = "" if kind else ", or is damaged at its start"
         raise InputError(
-            f"{path}: is not an image in a known format ({known}), or is damaged at its start; "
-            "convert it to PNG or JPEG, or copy it again."
+            f"{path}: {said} image in a known format ({known}){damaged}; convert it to PNG or "
+            "JPEG, or copy it again."
         ) from None
     except Exception as error:  # decoders raise nearly anything on a damaged file
         raise InputError(
@@ -224,6 +239,13 @@ def _refuse_pointer(path: Path) -> None:
         raise InputError(f"{path}: is empty (0 bytes); copy it again.")
     if start.startswith(b"version https://git-lfs"):
         raise InputError(f"{path}: is a Git LFS pointer, not an image; run `git lfs pull`.")
+
+
+def _other_kind(path: Path) -> str:
+    """What a file is that is no image in a known format, where that is known; else empty."""
+    with path.open("rb") as file:
+        start = file.read(64)
+    return next((k for k, p in OTHER_KINDS.items() if re.match(p, start, re.I | re.S)), "")
 
 
 def _check_kind(path: Path, image: ImageFile.ImageFile) -> None:
