@@ -19,6 +19,7 @@ from warpnerf.scenes.cameras.undistort import seen_pixels
 from warpnerf.scenes.extent.conventions import check_against_photographs
 from warpnerf.scenes.extent.given_depths import believed_bounds, doubted_depths
 from warpnerf.scenes.extent.masked import inverted_masks, mask_notes
+from warpnerf.scenes.extent.photo_consistency import PhotoConsistency
 from warpnerf.scenes.extent.points import Points, extent_by_points
 from warpnerf.scenes.files import by_number, exists
 from warpnerf.scenes.formats.frame import Frame, lens_warnings, photograph_notes, with_masks_beside
@@ -141,15 +142,20 @@ def assemble(
     indices = {
         split: tuple(sorted(index[name] for name in names)) for split, names in complete.items()
     }
-    views, points, told = check_against_photographs(views, indices["train"], points, is_object)
+    views, photographs, points, told = check_against_photographs(
+        views, indices["train"], points, is_object
+    )
     warnings += told
+    training = [views[i] for i in indices["train"]]
     masks_left, cameras = [entry.mask for entry in left], [view.camera for view in views]
     notes += mask_notes(masks_left, cameras)
     mask_warnings += inverted_masks(masks_left, cameras, indices["train"])
-    bounds, refuted = believed_bounds(views, indices["train"], _bounds(frames, views))
+    bounds, refuted = believed_bounds(photographs, views, _bounds(frames, views))
     warnings += refuted
-    warnings += doubted_depths([views[i] for i in indices["train"] if left[i].depth is not None])
-    training = [views[i] for i in indices["train"]]
+    deep = [views[i] for i in indices["train"] if left[i].depth is not None]
+    warnings += doubted_depths(
+        photographs if len(deep) == len(training) else PhotoConsistency.of(deep)
+    )
     unbounded = not is_object
     transparent = {view.name for view, see in zip(views, kept.see_through, strict=True) if see}
     try:
