@@ -78,7 +78,7 @@ MUTANTS = [
     of_host("doubts: focal lengths that fit about as well", DOUBTS, "return zoom if sharp else None", "return zoom", ANY_FOCAL),
     of_host("doubts: focal lengths as they stand only", DOUBTS, "for steps in (ZOOMS, FINER):", "for steps in (FINER,):", FOCAL),
     of_host("doubts: the inverse factor", DOUBTS, "photographs.zoomed(middle * step)", "photographs.zoomed(1.0 / (middle * step))", FOCAL),
-    of_host("doubts: of cameras far apart", DOUBTS, " and photographs.apart(poses) <= CLOSE", "", HARDLY),
+    of_host("doubts: of cameras far apart", DOUBTS, " and photographs.apart() <= CLOSE", "", HARDLY),
     of_host("doubts: of few references", DOUBTS, "len(gain) < ENOUGH or ", "", HARDLY),
     of_host("doubts: none of poses", DOUBTS, "if gain.mean() < REFUTED and", "if False and", OTHER_POSES),
     of_host("doubts: not asked", "scenes/extent/conventions.py", "        warnings += doubts(photographs)\n", "        pass\n", OTHER_POSES),
