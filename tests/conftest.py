@@ -18,6 +18,7 @@ from tests.support import cli_process
 from tests.support.compiling import compile_as_tests_do, not_optimising
 from tests.support.fake_colmap import Colmap, photographs
 from tests.support.kernel_runner import Kernels
+from warpnerf.scenes.extent.photo_consistency import PhotoConsistency
 from warpnerf.scenes.formats import assemble
 from warpnerf.sfm import pose as sfm_pose
 
@@ -70,7 +71,10 @@ def poses_as_given() -> Iterator[None]:
     """For a module that loads photographs often, but asks nothing of them: nor do scenes ask them
     which axes their poses have, which takes a second each time."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(assemble, "check_against_photographs", lambda v, t, p, o: (list(v), p, []))
+        unasked = PhotoConsistency.of([])
+        patch.setattr(
+            assemble, "check_against_photographs", lambda v, t, p, o: (list(v), unasked, p, [])
+        )
         yield
 
 

@@ -76,7 +76,7 @@ def test_what_the_guide_quotes_is_said() -> None:
     ]
     for section in (
         "By what inspect warns of",
-        "By the last line of a training",
+        "By what a training says at its end",
         "By what pose says",
     ):
         for phrase in quoted(section):

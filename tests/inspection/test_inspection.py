@@ -332,6 +332,13 @@ def test_costs_are_those_of_the_model(tmp_path: Path) -> None:
         assert found.facts()["costs"]["mine"]["model"]["name"] == model.name
 
 
+def test_voxels_are_described_where_they_say_how_fine_a_field_is(tmp_path: Path) -> None:
+    folder = scene_with(tmp_path, ring(9))
+    configs = {"grid": wn.TrainConfig(), "tables": wn.TrainConfig(field=wn.Hash())}
+    text = str(inspect(folder, configs=configs))
+    assert "voxels, grid" in text and "training, tables" in text and "voxels, tables" not in text
+
+
 def test_photographs_take_memory(tmp_path: Path) -> None:
     folder = scene_with(tmp_path, ring(9))  # 16 x 12 pixels of three numbers
     whole, half = (inspect(folder, downscale=n).costs["fast"].plan.memory for n in (1, 2))

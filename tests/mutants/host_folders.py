@@ -91,7 +91,7 @@ MUTANTS = [
     of_host(
         "names: a folder of photographs",
         FRAME_IMAGES,
-        " and not OWN.fullmatch(top)",
+        " and not PHOTOGRAPHS.fullmatch(top)",
         "",
         NAMED,
     ),
@@ -280,7 +280,7 @@ MUTANTS = [
     of_host(
         "contents: any folder in a scene's is its images",
         CONTENTS,
-        "if IMAGES.fullmatch(folder.name) and",
+        "if ANY_PHOTOGRAPHS.fullmatch(folder.name) and",
         "if",
         "scenes/test_contents.py::test_photographs_of_a_scene_lead_to_it",
     ),

@@ -23,6 +23,9 @@ PULLED = "evaluation/test_near_field.py::test_pulled_back_cameras_see_what_their
 NEAR_DENSITY = "evaluation/test_floater_metrics.py::test_near_density_is_density_times_clearance"
 EVENLY = "evaluation/test_floater_metrics.py::test_directions_are_spread_evenly"
 PHOTOGRAPHS = "inspection/test_inspection.py::test_photographs_take_memory"
+VOXELS = (
+    "inspection/test_inspection.py::test_voxels_are_described_where_they_say_how_fine_a_field_is"
+)
 COSTS = "inspection/test_inspection.py::test_costs_grow_with_what_is_asked"
 OF_MODEL = "inspection/test_inspection.py::test_costs_are_those_of_the_model"
 UPDATES = "inspection/test_inspection.py::test_fewer_updates_cost_less_by_their_nodes"
@@ -105,6 +108,7 @@ MUTANTS = [
     of_host("memory of four numbers a node", "model/storage_kinds.py", "math.prod(size) * model.n_floats * NUMBER_BYTES",
             "math.prod(size) * 4 * NUMBER_BYTES", OF_MODEL),
     of_host("time of any model", INSPECTION, "step *= config.model.relative_time * ", "step *= ", OF_MODEL),
+    of_host("voxels of a hash are described", INSPECTION, "if cost.plan.config.field.as_fine_as_nodes:", "if True:", VOXELS),
     of_host("time on one thread", INSPECTION, "config.steps * step / threads", "config.steps * step", COSTS),
     of_host("every step updates", INSPECTION, "(nodes / steps_an_update).mean()", "nodes.mean()", UPDATES),
     of_host("half the field of view", INSPECTION, "math.degrees(2.0 * half)", "math.degrees(half)", ORDINARY),

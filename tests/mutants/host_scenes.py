@@ -58,7 +58,7 @@ POINTS, FOCUS, OVERLAP, FISHEYE = (
 
 LENS, FRAME = "scenes/cameras/lens.py", "scenes/formats/frame.py"
 DIAGNOSTICS = "inspection/diagnostics.py"
-GIVEN = "scenes/extent/given_depths.py"
+GIVEN, CONSISTENCY = "scenes/extent/given_depths.py", "scenes/extent/photo_consistency.py"
 MASKED = "scenes/extent/masked.py"
 SPACES = "model/spaces.py"
 SPACE, SPACE_PLAN, OBSERVATIONS = (
@@ -82,10 +82,10 @@ MUTANTS = [
     of_host("doubts: focal lengths that fit about as well", DOUBTS, "return zoom if sharp else None", "return zoom", ANY_FOCAL),
     of_host("doubts: focal lengths as they stand only", DOUBTS, "for steps in (ZOOMS, FINER):", "for steps in (FINER,):", FOCAL),
     of_host("doubts: the inverse factor", DOUBTS, "photographs.zoomed(middle * step)", "photographs.zoomed(1.0 / (middle * step))", FOCAL),
-    of_host("doubts: of cameras far apart", DOUBTS, " and photographs.apart(poses) <= CLOSE", "", HARDLY),
+    of_host("doubts: of cameras far apart", DOUBTS, " and photographs.apart() <= CLOSE", "", HARDLY),
     of_host("doubts: of few references", DOUBTS, "len(gain) < ENOUGH or ", "", HARDLY),
     of_host("doubts: none of poses", DOUBTS, "if gain.mean() < REFUTED and", "if False and", OTHER_POSES),
-    of_host("doubts: not asked", "scenes/extent/conventions.py", "        warnings += doubts(photographs, poses, agreement)\n", "        pass\n", OTHER_POSES),
+    of_host("doubts: not asked", "scenes/extent/conventions.py", "        warnings += doubts(photographs)\n", "        pass\n", OTHER_POSES),
     of_host("w last: w second", "scenes/extent/conventions.py", "np.roll(quaternions(to_camera), 1, axis=1)", "np.roll(quaternions(to_camera), 2, axis=1)", READ_AS),
     of_host("w last: positions as they were", "scenes/extent/conventions.py", "-turned @ moved], axis=2)", "poses[:, :, 3:]], axis=2)", READ_AS),
     of_host("widths: no bend", SPACES, "k = np.where(n > 1.0, (ahead - s) / (n * ahead), 0.0)", "k = 0.0 * n", WIDTHS),
@@ -171,14 +171,14 @@ MUTANTS = [
     of_host("bounds: any are right", GIVEN, "support >= SUPPORTED:\n        return bounds", "support >= 0.0:\n        return bounds", BOUNDS),
     of_host("bounds: never right", GIVEN, "SUPPORTED = 0.7", "SUPPORTED = 1.5",
             "scenes/test_given_depths.py::test_bounds_that_hold_what_photographs_show_are_used"),
-    of_host("bounds: photographs that fit nothing", GIVEN, " and photographs.agreement(photographs.poses).fits", "",
+    of_host("bounds: photographs that fit nothing", CONSISTENCY, " and self.agreement.fits", "",
             "scenes/test_given_depths.py::test_photographs_that_fit_nothing_refute_no_depths"),
     of_host("depth maps: the other way", GIVEN, "1.0 / (unit * sampled", "unit / (1.0 * sampled", UNIT),
     of_host("depth maps: no inverse ones", GIVEN, "REFUTED = 0.5", "REFUTED = 0.0",
             "scenes/test_given_depths.py::test_inverse_depths_and_depths_of_others_are_told"),
     of_host("depth maps: of a pinhole", GIVEN, "camera.distort((middles * size - centre) / focal)[0]", "((middles * size - centre) / focal)",
             "scenes/test_given_depths.py::test_a_map_is_read_where_the_lens_shows_what_a_pinhole_does"),
-    of_host("sweep: the far end is tried alone", "scenes/extent/photo_consistency.py", "found[DEPTHS:].max(axis=0)", "found[DEPTHS]",
+    of_host("sweep: the far end is tried alone", CONSISTENCY, "found[DEPTHS:].max(axis=0)", "found[DEPTHS]",
             "scenes/test_given_depths.py::test_bounds_that_hold_what_photographs_show_are_used"),
     of_host("photographs: alike is the same", DIAGNOSTICS, "if moved and np.array_equal(other.image, view.image):", "if moved:", FROZEN),
     of_host("photographs: at any poses", DIAGNOSTICS, "if moved and np.", "if np.", FROZEN),

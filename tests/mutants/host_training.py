@@ -127,7 +127,7 @@ TRAINER, EXTENT, SMOOTHING = (
     "training/extent.py",
     "fields/total_variation.py",
 )
-NEAR = "fields/near_decay.py"
+NEAR, SKIPPED = "fields/near_decay.py", "training/free_space.py"
 PLANNED, GROWN = "training/plan.py", "training/growth.py"
 OPTIM, STATE, COARSE = (f"training/{name}.py" for name in ("optim", "state", "coarse"))
 SPACE_PLAN = "scenes/extent/space_plan.py"
@@ -137,10 +137,10 @@ RAYS, RENDER, JOINED = (f"rendering/{name}.py" for name in ("rays", "render", "l
 MARCH = "rendering/steps.py"
 
 MUTANTS = [
-    # trainer.py: what kernels get
-    of_host("one distance for every ray", TRAINER, "np.array(plan.content_distances),",
+    # trainer.py, free_space.py: what kernels get
+    of_host("one distance for every ray", SKIPPED, "np.array(plan.content_distances),",
             "np.full(len(plan.content_distances), plan.content_distance),", EACH_DISTANCE),
-    of_host("one distance for every ray, in a step", TRAINER, "np.array(plan.content_distances),",
+    of_host("one distance for every ray, in a step", SKIPPED, "np.array(plan.content_distances),",
             "np.full(len(plan.content_distances), plan.content_distance),", BOUNDED),
     of_host("no jacobian", TRAINER, "            self.config.jacobian,\n            self.workers,\n",
             "            \"none\",\n            self.workers,\n", CONTRACTED),
@@ -150,8 +150,8 @@ MUTANTS = [
     of_host("scaled where it shall not be", TRAINER,
             "            self.config.scaling,\n            self.config.jacobian,\n            self.workers,\n",
             "            \"clamped\",\n            self.config.jacobian,\n            self.workers,\n", PLAIN),
-    of_host("no jitter", TRAINER, "config.march.jitter,", "False,", BOUNDED),
-    of_host("always jitter", TRAINER, "config.march.jitter,", "True,", CONTRACTED),
+    of_host("no jitter", SKIPPED, "config.march.jitter,", "False,", BOUNDED),
+    of_host("always jitter", SKIPPED, "config.march.jitter,", "True,", CONTRACTED),
     of_host("distortion in scene units", TRAINER,
             "Objective(config=self.plan.losses, content_distance=self.plan.content_distance)",
             "Objective(config=self.plan.losses)", LOSSES),
@@ -169,17 +169,15 @@ MUTANTS = [
             "self._sampler.draw(self.steps_done, 1, (", SHARED),
     of_host("the same batch again", TRAINER, "self._sampler.draw(self.steps_done, n_steps, (",
             "self._sampler.draw(0, n_steps, (", SHARED),
-    of_host("another seed", TRAINER, "config.seed,\n            self.workers,\n        )\n        self.schedule",
-            "0,\n            self.workers,\n        )\n        self.schedule",
-            SEED),
+    of_host("another seed", SKIPPED, "config.seed,\n        workers,", "0,\n        workers,", SEED),
     of_host("weights of any seed", TRAINER, "first_weights(self.model, config.seed,", "first_weights(self.model, 0,", SEED),
     of_host("a random background is black", PLANNED, "\"random\": (1.0, 1.0, 1.0)",
             "\"random\": (0.0, 0.0, 0.0)", BEHIND),
-    of_host("random is white", TRAINER, "None if plan.random_background else plan.background",
+    of_host("random is white", SKIPPED, "None if plan.random_background else plan.background",
             "plan.background", BEHIND),
     of_host("before black, whatever they are", PLANNED, "\"white\" if scene.has_alpha else \"black\"",
             "\"black\"", BEHIND),
-    of_host("contracted space is left out", TRAINER, " and self.lattice.kind.bounded:", ":", ALL_DRAWN),
+    of_host("contracted space is left out", SKIPPED, " and lattice.kind.bounded:", ":", ALL_DRAWN),
     of_host("total variation as of one step", TRAINER, "self._updates, fraction, n_steps)",
             "self._updates, fraction, 1)", VARIATION),
     of_host("total variation of the grid that is", GROWN, "voxels=config.grid.n_nodes,",
@@ -195,7 +193,7 @@ MUTANTS = [
             "density_shift=grown.density_shift", SHIFT),
     of_host("one shift for all growths", TRAINER, "(grown - self._grown) * config", "grown * config", SHIFT),
     of_host("moments are kept", TRAINER, "            self._restarted = self._updates\n", "", GROWTH),
-    of_host("the box stays", GROWN, "return box_min + occupied[0] * edges, box_min + occupied[1] * edges",
+    of_host("the box stays", SKIPPED, "return box_min + occupied[0] * edges, box_min + occupied[1] * edges",
             "return box_min, box_max", GROWS),
     of_host("time does not count", TRAINER, "done = max(done, self._seconds / self.config.time_limit)", "pass", SECONDS),
     of_host("checkpoints at the end only", TRAINER, "if agreed.save and on_checkpoint is not None:",

@@ -30,7 +30,7 @@ PROSE: dict[str, str] = {
     r"(?:is|are) folded|folded (?:in|space|coordinates|box)": "contracted",
     r"what is odd|oddit(?:y|ies)|odd:": "diagnostics, warning",
     r"(?:One|The|one|the) door (?:to|of)|torch door": "entry point, interface",
-    r"in matter|opaque matter|no matter|(?:thin|dense|denser) matter": "density, medium, surface",
+    r"(?:in|opaque|all|no|thin|dense|denser) matter": "density, medium, surface",
     r"call(?:s|ed)? (?:\w+ ){0,3}off": "cancel",
     r"everyday": "default",
     r"pick(?:s|ed)? out": "select",

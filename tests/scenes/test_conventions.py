@@ -92,7 +92,7 @@ def misread(views: list[View], as_written: Callable[[np.ndarray], np.ndarray]) -
 
 
 def held(views: list[View], points: Points | None = None) -> tuple[list[View], Points | None, str]:
-    found, left, said = check_against_photographs(views, range(len(views)), points, False)
+    found, _, left, said = check_against_photographs(views, range(len(views)), points, False)
     return found, left, "; ".join(said)
 
 
@@ -224,11 +224,11 @@ def test_lenses_are_undone(bent: dict[str, Any], room: list[View]) -> None:
         inside = ((pixels >= 0) & (pixels < [96, 72])).all(axis=1)
         image[pixels[inside, 1], pixels[inside, 0]] = view.image.reshape(-1, 3)[inside]
         views.append(View(name=view.name, camera=camera, image=image))
-    agreement = [PhotoConsistency(v).agreement(PhotoConsistency(v).poses) for v in (views, room)]
+    agreement = [PhotoConsistency.of(v).agreement for v in (views, room)]
     undone = [replace(v, camera=replace(v.camera, k1=0.0, p1=0.0, fisheye=False)) for v in views]
-    without = PhotoConsistency(undone)
+    without = PhotoConsistency.of(undone).agreement
     assert agreement[0].gain.mean() > 0.6 * agreement[1].gain.mean()
-    assert agreement[0].found.mean() > without.agreement(without.poses).found.mean() + 0.03
+    assert agreement[0].found.mean() > without.found.mean() + 0.03
 
 
 def test_noise_and_few_or_small_photographs_tell_nothing() -> None:

@@ -13,7 +13,9 @@ from PIL import Image
 from tests.support.tiny_scenes import camera_at, look_at, picture, ring, save
 from warpnerf.scenes.builtin.room import photograph
 from warpnerf.scenes.cameras.undistort import directions
+from warpnerf.scenes.extent import photo_consistency
 from warpnerf.scenes.extent.given_depths import believed_bounds, doubted_depths, pixels_of
+from warpnerf.scenes.extent.photo_consistency import Agreement, PhotoConsistency
 from warpnerf.scenes.formats.load import load_scene
 from warpnerf.scenes.scene import View
 
@@ -35,20 +37,21 @@ def views() -> list[View]:
 def told(views: list[View], change: Any) -> str:
     """Of depth maps that are changed."""
     assert all(view.depth is not None for view in views)
-    return "; ".join(doubted_depths([replace(v, depth=change(v.depth)) for v in views]))
+    changed = [replace(view, depth=change(view.depth)) for view in views]
+    return "; ".join(doubted_depths(PhotoConsistency.of(changed)))
 
 
 @pytest.mark.parametrize("times", [0.8, 1.0, 1.25])
 def test_bounds_that_hold_what_photographs_show_are_used(views: list[View], times: float) -> None:
     bounds = times * np.tile([0.8, 4.5], (len(views), 1))
-    found, said = believed_bounds(views, range(1, len(views)), bounds)
+    found, said = believed_bounds(PhotoConsistency.of(views[1:]), views, bounds)
     assert found is bounds and said == []
 
 
 @pytest.mark.parametrize("times", [1e-3, 0.1, 10.0, 1e3])
 def test_bounds_in_other_units_are_not_used(views: list[View], times: float) -> None:
     bounds = times * np.tile([0.8, 4.5], (len(views), 1))
-    found, said = believed_bounds(views, range(1, len(views)), bounds)
+    found, said = believed_bounds(PhotoConsistency.of(views[1:]), views, bounds)
     assert found is None
     (said,) = said
     assert said.startswith("bounds of depth are not used: what the photographs show is not found")
@@ -67,10 +70,11 @@ def test_photographs_that_fit_nothing_refute_no_depths() -> None:
         for k, pose in enumerate(ring(9))
     ]
     bounds = np.tile([1e3, 2e3], (9, 1))
-    found, said = believed_bounds(views, range(9), bounds)
+    noise = PhotoConsistency.of(views)
+    found, said = believed_bounds(noise, views, bounds)
     assert found is bounds and said == []
-    assert doubted_depths(views) == [] == doubted_depths(views[:3])
-    assert believed_bounds(views, range(9), None) == (None, [])
+    assert doubted_depths(noise) == [] == doubted_depths(PhotoConsistency.of(views[:3]))
+    assert believed_bounds(noise, views, None) == (None, [])
 
 
 def test_depth_maps_that_fit_are_believed(views: list[View]) -> None:
@@ -102,8 +106,17 @@ def test_inverse_depths_and_depths_of_others_are_told(views: list[View]) -> None
     assert told(views, lambda depth: np.full_like(depth, np.nan)) == ""
 
 
-def test_a_scene_file_tells_of_its_depths(views: list[View], tmp_path: Path) -> None:
-    """Metres that are read as millimetres, by .npy."""
+def test_a_scene_file_tells_of_its_depths(
+    views: list[View], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Metres that are read as millimetres, by .npy; nothing is compared twice."""
+    compared: list[bytes] = []
+
+    def agreement(**both: Any) -> Agreement:
+        compared.append(both["found"].tobytes())
+        return Agreement(**both)
+
+    monkeypatch.setattr(photo_consistency, "Agreement", agreement)
     frames = []
     for view in views:
         Image.fromarray(view.image).save(tmp_path / view.name)
@@ -124,5 +137,7 @@ def test_a_scene_file_tells_of_its_depths(views: list[View], tmp_path: Path) -> 
             tmp_path / "transforms.json",
             {**lens, "depth_unit_scale_factor": unit, "frames": frames},
         )
+        compared.clear()
         said = [text for text in load_scene(tmp_path).warnings if text.startswith("depth maps")]
         assert len(said) == warnings
+        assert len(compared) == len(set(compared)) > 0

@@ -173,7 +173,7 @@ def render_command(
         views = load_run_scene(config, scene, threads)
         named = _still_cameras(views, options)
         cameras = list(named.values())
-        what = f"{len(cameras)} views"
+        what = f"{len(cameras)} view{'s' if len(cameras) > 1 else ''}"
     width, height = cameras[0].width, cameras[0].height
     shown, said = None, ""
     if "depth" in options.show:

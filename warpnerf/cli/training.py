@@ -191,6 +191,6 @@ def describe(scene: Scene, trainer: Trainer) -> None:
     print(f"  the field is {plan.config.field.name}, rays are {plan.sampler.past}")
     space = trainer.lattice.space  # of an object that is resumed, tighter than the plan's
     print(f"  box {in_words(space, space.kind.words)}")
-    if trainer.steps_done == 0:
+    if trainer.steps_done == 0 and plan.config.field.as_fine_as_nodes:
         print(f"  voxels {plan.voxel_pixels}")
     sys.stdout.flush()

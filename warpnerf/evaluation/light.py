@@ -88,7 +88,7 @@ def absorbed(
     Returns:
         [n, 4] float64; each row sums to 1.
     """
-    whole = field.up_to(math.inf)  # marched, and all matter that is there
+    whole = field.up_to(math.inf)  # marched: also densities that hardly any light reaches
     limits = np.outer(depths.astype(np.float64), (0.0, FRONT, BEHIND, math.inf))
     light, shares = np.ones(len(depths)), []
     for ends in (limits[:, :2], limits[:, 1:3], limits[:, 2:]):

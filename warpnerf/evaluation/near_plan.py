@@ -63,7 +63,7 @@ def near_plan(field: Field, scene: Scene) -> NearPlan | None:
     n = int(np.clip(math.ceil(extent * ACROSS / (2.0 * radius)), 1, MAX_CELLS))
     cells = (np.arange(n) + 0.5) * extent / n - 0.5 * extent
     depths = np.full((n, n), np.nan)
-    whole = field.up_to(math.inf)  # marched, and all matter that is there
+    whole = field.up_to(math.inf)  # marched: also densities that hardly any light reaches
     near = whole.steps.near
     for place in places:
         apart = np.hypot(

@@ -50,7 +50,7 @@ class FreeCells:
         alpha_min: float,
         sampler: Sampler = STEPS,
     ) -> FreeCells:
-        """Look a field over.
+        """Compute the occupancy grid of a field.
 
         Args:
             storage: What it is stored in.

@@ -199,7 +199,8 @@ class Inspection:
                     f"very roughly {duration(cost.seconds)} on {cost.threads} CPU threads",
                 )
             )
-            rows.append((f"voxels, {name}", str(cost.plan.voxel_pixels)))
+            if cost.plan.config.field.as_fine_as_nodes:
+                rows.append((f"voxels, {name}", str(cost.plan.voxel_pixels)))
         rows += [("warning", finding) for finding in self.diagnostics] or [("warnings", "none")]
         return "\n".join([scene.name, *(f"  {name:17} {text}" for name, text in rows)])
 

@@ -275,5 +275,5 @@ def crossings(
 
 
 def _marched(member: Member) -> Field:
-    """All matter that a field holds, as ``Field.up_to`` has it."""
+    """All that a field holds, as ``Field.up_to`` has it."""
     return member().up_to(np.inf)

@@ -25,7 +25,7 @@ from warpnerf.scenes.images.pixel_file import expect_random_reads
 from warpnerf.scenes.scene import View
 
 MOST_BLOCKS = 2**20
-"""Blocks of pixels in all photographs together: looking all of them over takes under a second."""
+"""Blocks of pixels in all photographs together: testing all of them takes under a second."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -38,6 +38,10 @@ UNREAD_ENDINGS = (
 
 REDUCED = re.compile(r"images_\d{1,3}", re.IGNORECASE)
 """Names of folders of a scene's photographs, reduced."""
+PHOTOGRAPHS = re.compile(rf"images|{REDUCED.pattern}|input", re.IGNORECASE)
+"""Names of folders of a scene's photographs, as programs call them."""
+ANY_PHOTOGRAPHS = re.compile(rf"{PHOTOGRAPHS.pattern}|image|rgb|train|test|val", re.IGNORECASE)
+"""The same, and what data sets call them: by a split, or as colours beside depths."""
 MASKS = re.compile(r"(.*[_-])?masks?", re.IGNORECASE)
 DEPTHS = re.compile(r"(.*[_-])?depths?([_-]?maps?)?", re.IGNORECASE)
 """Names of folders of masks and of depth maps."""

@@ -10,7 +10,6 @@ import warp as wp
 
 from warpnerf.config import TrainConfig
 from warpnerf.fields.lattice import Lattice
-from warpnerf.fields.occupancy import FreeCells
 from warpnerf.fields.parameters import Parameter
 from warpnerf.fields.storage import Storage, TrainedOn, require_memory
 from warpnerf.fields.storages import class_of
@@ -76,21 +75,6 @@ def first_storage(plan: TrainingPlan, device: wp.Device) -> Storage:
         density_shift=math.log(math.expm1(-math.log1p(-config.grid.alpha_init))),
         density_scale=1.0 / voxel,
     )
-
-
-def occupied_box(lattice: Lattice, free: FreeCells) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of the box around what is occupied, [3] each; never larger than before.
-
-    Args:
-        lattice: Not in contracted space.
-        free: What of it is not occupied.
-    """
-    box_min, box_max = lattice.box_min, lattice.box_max
-    occupied = free.occupied_range()
-    if occupied is None:
-        return box_min, box_max
-    edges = box_max - box_min
-    return box_min + occupied[0] * edges, box_min + occupied[1] * edges
 
 
 def grown_storage(

@@ -16,24 +16,22 @@ from warpnerf.fields.occupancy import FreeCells
 from warpnerf.fields.parameters import Parameter, first_weights, head_parameters
 from warpnerf.fields.storage import Regulariser
 from warpnerf.model.interface import Model
-from warpnerf.model.storage_kinds import parts_of
 from warpnerf.rendering.field import Field
 from warpnerf.rendering.losses import Objective
-from warpnerf.rendering.rays import PixelSampler, RayBatch
+from warpnerf.rendering.rays import RayBatch
 from warpnerf.rendering.render import TrainingPass
 from warpnerf.rendering.steps import Steps
-from warpnerf.rendering.structs import march_struct
 from warpnerf.runtime.memory import release_free_memory
 from warpnerf.runtime.parallel import Workers
 from warpnerf.scenes.extent.points import ObservedExtent, with_extent
 from warpnerf.scenes.scene import Scene
 from warpnerf.training.exposure import STATE, Exposures, exposures_of
 from warpnerf.training.extent import march_steps, require_samples
+from warpnerf.training.free_space import cull_background, free_cells, occupied_box, pixel_sampler
 from warpnerf.training.growth import (
     first_storage,
     grown_states,
     grown_storage,
-    occupied_box,
     require_room,
     trained_on,
 )
@@ -85,7 +83,7 @@ class Trainer:
 
         Raises:
             InputError: The device is missing, the grid would not fit the memory, or scene or
-                configuration are not those of the training to be resumed, or scene and sight not
+                configuration are not those of the training to be resumed, or scene and extent not
                 those of the plan.
         """
         self._given = scene
@@ -113,15 +111,7 @@ class Trainer:
         if resume is None:
             require_samples(scene, plan.space, config.march)
         self.steps_done = 0
-        self._sampler = PixelSampler(
-            [scene.views[i] for i in scene.splits["train"]],
-            np.array(plan.content_distances),
-            None if plan.random_background else plan.background,
-            config.rays_per_step,
-            config.march.jitter,
-            config.seed,
-            self.workers,
-        )
+        self._sampler = pixel_sampler(scene, plan, self.workers)
         self.schedule = plan.schedule
         self._grown = 0
         self._updates = 0
@@ -149,9 +139,7 @@ class Trainer:
         if self.exposures is not None:
             self._sampler.take_out_exposures(self.exposures.gains, self.exposures.offsets)
         self._occupied = self.free.share()
-        self._seen = 1.0
-        if resume is not None:
-            self._keep_to_what_is_seen()
+        self._seen = self._cull_background()
         self._pass = self._training_pass()
         self._regularise_lattice()
 
@@ -463,21 +451,11 @@ class Trainer:
         if self.steps_done < FIRST_LOOK:
             return
         self._find_free_space()
-        self._keep_to_what_is_seen()
+        self._seen = self._cull_background()
 
-    def _keep_to_what_is_seen(self) -> None:
-        """Cull the background: draw no pixels whose rays meet free space only.
-
-        In contracted space all see something.
-
-        A single cell tells nothing: it is what there is before the first look, too.
-        """
-        looked = self.free.size != (1, 1, 1)
-        if looked and self.config.skip_empty_rays and self.lattice.kind.bounded:
-            self._seen = self._sampler.cull_background(self.lattice, self.free)
+    def _cull_background(self) -> float:
+        return cull_background(self._sampler, self.config, self.lattice, self.free)
 
     def _find_free_space(self) -> None:
-        march = march_struct(self.model, "float32", self.march_steps(), self.workers)
-        sampler = parts_of(self.model, "float32", self.config.field).sampler
-        self.free = FreeCells.of(self.storage, self.workers, march, self.config.alpha_min, sampler)
+        self.free = free_cells(self.config, self.storage, self.march_steps(), self.workers)
         self._occupied = self.free.share()

@@ -18,7 +18,7 @@ from warpnerf.scenes.cameras.focus import find_focus
 from warpnerf.scenes.cameras.overlap import in_picture
 from warpnerf.scenes.cameras.quaternions import quaternions, rotations
 from warpnerf.scenes.extent.doubts import doubts
-from warpnerf.scenes.extent.photo_consistency import ALMOST_ALL, Agreement, PhotoConsistency
+from warpnerf.scenes.extent.photo_consistency import ALMOST_ALL, PhotoConsistency
 from warpnerf.scenes.extent.points import Points
 from warpnerf.scenes.scene import View
 
@@ -89,7 +89,7 @@ READINGS: dict[str, Poses] = {
 
 def check_against_photographs(
     views: Sequence[View], training: Sequence[int], points: Points | None, is_object: bool
-) -> tuple[list[View], Points | None, list[str]]:
+) -> tuple[list[View], PhotoConsistency, Points | None, list[str]]:
     """Detect the coordinate conventions of poses and points, by what the photographs show.
 
     What stands in the files is changed only where the photographs refute it and agree with another
@@ -103,36 +103,32 @@ def check_against_photographs(
             nothing to ask.
 
     Returns:
-        The views and points that fit, and warnings of what was changed or left out, but for points
-        that were only tried.
+        The views that fit; the photographs of the training, posed as these; the points that fit;
+        and warnings of what was changed or left out, but for points that were only tried.
     """
+    photographs = PhotoConsistency.of([views[i] for i in training])
     if is_object and points is None and _look_at_one_thing([views[i].camera for i in training]):
-        return list(views), None, []
-    photographs = PhotoConsistency([views[i] for i in training])
-    poses = photographs.poses
+        return list(views), photographs, None, []
     if points is not None and not len(points.positions):
         points = None
-    agreement = photographs.agreement(poses) if photographs.can_tell else None
-    name = _reading(photographs, agreement, points)
+    name = _reading(photographs, points)
     warnings = []
     if name is not None:
         read = READINGS[name]
         every = read(np.array([view.camera.c2w for view in views]))
         views = [view.posed(pose) for view, pose in zip(views, every, strict=True)]
-        poses = read(poses)
-        evidence = "points" if agreement is None else "photographs"
+        photographs = photographs.posed(read(photographs.poses))
+        evidence = "photographs" if photographs.can_tell else "points"
         warnings.append(
             f"poses are read as {name}: so the {evidence} fit each other, and not as camera to "
             "world in OpenGL axes; convert them, if other programs shall read them"
         )
-        agreement = None if agreement is None else photographs.agreement(poses)
-    if agreement is not None:
-        warnings += doubts(photographs, poses, agreement)
+    if photographs.can_tell:
+        warnings += doubts(photographs)
     if points is not None:
-        told = photographs if agreement is not None and agreement.fits else None
-        points, why = _believed(told, poses, _posed(photographs.cameras, poses), points)
+        points, why = _believed(photographs, points)
         warnings += why
-    return list(views), points, warnings
+    return list(views), photographs, points, warnings
 
 
 def _look_at_one_thing(cameras: Sequence[Camera]) -> bool:
@@ -142,57 +138,44 @@ def _look_at_one_thing(cameras: Sequence[Camera]) -> bool:
         return False
 
 
-def _reading(
-    photographs: PhotoConsistency, agreement: Agreement | None, points: Points | None
-) -> str | None:
+def _reading(photographs: PhotoConsistency, points: Points | None) -> str | None:
     """The other way to read poses that photographs, or else points, prove; None: as they stand.
 
     Where photographs fit as the poses stand, only OpenCV's axes are tried: for cameras that move
     along a line nearly parallel to each other, these fit nearly as well.
     """
-    poses, cameras = photographs.poses, photographs.cameras
+    poses = photographs.poses
     shares = {}
     if points is not None:
         sample = _sample(points)
         shares = {
-            name: _share_seen(_posed(cameras, read(poses)), sample)
+            name: _share_seen(photographs.posed(read(poses)).cameras, sample)
             for name, read in {"": lambda given: given, **READINGS}.items()
         }
-    if agreement is None:
+    if not photographs.can_tell:
         found = max(READINGS, key=lambda name: shares.get(name, 0.0))
         told = bool(shares) and shares[""] < UNSEEN and shares[found] > SEEN
         return found if told else None
-    better = {}
+    agreement, better = photographs.agreement, {}
     for name in (OPENCV,) if agreement.fits else READINGS:
-        other = photographs.agreement(READINGS[name](poses))
+        other = photographs.posed(READINGS[name](poses)).agreement
         refuted = bool(shares) and shares[name] < 0.5 * shares[""]
         if not refuted and other.is_better(agreement):
             better[name] = float(other.gain.mean())
     return max(better, key=lambda name: better[name]) if better else None
 
 
-def _believed(
-    photographs: PhotoConsistency | None,
-    poses: np.ndarray,
-    cameras: Sequence[Camera],
-    points: Points,
-) -> tuple[Points | None, list[str]]:
-    """Points in the cameras' axes and units, if there are such, and what to say of them.
-
-    Args:
-        photographs: That fit their poses; None: they tell nothing.
-        poses: [n, 3, 4] of the cameras that are looked at.
-        cameras: These.
-        points: As they stand.
-    """
+def _believed(photographs: PhotoConsistency, points: Points) -> tuple[Points | None, list[str]]:
+    """Points in the cameras' axes and units, if there are such, and what to say of them."""
+    cameras, tell = photographs.cameras, photographs.tell_depths
     share = _share_seen(cameras, _sample(points))
-    support = None if photographs is None else photographs.support(poses, points.positions)
+    support = photographs.support(points.positions) if tell else None
     near = AS_NEAR_AS <= _times_as_far(cameras, points.positions) <= AS_FAR_AS
     good = support is None or support >= SUPPORTED
     if share >= SEEN and good and near:
         return points, []
-    if photographs is not None:
-        moved = _moved(photographs, poses, cameras, points.positions, share, support or 0.0)
+    if tell:
+        moved = _moved(photographs, points.positions, share, support or 0.0)
         if moved is not None:
             how, positions = moved
             return replace(points, positions=positions), [
@@ -212,14 +195,10 @@ def _believed(
 
 
 def _moved(
-    photographs: PhotoConsistency,
-    poses: np.ndarray,
-    cameras: Sequence[Camera],
-    positions: np.ndarray,
-    share: float,
-    support: float,
+    photographs: PhotoConsistency, positions: np.ndarray, share: float, support: float
 ) -> tuple[str, np.ndarray] | None:
     """Points with axes exchanged, mirrored and scaled so that they surely fit; None: in no way."""
+    cameras = photographs.cameras
     sample = positions[:: max(1, -(-len(positions) // LOOKED_AT))]
     for scale in SCALES:
         if not AS_NEAR_AS <= _times_as_far(cameras, scale * sample) <= AS_FAR_AS:
@@ -230,14 +209,14 @@ def _moved(
                 continue
             seen = _share_seen(cameras, scale * sample[:, order] * signs)
             if seen >= max(SEEN, ALMOST_ALL * share):
-                fit = photographs.support(poses, scale * sample[:, order] * signs, EVERY)
+                fit = photographs.support(scale * sample[:, order] * signs, EVERY)
                 rated.append((seen * (fit or 0.0), seen, order, signs))
         rated.sort(key=lambda entry: -entry[0])
         if not rated:
             continue
         _, seen, order, signs = rated[0]
         found = scale * positions[:, order] * signs
-        fit = photographs.support(poses, found) or 0.0
+        fit = photographs.support(found) or 0.0
         enough = BETTER if share >= SEEN else 0.0
         rival = rated[1][0] if len(rated) > 1 else 0.0
         if fit >= max(SURELY, support + enough) and rival < RUNNER_UP * rated[0][0]:
@@ -257,10 +236,6 @@ def _in_words(scale: float, order: Sequence[int], signs: Sequence[float]) -> str
         f"{'-' if s < 0.0 else ''}{'xyz'[k]}" for k, s in zip(order, signs, strict=True)
     )
     return f"({axes})" if scale == 1.0 else f"{scale:g} ({axes})"
-
-
-def _posed(cameras: Sequence[Camera], poses: np.ndarray) -> list[Camera]:
-    return [replace(camera, c2w=pose) for camera, pose in zip(cameras, poses, strict=True)]
 
 
 def _sample(points: Points) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from warpnerf.scenes.extent.photo_consistency import Agreement, PhotoConsistency
+from warpnerf.scenes.extent.photo_consistency import PhotoConsistency
 
 REFUTED = 0.08
 """Mean gain below which photographs do not fit their poses: captures of cameras that are CLOSE have
@@ -25,25 +25,19 @@ PEAK = 0.85
 turn, any focal length fits: depths make up for it."""
 
 
-def doubts(photographs: PhotoConsistency, poses: np.ndarray, agreement: Agreement) -> list[str]:
-    """Warnings of focal lengths, or else poses, that photographs refute.
-
-    Args:
-        photographs: Some of the training.
-        poses: [n, 3, 4] of these, as they are used, camera to world in OpenGL axes.
-        agreement: With these.
-    """
-    gain = agreement.gain
+def doubts(photographs: PhotoConsistency) -> list[str]:
+    """Warnings of focal lengths, or else poses, that photographs of the training refute."""
+    gain = photographs.agreement.gain
     if len(gain) < ENOUGH or gain.mean() >= UNSURE:
         return []
-    zoom = _zoom(photographs, poses, agreement)
+    zoom = _zoom(photographs)
     if zoom is not None:
         return [
             "focal lengths do not fit the photographs, which fit each other with about "
             f"{zoom * FINER[0]:.2g} to {zoom * FINER[1]:.2g} times as much; correct them: they may "
             "be those of photographs of another size, or in millimetres"
         ]
-    if gain.mean() < REFUTED and photographs.apart(poses) <= CLOSE:
+    if gain.mean() < REFUTED and photographs.apart() <= CLOSE:
         return [
             "photographs do not fit their poses: what one shows is not found in its neighbours, at "
             "any depth; poses, focal lengths or the order of the photographs are likely wrong"
@@ -51,17 +45,17 @@ def doubts(photographs: PhotoConsistency, poses: np.ndarray, agreement: Agreemen
     return []
 
 
-def _zoom(photographs: PhotoConsistency, poses: np.ndarray, agreement: Agreement) -> float | None:
+def _zoom(photographs: PhotoConsistency) -> float | None:
     """How many times the focal length photographs prove; None: they do not."""
-    zoom, best = 1.0, agreement
+    zoom, best = 1.0, photographs.agreement
     for steps in (ZOOMS, FINER):
         middle = zoom
         for step in steps:
-            other = photographs.zoomed(middle * step).agreement(poses)
-            if other.is_better(agreement) and other.gain.mean() > best.gain.mean():
+            other = photographs.zoomed(middle * step).agreement
+            if other.is_better(photographs.agreement) and other.gain.mean() > best.gain.mean():
                 zoom, best = float(middle * step), other
     if zoom == 1.0:
         return None
-    beside = [photographs.zoomed(zoom * factor).agreement(poses) for factor in (0.5, 2.0)]
+    beside = [photographs.zoomed(zoom * factor).agreement for factor in (0.5, 2.0)]
     sharp = max(other.gain.mean() for other in beside) <= PEAK * best.gain.mean()
     return zoom if sharp else None

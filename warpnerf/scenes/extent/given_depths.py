@@ -22,13 +22,13 @@ OBLIQUE = 1.5
 
 
 def believed_bounds(
-    views: Sequence[View], training: Sequence[int], bounds: np.ndarray | None
+    photographs: PhotoConsistency, views: Sequence[View], bounds: np.ndarray | None
 ) -> tuple[np.ndarray | None, list[str]]:
     """Depth bounds, unless the photographs refute them: what they show is found at other depths.
 
     Args:
-        views: All, as they are posed.
-        training: Indices of those that are looked at.
+        photographs: Of the training, as they are posed.
+        views: All.
         bounds: [n_views, 2] nearest and farthest depth, scene units; None: not known.
 
     Returns:
@@ -36,7 +36,6 @@ def believed_bounds(
     """
     if bounds is None:
         return None, []
-    photographs = PhotoConsistency([views[i] for i in training])
     of = {view.name: pair for view, pair in zip(views, bounds, strict=True)}
 
     def between(view: View, middles: np.ndarray, most: float) -> np.ndarray:
@@ -46,9 +45,9 @@ def believed_bounds(
         high = max(min(1.0 / near, most), low)
         return np.tile(np.linspace(low, high, DEPTHS)[:, None], len(middles))
 
-    if not _tell(photographs):
+    if not photographs.tell_depths:
         return bounds, []
-    support = photographs.support_of(photographs.poses, between)
+    support = photographs.support_of(between)
     if support is None or support >= SUPPORTED:
         return bounds, []
     near, far = np.median(bounds, axis=0)
@@ -59,17 +58,16 @@ def believed_bounds(
     ]
 
 
-def doubted_depths(views: Sequence[View]) -> list[str]:
+def doubted_depths(photographs: PhotoConsistency) -> list[str]:
     """Detect depth maps that the photographs refute, and the unit in which they would fit.
 
     Args:
-        views: That have depth, as they are posed.
+        photographs: That have depth, as they are posed.
 
     Returns:
         A warning, or none.
     """
-    photographs = PhotoConsistency(views)
-    if not _tell(photographs):
+    if not photographs.tell_depths:
         return []
     sampled: dict[str, np.ndarray] = {}
 
@@ -80,7 +78,7 @@ def doubted_depths(views: Sequence[View]) -> list[str]:
                 sampled[view.name] = view.depth[pixels_of(view.camera, middles)].astype(np.float64)
             return np.asarray(1.0 / (unit * sampled[view.name])[None])
 
-        found = photographs.support_of(photographs.poses, given)
+        found = photographs.support_of(given)
         return SUPPORTED if found is None else found
 
     own = support(1.0)
@@ -115,8 +113,3 @@ def pixels_of(camera: Camera, middles: np.ndarray) -> tuple[np.ndarray, np.ndarr
     pixels = camera.distort((middles * size - centre) / focal)[0] * focal + centre
     column, row = np.clip(pixels, 0, size - 1).astype(int).T
     return row, column
-
-
-def _tell(photographs: PhotoConsistency) -> bool:
-    """Whether photographs fit their poses, so that they tell depths."""
-    return photographs.can_tell and photographs.agreement(photographs.poses).fits

@@ -9,8 +9,8 @@ distortion.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -119,78 +119,85 @@ Given = Callable[[View, np.ndarray, float], np.ndarray]
 1 / distance of the sweep to those that are tried: [k, m] 1 / distance, NaN where not known."""
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
 class PhotoConsistency:
-    """Photographs of a scene, checked against poses and against points."""
+    """Photographs of a scene, checked against poses and against points.
 
-    def __init__(self, views: Sequence[View]) -> None:
-        """Choose photographs; each is read when it is first looked at.
+    Each is read when it is first looked at, and once for all poses that are tried.
+    """
 
-        Args:
-            views: Of the training.
-        """
-        self._views = list(views[:: max(1, -(-len(views) // VIEWS))])
-        self._pictures: dict[int, _Picture] = {}
-        self._zoom = 1.0
-        every = max(1, -(-len(self._views) // REFERENCES))
-        self.references = range(0, len(self._views), every)
-        """Indices of the chosen views whose patches are looked for."""
+    views: Sequence[View]
+    """Whose photographs these are."""
+    poses: np.ndarray
+    """[n, 3, 4] of these, camera to world in OpenGL axes, scene units."""
+    zoom: float = 1.0
+    """How many times their focal length the lenses have."""
+    _pictures: dict[int, _Picture] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, views: Sequence[View]) -> PhotoConsistency:
+        """Some of these views, as they are posed."""
+        chosen = views[:: max(1, -(-len(views) // VIEWS))]
+        return cls(views=chosen, poses=np.array([view.camera.c2w for view in chosen]))
+
+    @property
+    def references(self) -> range:
+        """Indices of the views whose patches are looked for."""
+        return range(0, len(self.views), max(1, -(-len(self.views) // REFERENCES)))
 
     @property
     def cameras(self) -> list[Camera]:
-        """Of the chosen views."""
-        return [view.camera for view in self._views]
-
-    @property
-    def poses(self) -> np.ndarray:
-        """[n, 3, 4] of the chosen views, camera to world in OpenGL axes, scene units."""
-        return np.array([view.camera.c2w for view in self._views])
+        """Of the views, as they are posed here."""
+        pairs = zip(self.views, self.poses, strict=True)
+        return [replace(view.camera, c2w=pose) for view, pose in pairs]
 
     @property
     def can_tell(self) -> bool:
         """Whether there are photographs enough, and large enough."""
-        sides = [min(camera.width, camera.height) for camera in self.cameras]
+        sides = [min(view.camera.width, view.camera.height) for view in self.views]
         return len(sides) >= FEWEST and min(sides) >= LEAST_SIDE
+
+    def posed(self, poses: np.ndarray) -> PhotoConsistency:
+        """The same photographs, had the cameras other poses [n, 3, 4]."""
+        return replace(self, poses=poses)
 
     def zoomed(self, factor: float) -> PhotoConsistency:
         """The same photographs, had their lenses so many times the focal length."""
-        other = copy(self)
-        other._zoom *= factor
-        return other
+        return replace(self, zoom=factor * self.zoom)
 
-    def apart(self, poses: np.ndarray) -> float:
+    def apart(self) -> float:
         """How far off the neighbours of a reference are, by the median; see ``neighbours``."""
+        poses = self.poses
         return float(
             np.median([_apart(poses, i)[neighbours(poses, i)].mean() for i in self.references])
         )
 
-    def agreement(self, poses: np.ndarray) -> Agreement:
-        """How well patches of all references are found again, had the cameras other poses.
-
-        Args:
-            poses: [n, 3, 4] of the chosen views.
-
-        Returns:
-            For references that have texture.
-        """
+    @cached_property
+    def agreement(self) -> Agreement:
+        """How well patches of all references that have texture are found again."""
         found: list[float] = []
         by_chance: list[float] = []
         for i in self.references:
             middles = self._textured(i, _grid(self._picture(i).gray.shape))
             if not len(middles):
                 continue
-            near = neighbours(poses, i)
-            inverse = np.tile(_inverse_depths(poses, i, near)[:, None], len(middles))
+            near = neighbours(self.poses, i)
+            inverse = np.tile(_inverse_depths(self.poses, i, near)[:, None], len(middles))
             shown = near, self._strangers(i, near)
-            matches = self._correlations(poses, i, near, shown, middles, inverse)
+            matches = self._correlations(i, near, shown, middles, inverse)
             for match, means in zip(matches, (found, by_chance), strict=True):
                 means.append(float(np.maximum(match.max(axis=0), 0.0).mean()))
         return Agreement(found=np.array(found), by_chance=np.array(by_chance))
 
-    def support_of(self, poses: np.ndarray, given: Given) -> float | None:
+    @property
+    def tell_depths(self) -> bool:
+        """Whether there are photographs enough that fit their poses."""
+        return self.can_tell and self.agreement.fits
+
+    def support_of(self, given: Given) -> float | None:
         """How well patches are found again at given depths, against the best depths of the sweep.
 
         Args:
-            poses: [n, 3, 4] of the chosen views.
             given: Tells the depths.
 
         Returns:
@@ -200,15 +207,15 @@ class PhotoConsistency:
         for i in self.references:
             height, width = self._picture(i).gray.shape
             middles = self._textured(i, _grid((height, width)))
-            near = neighbours(poses, i, FAR_APART)
-            inverse = _inverse_depths(poses, i, near)
-            tried = given(self._views[i], middles / [width, height], float(inverse[-1]))
+            near = neighbours(self.poses, i, FAR_APART)
+            inverse = _inverse_depths(self.poses, i, near)
+            tried = given(self.views[i], middles / [width, height], float(inverse[-1]))
             known = np.isfinite(tried).all(axis=0)
             if known.sum() < FEWEST_POINTS:
                 continue
             sweep = np.tile(inverse[:, None], int(known.sum()))
             both = np.concatenate([sweep, tried[:, known]])
-            (match,) = self._correlations(poses, i, near, [near], middles[known], both)
+            (match,) = self._correlations(i, near, [near], middles[known], both)
             found = np.maximum(match, 0.0)
             own.append(float(found[DEPTHS:].max(axis=0).mean()))
             best.append(float(found[:DEPTHS].max(axis=0).mean()))
@@ -216,11 +223,10 @@ class PhotoConsistency:
             return None
         return float(np.mean(own) / np.mean(best))
 
-    def support(self, poses: np.ndarray, points: np.ndarray, every: int = 1) -> float | None:
+    def support(self, points: np.ndarray, every: int = 1) -> float | None:
         """How well patches around points are found again at these, against their best depths.
 
         Args:
-            poses: [n, 3, 4] of the chosen views.
             points: [m, 3] scene units.
             every: Every which reference is looked at.
 
@@ -231,11 +237,11 @@ class PhotoConsistency:
         own, best = [], []
         chosen = self.references[::every]
         for i in chosen:
-            middles, away = self._foremost(poses[i], i, points)
-            near = neighbours(poses, i, FAR_APART)
-            sweep = np.tile(_inverse_depths(poses, i, near)[:, None], len(middles))
+            middles, away = self._foremost(i, points)
+            near = neighbours(self.poses, i, FAR_APART)
+            sweep = np.tile(_inverse_depths(self.poses, i, near)[:, None], len(middles))
             inverse = np.concatenate([sweep, 1.0 / away[None]])
-            (match,) = self._correlations(poses, i, near, [near], middles, inverse)
+            (match,) = self._correlations(i, near, [near], middles, inverse)
             seen = match[-1] > -1.0
             if seen.sum() >= FEWEST_POINTS:
                 own.append(float(match[-1, seen].mean()))
@@ -244,11 +250,9 @@ class PhotoConsistency:
             return None
         return max(0.0, float(np.mean(own) / np.mean(best)))
 
-    def _foremost(
-        self, pose: np.ndarray, i: int, points: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _foremost(self, i: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where a reference sees points with texture that others do not hide, and how far away."""
-        picture = self._picture(i)
+        picture, pose = self._picture(i), self.poses[i]
         local = (points - pose[:, 3]) @ pose[:, :3]
         pixels, front = _project(picture, local)
         height, width = picture.gray.shape
@@ -264,7 +268,6 @@ class PhotoConsistency:
 
     def _correlations(
         self,
-        poses: np.ndarray,
         i: int,
         near: Sequence[int],
         shown: Sequence[Sequence[int]],
@@ -274,7 +277,6 @@ class PhotoConsistency:
         """Correlations of patches of a reference with what its neighbours show at depths.
 
         Args:
-            poses: [n, 3, 4] of the chosen views.
             i: The reference.
             near: Its neighbours.
             shown: Whose photographs these show, one after the other: their own, or strangers'.
@@ -285,7 +287,7 @@ class PhotoConsistency:
             [len(shown), k, m] mean over the neighbours that see the patch there, -1 where none
             does.
         """
-        picture = self._picture(i)
+        picture, poses = self._picture(i), self.poses
         pixels = middles[:, None] + PATCH
         patch = _bilinear(picture.gray, pixels)
         rays = np.ones((*pixels.shape[:2], 3))
@@ -308,7 +310,7 @@ class PhotoConsistency:
 
     def _strangers(self, i: int, near: Sequence[int]) -> list[int]:
         """As many views as a reference has neighbours, spread evenly over those that are none."""
-        rest = [k for k in range(len(self._views)) if k != i and k not in near]
+        rest = [k for k in range(len(self.views)) if k != i and k not in near]
         return [rest[(2 * k + 1) * len(rest) // (2 * len(near))] for k in range(len(near))]
 
     def _textured(self, i: int, middles: np.ndarray) -> np.ndarray:
@@ -320,9 +322,9 @@ class PhotoConsistency:
 
     def _picture(self, i: int) -> _Picture:
         if i not in self._pictures:
-            self._pictures[i] = _reduced(self._views[i])
+            self._pictures[i] = _reduced(self.views[i])
         picture = self._pictures[i]
-        return picture if self._zoom == 1.0 else replace(picture, focal=self._zoom * picture.focal)
+        return picture if self.zoom == 1.0 else replace(picture, focal=self.zoom * picture.focal)
 
 
 def neighbours(poses: np.ndarray, i: int, least: float = APART) -> list[int]:

@@ -19,6 +19,7 @@ from warpnerf.scenes.cameras.undistort import seen_pixels
 from warpnerf.scenes.extent.conventions import check_against_photographs
 from warpnerf.scenes.extent.given_depths import believed_bounds, doubted_depths
 from warpnerf.scenes.extent.masked import inverted_masks, mask_notes
+from warpnerf.scenes.extent.photo_consistency import PhotoConsistency
 from warpnerf.scenes.extent.points import Points, extent_by_points
 from warpnerf.scenes.files import by_number, exists
 from warpnerf.scenes.formats.frame import Frame, lens_warnings, photograph_notes, with_masks_beside
@@ -47,6 +48,20 @@ HOLD_OUT = 8
 """Without a split in the file every 8th image is for testing, as in LLFF and Mip-NeRF 360."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Reading:
+    """How photographs are to be read, whatever the format."""
+
+    downscale: int
+    """Edge of the blocks of pixels that become one; 1 keeps photographs as they are."""
+    masks: Path | None
+    """Folder of masks for all photographs, which take the place of those that frames have."""
+    keeping: Keeping
+    """Where their pixels are kept, and how many threads read them."""
+    withhold: Split | None = None
+    """What for testing; None: as the capture says, else every 8th."""
+
+
 def assemble(
     *,
     folder: Path,
@@ -54,11 +69,8 @@ def assemble(
     frames: Sequence[Frame],
     splits: Mapping[str, set[str]],
     warnings: Sequence[str],
-    downscale: int,
-    masks: Path | None,
-    keeping: Keeping,
+    reading: Reading,
     points: Points | None = None,
-    withhold: Split | None = None,
 ) -> Scene:
     """Read the images and make the scene.
 
@@ -69,28 +81,27 @@ def assemble(
         splits: Names for "train", "test" and "val"; what is left out is filled in, see
             ``complete_splits``.
         warnings: Those so far; the result's begin with them.
-        downscale: Edge of the blocks of pixels that become one.
-        masks: Folder of masks, which take the place of those that frames have.
-        keeping: Where the images' pixels are kept, and how many threads read them.
+        reading: How photographs are to be read; what it withholds for testing takes the place of
+            ``splits``.
         points: Of the scene's surfaces, where there are some; tracks go by names of frames.
-        withhold: What for testing, in place of ``splits``.
 
     Raises:
         InputError: An image, a mask, the split or the placement of the cameras is of no use.
     """
     frames = sorted(frames, key=lambda frame: frame.name)
     names = [frame.name for frame in frames]
-    if withhold is None:
+    downscale, keeping = reading.downscale, reading.keeping
+    if reading.withhold is None:
         complete, notes = complete_splits(file, names, splits)
     else:
-        test, note = withheld(withhold, names, [frame.c2w for frame in frames])
+        test, note = withheld(reading.withhold, names, [frame.c2w for frame in frames])
         complete, notes = {"train": set(names) - test, "test": test}, [note]
     used = set().union(*complete.values())
     frames = [frame for frame in frames if frame.name in used]
     frames, reduced = with_reduced(frames, downscale)
     notes += reduced
-    if masks is not None:
-        found = masks_of_folder(masks, [frame.name for frame in frames])
+    if reading.masks is not None:
+        found = masks_of_folder(reading.masks, [frame.name for frame in frames])
         frames = [replace(frame, mask=mask) for frame, mask in zip(frames, found, strict=True)]
     else:
         unused = unused_masks(folder, frames)
@@ -141,15 +152,20 @@ def assemble(
     indices = {
         split: tuple(sorted(index[name] for name in names)) for split, names in complete.items()
     }
-    views, points, told = check_against_photographs(views, indices["train"], points, is_object)
+    views, photographs, points, told = check_against_photographs(
+        views, indices["train"], points, is_object
+    )
     warnings += told
+    training = [views[i] for i in indices["train"]]
     masks_left, cameras = [entry.mask for entry in left], [view.camera for view in views]
     notes += mask_notes(masks_left, cameras)
     mask_warnings += inverted_masks(masks_left, cameras, indices["train"])
-    bounds, refuted = believed_bounds(views, indices["train"], _bounds(frames, views))
+    bounds, refuted = believed_bounds(photographs, views, _bounds(frames, views))
     warnings += refuted
-    warnings += doubted_depths([views[i] for i in indices["train"] if left[i].depth is not None])
-    training = [views[i] for i in indices["train"]]
+    deep = [views[i] for i in indices["train"] if left[i].depth is not None]
+    warnings += doubted_depths(
+        photographs if len(deep) == len(training) else PhotoConsistency.of(deep)
+    )
     unbounded = not is_object
     transparent = {view.name for view, see in zip(views, kept.see_through, strict=True) if see}
     try:

@@ -10,12 +10,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from warpnerf.scenes.files import exists
-from warpnerf.scenes.formats.assemble import assemble
+from warpnerf.scenes.formats.assemble import Reading, assemble
 from warpnerf.scenes.formats.frame import Frame
 from warpnerf.scenes.formats.transforms import read_frames
-from warpnerf.scenes.images.photographs import KEEPING, Keeping
 from warpnerf.scenes.scene import Scene
-from warpnerf.scenes.split import Split
 
 SPLITS = ("train", "val", "test")
 
@@ -63,24 +61,14 @@ def is_frames(file: Path) -> bool:
     return b'"frames"' in head and b'"transform_matrix"' in head
 
 
-def load_blender(
-    folder: Path,
-    *,
-    downscale: int = 1,
-    masks: Path | None = None,
-    keeping: Keeping = KEEPING,
-    withhold: Split | None = None,
-) -> Scene:
+def load_blender(folder: Path, reading: Reading) -> Scene:
     """Load a scene from transforms_train.json and its siblings.
 
     Without transforms_test.json, or without its images, every 8th training image is for testing.
 
     Args:
         folder: The scene's folder; image paths are relative to it and stay inside it.
-        downscale: Edge of the blocks of pixels that become one.
-        masks: Folder of masks for all photographs.
-        keeping: Where the images' pixels are kept.
-        withhold: What for testing; None: as the capture says.
+        reading: How photographs are to be read.
 
     Raises:
         InputError: Something in the files or the images is wrong; the message names it.
@@ -105,8 +93,5 @@ def load_blender(
         frames=list(frames.values()),
         splits=splits,
         warnings=warnings,
-        downscale=downscale,
-        masks=masks,
-        keeping=keeping,
-        withhold=withhold,
+        reading=reading,
     )

@@ -25,7 +25,7 @@ from warpnerf.scenes.files import (
     printable,
     require_regular_file,
 )
-from warpnerf.scenes.formats.assemble import assemble
+from warpnerf.scenes.formats.assemble import Reading, assemble
 from warpnerf.scenes.formats.colmap_files import (
     PARAMETERS,
     ModelCamera,
@@ -55,9 +55,7 @@ from warpnerf.scenes.formats.frame_images import (
 from warpnerf.scenes.formats.split_lists import read_split_lists
 from warpnerf.scenes.formats.unnamed_photographs import unnamed_photographs
 from warpnerf.scenes.images.masks import mask_in
-from warpnerf.scenes.images.photographs import KEEPING, Keeping
 from warpnerf.scenes.scene import Scene
-from warpnerf.scenes.split import Split
 
 SAME = 0.02
 """Largest difference of two cameras that are one: in spreads of all, and of unit vectors."""
@@ -76,14 +74,7 @@ def _require_once(file: Path, images: Sequence[ModelImage]) -> None:
             )
 
 
-def load_colmap(
-    model: Path,
-    *,
-    downscale: int = 1,
-    masks: Path | None = None,
-    keeping: Keeping = KEEPING,
-    withhold: Split | None = None,
-) -> Scene:
+def load_colmap(model: Path, reading: Reading) -> Scene:
     """Load a scene from a sparse model.
 
     Every 8th photograph is for testing. Box and content distance are those of the model's points,
@@ -91,10 +82,7 @@ def load_colmap(
 
     Args:
         model: Folder of cameras.bin and images.bin, or of cameras.txt and images.txt.
-        downscale: Edge of the blocks of pixels that become one.
-        masks: Folder of masks for all photographs.
-        keeping: Where the images' pixels are kept.
-        withhold: What for testing; None: as the capture says.
+        reading: How photographs are to be read.
 
     Returns:
         The scene; distances are the model's.
@@ -207,10 +195,7 @@ def load_colmap(
         frames=frames,
         splits=splits,
         warnings=warnings,
-        downscale=downscale,
-        masks=masks,
-        keeping=keeping,
-        withhold=withhold,
+        reading=reading,
         points=points,
     )
     return replace(scene, notes=(*notes, *scene.notes))

@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from warpnerf.checks import InputError
-from warpnerf.scenes.files import ENDINGS, UNREAD_ENDINGS, exists, printable
+from warpnerf.scenes.files import ANY_PHOTOGRAPHS, ENDINGS, UNREAD_ENDINGS, exists, printable
 from warpnerf.scenes.formats import llff
 from warpnerf.scenes.formats.blender import SPLITS, other_transforms, split_file
 from warpnerf.scenes.formats.colmap_models import find_model, model_kind
@@ -43,9 +43,6 @@ POSES_IN_TEXT = re.compile(
 and, for exchange between programs, of ContextCapture."""
 LOOKED_AT = 4096
 """Bytes at the beginning of a text, and texts at a place, at most, that are looked at."""
-
-IMAGES = re.compile(r"images?(_\d{1,3})?|input|rgb|train|test|val", re.IGNORECASE)
-"""Folders of photographs in a scene's."""
 
 NEEDED = 3
 """Photographs, at least, whose poses can be estimated."""
@@ -207,7 +204,7 @@ def _poses_nearby(folder: Path) -> str | None:
             name = printable(models[0].relative_to(folder).as_posix())
             return f"its COLMAP model is in {name}; use {_quoted(models[0])}"
     above = folder.absolute().parent
-    if IMAGES.fullmatch(folder.name) and holds_scene(above):
+    if ANY_PHOTOGRAPHS.fullmatch(folder.name) and holds_scene(above):
         return (
             f"it is a folder of the scene {printable(above.name)}; use {_quoted(above)}, or "
             f"estimate other poses by {pose_command(_quoted(folder))}"

@@ -27,15 +27,13 @@ from warpnerf.scenes.files import (
     printable,
     resolve_inside,
 )
-from warpnerf.scenes.formats.assemble import POSED, assemble
+from warpnerf.scenes.formats.assemble import POSED, Reading, assemble
 from warpnerf.scenes.formats.frame import Frame
 from warpnerf.scenes.formats.left_over import only_ply, tried_points
 from warpnerf.scenes.formats.unnamed_photographs import photographs_left
 from warpnerf.scenes.images.depths import DepthFile
 from warpnerf.scenes.images.masks import without_masks
-from warpnerf.scenes.images.photographs import Keeping
 from warpnerf.scenes.scene import Scene
-from warpnerf.scenes.split import Split
 
 NO_PHOTOGRAPHS = re.compile(rf"{REDUCED.pattern}|{OTHER_IMAGES.pattern}", re.IGNORECASE)
 """Folders within one of photographs whose images are none, or are the same ones reduced."""
@@ -183,20 +181,6 @@ def _photographs_below(root: Path, within: bool, endings: tuple[str, ...] = ENDI
     return sorted(without_masks(found))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Reading:
-    """How photographs are to be read, whatever the format."""
-
-    downscale: int
-    """Edge of the blocks of pixels that become one."""
-    masks: Path | None
-    """Folder of masks for all photographs."""
-    keeping: Keeping
-    """Where their pixels are kept."""
-    withhold: Split | None = None
-    """What for testing; None: every 8th."""
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PosedCamera:
     """What another program knows of a photograph."""
@@ -267,10 +251,7 @@ def scene_of(
         frames=frames,
         splits={},
         warnings=[*warnings, *many, *more],
-        downscale=reading.downscale,
-        masks=reading.masks,
-        keeping=reading.keeping,
-        withhold=reading.withhold,
+        reading=reading,
         points=points,
     )
     tried = tried_points(points, scene)

@@ -10,6 +10,7 @@ from pathlib import Path
 from warpnerf.checks import InputError
 from warpnerf.scenes.files import (
     ENDINGS,
+    PHOTOGRAPHS,
     REDUCED,
     UNREAD_ENDINGS,
     OutsideError,
@@ -22,8 +23,6 @@ from warpnerf.scenes.files import (
 from warpnerf.scenes.formats.found_photographs import Photographs, normalised, without_ending
 from warpnerf.scenes.formats.frame import Frame
 
-OWN = re.compile(rf"images|{REDUCED.pattern}|input", re.IGNORECASE)
-"""Folders of photographs in a scene's folder, as programs call them."""
 RENDERINGS = re.compile(r"(.*[_-])?render(ing)?s?", re.IGNORECASE)
 """Folders of images that are photographs, as of a synthetic scene, only where a file says so."""
 
@@ -247,7 +246,7 @@ class _ByEnds:
         """Whether a photograph is in a folder that its name does not have, nor is one of
         photographs."""
         top = self._photographs.name(path).partition("/")[0]
-        return len(self._parts_of(path)) > len(_parts(name)) and not OWN.fullmatch(top)
+        return len(self._parts_of(path)) > len(_parts(name)) and not PHOTOGRAPHS.fullmatch(top)
 
     def _parts_of(self, path: Path) -> tuple[str, ...]:
         parts = _parts(self._photographs.name(path))

@@ -17,33 +17,21 @@ from warpnerf.checks import InputError
 from warpnerf.scenes.cameras.lens import Lens
 from warpnerf.scenes.cameras.poses import check_pose
 from warpnerf.scenes.files import photograph_folder, printable, resolve_inside
-from warpnerf.scenes.formats.assemble import assemble
+from warpnerf.scenes.formats.assemble import Reading, assemble
 from warpnerf.scenes.formats.found_photographs import Photographs
 from warpnerf.scenes.formats.frame import Frame
 from warpnerf.scenes.images.arrays import read_npy
-from warpnerf.scenes.images.photographs import KEEPING, Keeping
 from warpnerf.scenes.scene import Scene
-from warpnerf.scenes.split import Split
 
 FILE = "poses_bounds.npy"
 
 
-def load_llff(
-    folder: Path,
-    *,
-    downscale: int = 1,
-    masks: Path | None = None,
-    keeping: Keeping = KEEPING,
-    withhold: Split | None = None,
-) -> Scene:
+def load_llff(folder: Path, reading: Reading) -> Scene:
     """Load a scene from poses_bounds.npy. Every 8th photograph is for testing.
 
     Args:
         folder: The scene's folder, with images/ or images_4/, images_8/, ...
-        downscale: Edge of the blocks of pixels that become one.
-        masks: Folder of masks for all photographs.
-        keeping: Where the images' pixels are kept.
-        withhold: What for testing; None: as the capture says.
+        reading: How photographs are to be read.
 
     Returns:
         The scene; distances are the file's.
@@ -118,8 +106,5 @@ def load_llff(
         frames=frames,
         splits={},
         warnings=warnings,
-        downscale=downscale,
-        masks=masks,
-        keeping=keeping,
-        withhold=withhold,
+        reading=reading,
     )

@@ -7,18 +7,18 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 from warpnerf.checked import checked_arguments
 from warpnerf.checks import InputError, require_one_of
 from warpnerf.runtime.memory import require_threads
 from warpnerf.scenes.files import exists, printable
 from warpnerf.scenes.formats import llff
+from warpnerf.scenes.formats.assemble import Reading
 from warpnerf.scenes.formats.blender import is_frames, is_split, load_blender, split_file
 from warpnerf.scenes.formats.colmap import load_colmap
 from warpnerf.scenes.formats.colmap_models import find_model
 from warpnerf.scenes.formats.contents import VIDEOS, is_unposed, pose_command, what_is_there
-from warpnerf.scenes.formats.found_photographs import Reading
 from warpnerf.scenes.formats.npz import load_npz, single_npz
 from warpnerf.scenes.formats.part import ENDING, part_of, read_part
 from warpnerf.scenes.formats.programs import export_of, exports_in
@@ -96,29 +96,24 @@ def load_scene(
         raise InputError(
             f"{path}: does not exist; give a scene's folder, or a built-in scene ({BUILTIN_KNOWN})."
         )
-    how: dict[str, Any] = {
-        "downscale": downscale,
-        "masks": masks,
-        "keeping": keeping,
-        "withhold": split,
-    }
+    reading = Reading(downscale=downscale, masks=masks, keeping=keeping, withhold=split)
     if path.name.endswith(ENDING):
-        return _load_part(path, how)
+        return _load_part(path, reading)
     if path.is_dir():
-        return _load_folder(path, how)
+        return _load_folder(path, reading)
     if is_split(path):
-        return load_blender(path.parent, **how)
+        return load_blender(path.parent, reading)
     if re.fullmatch(r"transforms.*\.json", path.name):
-        return load_transforms(path, **how)
+        return load_transforms(path, reading)
     if path.name == llff.FILE:
-        return llff.load_llff(path.parent, **how)
+        return llff.load_llff(path.parent, reading)
     if path.suffix == ".npz":
-        return load_npz(path, **how)
+        return load_npz(path, reading)
     export = export_of(path)
     if export is not None:
-        return export.load(path, Reading(**how))
+        return export.load(path, reading)
     if path.suffix.lower() == ".json" and is_frames(path):
-        return load_transforms(path, **how)
+        return load_transforms(path, reading)
     if path.suffix.lower() in VIDEOS:
         command = pose_command(shlex.quote(str(path)))
         raise InputError(f"{path}: is a video, not a scene; make one of it by {command}.")
@@ -127,17 +122,17 @@ def load_scene(
     raise InputError(f"{path}: is not a scene; give its folder or a transforms*.json in it.")
 
 
-def _load_part(path: Path, how: dict[str, Any]) -> Scene:
-    part, keeping = read_part(path), how["keeping"]
+def _load_part(path: Path, reading: Reading) -> Scene:
+    part = read_part(path)
     whole = load_scene(
         part.part_of,
-        downscale=how["downscale"],
-        masks=how["masks"],
+        downscale=reading.downscale,
+        masks=reading.masks,
         images="files",
-        threads=keeping.threads,
-        split=part.split if how["withhold"] is None else how["withhold"],
+        threads=reading.keeping.threads,
+        split=part.split if reading.withhold is None else reading.withhold,
     )
-    return part_of(whole, part, path, keeping, how["downscale"])
+    return part_of(whole, part, path, reading.keeping, reading.downscale)
 
 
 def _with_split(scene: Scene, split: Split | None) -> Scene:
@@ -152,9 +147,9 @@ def _with_split(scene: Scene, split: Split | None) -> Scene:
     return replace(scene, splits=splits, notes=(note, *scene.notes))
 
 
-def _load_folder(folder: Path, how: dict[str, Any]) -> Scene:
+def _load_folder(folder: Path, reading: Reading) -> Scene:
     try:
-        scene = _first_of_folder(folder, how)
+        scene = _first_of_folder(folder, reading)
     except InputError as error:
         model = find_model(folder)
         if model is None or not str(error).startswith(str(folder / "transforms")):
@@ -168,22 +163,22 @@ def _load_folder(folder: Path, how: dict[str, Any]) -> Scene:
     return replace(scene, notes=(*scene.notes, note))
 
 
-def _first_of_folder(folder: Path, how: dict[str, Any]) -> Scene:
+def _first_of_folder(folder: Path, reading: Reading) -> Scene:
     """The scene of the first form that a folder has."""
     if exists(folder / split_file("train")):
-        return load_blender(folder, **how)
+        return load_blender(folder, reading)
     if exists(folder / "transforms.json"):
-        return load_transforms(folder / "transforms.json", **how)
+        return load_transforms(folder / "transforms.json", reading)
     model = find_model(folder)
     if model is not None:
-        return load_colmap(model, **how)
+        return load_colmap(model, reading)
     if exists(folder / llff.FILE):
-        return llff.load_llff(folder, **how)
+        return llff.load_llff(folder, reading)
     for export in exports_in(folder):
-        return export.load(export.path, Reading(**how))
+        return export.load(export.path, reading)
     archive = single_npz(folder)
     if archive is not None and not is_unposed(folder):
-        return load_npz(archive, **how)
+        return load_npz(archive, reading)
     raise InputError(
         f"{folder}: no scene found: {what_is_there(folder)}. A scene has {split_file('train')} "
         "(Blender), transforms.json (instant-ngp, nerfstudio), sparse/0 (COLMAP), "

@@ -20,11 +20,11 @@ from warpnerf.scenes.cameras.brown import brown_lens
 from warpnerf.scenes.cameras.lens import Lens
 from warpnerf.scenes.cameras.poses import check_pose
 from warpnerf.scenes.files import MAX_JSON_BYTES, printable, require_regular_file
+from warpnerf.scenes.formats.assemble import Reading
 from warpnerf.scenes.formats.found_photographs import (
     Entry,
     Photographs,
     PosedCamera,
-    Reading,
     scene_of,
 )
 from warpnerf.scenes.scene import Scene

@@ -21,13 +21,11 @@ from warpnerf.runtime.memory import usable_memory
 from warpnerf.scenes.cameras.lens import Lens
 from warpnerf.scenes.cameras.poses import check_pose
 from warpnerf.scenes.files import printable, require_regular_file
-from warpnerf.scenes.formats.assemble import assemble
+from warpnerf.scenes.formats.assemble import Reading, assemble
 from warpnerf.scenes.formats.frame import Frame
 from warpnerf.scenes.images.arrays import Header, read_header, read_numbers
 from warpnerf.scenes.images.images import MAX_PIXELS
-from warpnerf.scenes.images.photographs import KEEPING, Keeping
 from warpnerf.scenes.scene import Scene
-from warpnerf.scenes.split import Split
 
 ROUNDING = 1e-3
 """How far images may be out of [0, 1]."""
@@ -46,22 +44,12 @@ MAX_SMALL = 2**26
 """Bytes of all poses, at most."""
 
 
-def load_npz(
-    file: Path,
-    *,
-    downscale: int = 1,
-    masks: Path | None = None,
-    keeping: Keeping = KEEPING,
-    withhold: Split | None = None,
-) -> Scene:
+def load_npz(file: Path, reading: Reading) -> Scene:
     """Load a scene from an .npz file. Every 8th image is for testing.
 
     Args:
         file: With images, poses and focal; other arrays are not read.
-        downscale: Edge of the blocks of pixels that become one.
-        masks: Folder of masks for all photographs, which are called 000, 001, ...
-        keeping: Where the images' pixels are kept.
-        withhold: What for testing; None: as the capture says.
+        reading: How photographs are to be read, which are called 000, 001, ...
 
     Returns:
         The scene; distances are those of the poses.
@@ -106,10 +94,7 @@ def load_npz(
         frames=frames,
         splits={},
         warnings=warnings,
-        downscale=downscale,
-        masks=masks,
-        keeping=keeping,
-        withhold=withhold,
+        reading=reading,
     )
 
 

@@ -15,11 +15,11 @@ from warpnerf.checks import InputError
 from warpnerf.scenes.cameras.lens import Lens
 from warpnerf.scenes.cameras.poses import check_pose
 from warpnerf.scenes.files import exists, read_json
+from warpnerf.scenes.formats.assemble import Reading
 from warpnerf.scenes.formats.found_photographs import (
     Entry,
     Photographs,
     PosedCamera,
-    Reading,
     scene_of,
 )
 from warpnerf.scenes.formats.unnamed_photographs import UNPOSED

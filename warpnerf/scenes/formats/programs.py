@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from warpnerf.scenes.files import printable
-from warpnerf.scenes.formats.found_photographs import Reading
+from warpnerf.scenes.formats.assemble import Reading
 from warpnerf.scenes.formats.metashape import find_metashape, is_metashape, load_metashape
 from warpnerf.scenes.formats.polycam import find_polycam, load_polycam
 from warpnerf.scenes.formats.reality import find_reality, is_reality, load_reality

@@ -31,7 +31,7 @@ from warpnerf.scenes.files import (
     resolve_inside,
 )
 from warpnerf.scenes.formats import left_over
-from warpnerf.scenes.formats.assemble import assemble
+from warpnerf.scenes.formats.assemble import Reading, assemble
 from warpnerf.scenes.formats.colmap import points_beside
 from warpnerf.scenes.formats.colmap_models import find_model, size_of
 from warpnerf.scenes.formats.frame import Frame
@@ -41,9 +41,7 @@ from warpnerf.scenes.formats.split_lists import read_split_lists
 from warpnerf.scenes.formats.unnamed_photographs import unnamed_photographs
 from warpnerf.scenes.images.depths import DEFAULT_UNIT, DepthFile
 from warpnerf.scenes.images.masks import Mask
-from warpnerf.scenes.images.photographs import KEEPING, Keeping
 from warpnerf.scenes.scene import Scene
-from warpnerf.scenes.split import Split
 
 IGNORED = {
     "white_transparent": "white stays opaque",
@@ -90,14 +88,7 @@ class TransformsFile(PictureKeys, kw_only=True):
     test_filenames: list[str] | None = None
 
 
-def load_transforms(
-    file: Path,
-    *,
-    downscale: int = 1,
-    masks: Path | None = None,
-    keeping: Keeping = KEEPING,
-    withhold: Split | None = None,
-) -> Scene:
+def load_transforms(file: Path, reading: Reading) -> Scene:
     """Load a scene from a transforms.json.
 
     The split is the file's ``{train,val,test}_filenames``, else that of lists beside it, else every
@@ -107,10 +98,7 @@ def load_transforms(
 
     Args:
         file: The file; image paths in it are relative to its folder and stay inside it.
-        downscale: Edge of the blocks of pixels that become one.
-        masks: Folder of masks for all photographs.
-        keeping: Where the images' pixels are kept.
-        withhold: What for testing; None: as the capture says.
+        reading: How photographs are to be read.
 
     Raises:
         InputError: Something in the file or its images is wrong; the message names it.
@@ -137,7 +125,7 @@ def load_transforms(
             )
         splits[split] = members
     listed_in: list[str] = []
-    if withhold is None and not any(splits.values()):
+    if reading.withhold is None and not any(splits.values()):
         called = {frame.called or frame.name: frame.name for frame in frames}
         members_of, listed_in, lost = read_split_lists(folder, called, called)
         splits = {split: {called[name] for name in of} for split, of in members_of.items()}
@@ -153,10 +141,7 @@ def load_transforms(
         frames=frames,
         splits=splits,
         warnings=warnings,
-        downscale=downscale,
-        masks=masks,
-        keeping=keeping,
-        withhold=withhold,
+        reading=reading,
         points=points,
     )
     tried = left_over.tried_points(points, scene)

@@ -60,10 +60,6 @@ class Keeping:
         return lasting if not given and lasting.is_dir() else Path(tempfile.gettempdir())
 
 
-KEEPING = Keeping()
-"""As the memory that there is suggests."""
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Photograph:
     """A photograph in its file."""
