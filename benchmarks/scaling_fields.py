@@ -2,7 +2,7 @@
 
     python benchmarks/scaling_fields.py builtin:room-sparse room-scan fox_q stitch
 
-The fields dense, vm and hash, each in the preset fast with marched rays, hash also with two other
+The fields dense, vm and hash, each in the preset fast, hash also with two other
 epsilons of Adam, and the preset mip360, also without its distortion loss; scalings none, quadratic
 and clamped; several seeds. Trainings are small: so many steps of so many rays on so many voxels,
 one after another. The record is written after each, and a run that was stopped resumes when it is
@@ -33,11 +33,11 @@ from warpnerf.checks import InputError
 from warpnerf.runtime.parallel import Workers
 
 FIELDS = {
-    "dense": "fast sampler=march",
-    "vm": "fast sampler=march field=vm",
-    "hash": "fast sampler=march field=hash",
-    "hash, epsilon 1e-8": "fast sampler=march field=hash field.epsilon=1e-8",
-    "hash, epsilon 1e-15": "fast sampler=march field=hash field.epsilon=1e-15",
+    "dense": "fast",
+    "vm": "fast field=vm",
+    "hash": "fast field=hash",
+    "hash, epsilon 1e-8": "fast field=hash field.epsilon=1e-8",
+    "hash, epsilon 1e-15": "fast field=hash field.epsilon=1e-15",
     "mip360": "mip360",
     "mip360, no distortion": "mip360 loss.distortion=0",
 }
