@@ -13,6 +13,7 @@ from page_parts import Records, below, of, place, seeds, table, text, values
 USED = ("none", "auto")
 """Values of ``--appearance`` that are compared."""
 
+THEN_MARCHED = ", then with `fast sampler=march`"
 MARCHED_TODAY = ", today with `fast sampler=march` for `fast`"
 """What commands need since rays of unbounded captures are resampled by default."""
 
@@ -81,13 +82,12 @@ def by_field(records: Records) -> str:
         text(
             f"""{settings["steps"]} equal steps of {settings["rays"]} rays, what clamped
             scaling gains over none, PSNR in dB (negative: it loses;
-            [by capture](decisions/fields.md)): {gains(record["rows"])}.""",
-            records.source("scaling_fields"),
-        ),
-        text(
-            f"""The same of hashes whose entries have other epsilons of Adam:
-            {gains(epsilons["rows"])}.""",
-            records.source("scaling_fields_epsilon"),
+            [by capture](decisions/fields.md)): {gains(record["rows"])}; with the sampler of the
+            preset, one seed, {gains(records["scaling_fields_sampler"]["rows"])}; with other
+            epsilons of Adam, {gains(epsilons["rows"])}.""",
+            records.source("scaling_fields", THEN_MARCHED),
+            records.source("scaling_fields_sampler"),
+            records.source("scaling_fields_epsilon", THEN_MARCHED),
         ),
     )
 
