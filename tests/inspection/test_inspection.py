@@ -147,6 +147,28 @@ def test_pixels_that_are_the_same_in_all_photographs_are_said(
     assert f"{share} of the pixels of {n} of {n} images" in found or not share
 
 
+@pytest.mark.parametrize("value", [0, 60, 255])
+def test_a_background_of_one_colour_is_not_said(tmp_path: Path, value: int) -> None:
+    """It has no place, and so goes well with all poses."""
+    scene_with(tmp_path, ring(10))
+    for k in range(10):
+        pixels = np.full((12, 16, 3), value, np.uint8)
+        rows, columns = np.mgrid[:12, :16]
+        ball = np.hypot(rows - 6, columns - 8 - k % 2) < 4
+        pixels[ball] = picture(k, width=16, height=12)[ball]
+        Image.fromarray(pixels).save(tmp_path / f"images/{k:03d}.png")
+    assert "the same in all photographs" not in odd(inspect(tmp_path))
+
+
+def test_dark_photographs_are_not_the_same_in_all(tmp_path: Path) -> None:
+    scene_with(tmp_path, ring(10))
+    for k in range(10):
+        dark = (picture(k, width=16, height=12) // 100).astype(np.uint8)
+        Image.fromarray(dark).save(tmp_path / f"images/{k:03d}.png")
+    found = odd(inspect(tmp_path))
+    assert "nearly black: 10 of 10" in found and "the same in all photographs" not in found
+
+
 @pytest.mark.parametrize(("step", "says"), [(2, True), (3, False)])
 def test_where_cameras_look_the_same_way_less_is_still(
     tmp_path: Path, step: int, says: bool

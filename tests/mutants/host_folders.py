@@ -21,9 +21,16 @@ MUTANTS = [
     of_host(
         "names: only the original",
         FRAME_IMAGES,
-        "or path.suffix.lower() in UNREAD_ENDINGS",
+        " and path.suffix.lower() not in UNREAD_ENDINGS",
         "",
         f"{IMAGES}photographs_that_were_converted_are_found",
+    ),
+    of_host(
+        "names: never the original",
+        FRAME_IMAGES,
+        "found = named | found",
+        "named.clear()",
+        f"{IMAGES}photographs_are_read_whatever_their_ending_says",
     ),
     of_host(
         "names: all are converted or none",
@@ -248,6 +255,34 @@ MUTANTS = [
         "\nROUNDED = 1e-4",
         "\nROUNDED = 1e-12",
         f"{MODELS_TESTS}a_model_in_the_other_form_that_has_other_poses_is_said",
+    ),
+    of_host(
+        "models: quaternions of any length",
+        MODELS,
+        "(np.array(image.rotation) / np.linalg.norm(image.rotation) for",
+        "(np.array(image.rotation) for",
+        f"{MODELS_TESTS}rounded_poses_in_the_other_form_are_the_same",
+    ),
+    of_host(
+        "models: an origin to the bit",
+        MODELS,
+        "size = max(size, float(",
+        "size = max(0.0, float(",
+        f"{MODELS_TESTS}rounded_poses_in_the_other_form_are_the_same",
+    ),
+    of_host(
+        "models: the first image of each form",
+        MODELS,
+        "if first is not None and image.name == first.name]",
+        "if image is images[0]]",
+        f"{MODELS_TESTS}rounded_poses_in_the_other_form_are_the_same",
+    ),
+    of_host(
+        "contents: some of too many folders",
+        CONTENTS,
+        "        if len(places) > MOST:\n            break\n",
+        "",
+        FOLDERS,
     ),
     of_host(
         "models: -q is another rotation",

@@ -107,6 +107,20 @@ def test_a_model_in_the_other_form_that_has_other_poses_is_said(
     assert (said in load_scene(tmp_path).warnings) == says
 
 
+def test_rounded_poses_in_the_other_form_are_the_same(tmp_path: Path) -> None:
+    """Where a camera is at the origin, quaternions have another length, images another order."""
+    text = in_both_forms(tmp_path, 9, 9) / "images.txt"
+    lines = text.read_text().splitlines()
+    images = [lines[k : k + 2] for k in range(2, len(lines), 2)]
+    for image in images:
+        number, *pose = image[0].split()[:8]
+        values = [1.001 * float(v) if i < 4 else float(v) + 1e-7 for i, v in enumerate(pose)]
+        image[0] = " ".join([number, *map(repr, values), *image[0].split()[8:]])
+    turned = [line for image in [*images[3:], *images[:3]] for line in image]
+    text.write_text("\n".join([*lines[:2], *turned]) + "\n")
+    assert not any("has other poses" in said for said in load_scene(tmp_path).warnings)
+
+
 def test_a_model_at_another_place_is_named(tmp_path: Path) -> None:
     two_models(tmp_path, False)
     (tmp_path / "colmap" / "sparse").mkdir(parents=True)

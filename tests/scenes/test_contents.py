@@ -90,6 +90,13 @@ def two_npz(folder: Path) -> None:
     np.savez(folder / "other.npz", density=np.zeros(1))
 
 
+def many_folders(folder: Path) -> None:
+    """More than are looked into, the first of them a scene."""
+    write_transforms(folder / "days/0")
+    for k in range(1, 201):
+        (folder / f"days/{k}").mkdir()
+
+
 def photographs_and_heic(folder: Path) -> None:
     photographs(folder)
     empty_file("a.HEIC")(folder)
@@ -146,6 +153,7 @@ UNREAD = r"holds poses in a form that is not read \({}\); .*, or .* `warpnerf po
         ),
         (lambda f: write_transforms(f / "a/b/c/d"), "neither poses nor photographs nor a video"),
         (two_scenes, r"2 of its folders hold one each \(first: a\); use .*s/a"),
+        (many_folders, "neither poses nor photographs nor a video"),
         (empty_file("sparse/0/cameras.bin"), "its COLMAP model lacks sparse/0/images.bin"),
         (half_a_model, r"lacks sparse/0/images\.bin; .* again, or .* `warpnerf pose .*s --output"),
         (empty_file("images.txt"), r"its COLMAP model lacks cameras\.txt"),

@@ -197,9 +197,23 @@ def test_depth_in_a_form_that_is_not_read_is_refused(tmp_path: Path, ending: str
 )
 def test_units_that_are_none_are_refused(tmp_path: Path, keys: dict[str, float]) -> None:
     content = write_transforms(tmp_path)
+    Image.fromarray(VALUES).save(tmp_path / "d.png")
+    content["frames"][1]["depth_path"] = "d.png"
     save(tmp_path / "transforms.json", content | keys)
     with pytest.raises(InputError, match=r"is no unit of depth; give .* above 0"):
         load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_depth_that_instant_ngp_would_not_read_is_not_read(tmp_path: Path, named: bool) -> None:
+    content = write_transforms(tmp_path)
+    if named:
+        content["enable_depth_loading"] = False
+        content["frames"][1]["depth_path"] = "d.exr"
+        (tmp_path / "d.exr").write_bytes(b"v/1\x01")
+    save(tmp_path / "transforms.json", content | {"integer_depth_scale": 0.0})
+    scene = load_scene(tmp_path)
+    assert len(scene.views) == 4 and all(view.depth is None for view in scene.views)
 
 
 @pytest.mark.usefixtures("compiled_kernels")

@@ -245,9 +245,18 @@ def test_photographs_that_are_to_be_converted_are_named(tmp_path: Path) -> None:
     (tmp_path / "images").mkdir()
     for name in four("images/{}.HEIC"):
         (tmp_path / name).write_bytes(b"\0\0\0\x18ftypheic")
-    says = r"but 4 as HEIC, to be converted to JPEG, are \(first: images/000.HEIC\); put the images"
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=r"images/00\d\.HEIC: is a HEIC file, .*; convert it to"):
         load_scene(tmp_path)
+
+
+def test_photographs_are_read_whatever_their_ending_says(tmp_path: Path) -> None:
+    """JPEG that a phone has called HEIC, for one."""
+    photographs(tmp_path, four("images/{}.png"))
+    named(tmp_path, four("images/{}.HEIC"))
+    for old, new in zip(four("images/{}.png"), four("images/{}.HEIC"), strict=True):
+        (tmp_path / old).rename(tmp_path / new)
+    scene = load_scene(tmp_path)
+    assert [view.name for view in scene.views] == four("images/{}.HEIC")
 
 
 def both_endings(folder: Path) -> None:

@@ -202,8 +202,8 @@ def test_an_angle_across_the_width_of_portraits_is_said(
         Image.fromarray(picture(k, width=8, height=height)).save(tmp_path / f"images/{k:03d}.png")
     said = (
         "transforms.json: camera_angle_x is taken to be across the width of all images, which "
-        "stand upright (first: images/000.png): 4 pixels; that of Blender, with sensor fit Auto, "
-        "is along the height: give fl_x, 6, if so"
+        "stand upright (first: images/000.png), a focal length of 4 pixels; Blender's, with sensor "
+        "fit Auto, is along the height: if Blender wrote it, give fl_x, 6"
     )
     assert [w for w in load_scene(tmp_path).warnings if "upright" in w] == [said] * says
 

@@ -9,6 +9,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from warpnerf.rendering.field import Field
 from warpnerf.training.trainer import Trainer
 from warpnerf.viewer.painter import KINDS, LAYOUTS, Subject
 from warpnerf.viewer.session import Session
+from warpnerf.viewer.stage import Pyramids
 from warpnerf.viewer.viewpoint import DISTANCE, FLIP
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
@@ -240,6 +242,21 @@ def test_each_page_gets_its_cameras_after_its_picture(field: Field) -> None:
                 page.wait(lambda page: visible(page) == {0, 2, 3})
                 first = page.messages["BatchedMeshesMessage"][0]
                 assert first["n_pictures"] >= 2  # a coarse one and a fine one
+                drawn, cameras = first["props"], session._stage.cameras
+                one = list(cameras.values())[1]
+                wxyz, position = session._world.pose(one.c2w)
+                np.testing.assert_allclose(drawn["batched_wxyzs"].reshape(-1, 4)[1], wxyz, 1e-5)
+                np.testing.assert_allclose(
+                    drawn["batched_positions"].reshape(-1, 3)[1], position, 1e-5
+                )
+                length = session._stage.length
+                base = [one.width / one.fx / 2.0, one.height / one.fy / 2.0, 1.0]
+                session._stage.show_cameras(visible=True, scale=2.0)
+                page.wait(
+                    lambda page, b=base, n=length: np.allclose(
+                        scales(page)[2], 2.0 * n * np.array(b)
+                    )
+                )
                 session._stage.show_cameras(visible=False, scale=2.0)
                 page.wait(lambda page: visible(page) == set())
                 session._stage.show_cameras(visible=True, scale=1.0)
@@ -250,11 +267,27 @@ def test_each_page_gets_its_cameras_after_its_picture(field: Field) -> None:
 
 def visible(page: PageClient) -> set[int]:
     """The cameras that a page shows, by what it was told last."""
+    return set(np.flatnonzero(scales(page).all(axis=1)).tolist())
+
+
+def scales(page: PageClient) -> np.ndarray:
+    """Half the width and height of each pyramid's base, and its length, as it was told last."""
     told = page.messages.get("SceneNodeUpdateMessage", [])
-    scales = [m["updates"]["batched_scales"] for m in told if m["name"] == "/cameras"]
-    if not scales:
-        return set()
-    return set(np.flatnonzero(scales[-1].reshape(-1, 3).all(axis=1)).tolist())
+    said = [m["updates"]["batched_scales"] for m in told if m["name"] == "/cameras"]
+    return said[-1].reshape(-1, 3) if said else np.zeros((4, 3))
+
+
+@pytest.mark.parametrize(("index", "stands"), [(2, True), (None, False), (-1, False), (4, False)])
+def test_a_click_on_a_camera_that_is_not_there_does_nothing(
+    field: Field, monkeypatch: pytest.MonkeyPatch, index: int | None, stands: bool
+) -> None:
+    """A page says which it was, and may say anything."""
+    clicked: list[int] = []
+    with serving(field, scene=tiny_scene(ring(5))) as session:
+        monkeypatch.setattr(session._stage, "clicked", lambda i, client: clicked.append(i))
+        pyramids = Pyramids(SimpleNamespace(), session._stage)
+        pyramids._clicked(SimpleNamespace(instance_index=index, client=None))
+    assert clicked == [index] * stands
 
 
 def trained(config: TrainConfig, looking: bool) -> tuple[bytes, int]:

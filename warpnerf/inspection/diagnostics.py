@@ -34,6 +34,8 @@ SAME_WAY = 0.966
 """Length of the mean of the optical axes from which on that is so: 15 degrees from their middle."""
 MANY_STILL = 0.01
 """Share of such pixels from which on they are something: real captures have up to 0.005."""
+BACKGROUND = 0.2
+"""Share of the pixels from which still ones of one colour may be a background."""
 ENOUGH_STILL = 10
 """Photographs of one size, at least, by which that can be told."""
 MOST_STILL = 200
@@ -187,15 +189,18 @@ def _look(view: View) -> _Look:
 
 def _share_still(looks: Mapping[View, _Look]) -> tuple[float, int]:
     """The share of pixels that are the same in all photographs of the commonest size, and how many
-    these are, each once. White ones count only if all corners are still: else they may be a sky."""
+    are compared, each once.
+
+    White ones count only if all corners are still: else they may be a sky. Many of one colour, and
+    no bars, are a background, which has no place.
+    """
     sizes = Counter(look.size for look in looks.values())
     most = max(sizes, key=lambda size: sizes[size], default=())
     of_size = [look for look in looks.values() if look.size == most]
     alike = list({look.sample.tobytes(): look for look in of_size}.values())
-    n = len(alike)
-    if n < ENOUGH_STILL:
-        return 0.0, n
-    alike = alike[:: -(-n // MOST_STILL)]
+    alike = alike[:: max(1, -(-len(alike) // MOST_STILL))]
+    if len(alike) < ENOUGH_STILL:
+        return 0.0, len(alike)
     samples = np.stack([look.sample[..., :3] for look in alike])
     seen = np.all([look.counts for look in alike], axis=0)
     axes = np.mean([view.camera.c2w[:, 2] for view in looks], axis=0)
@@ -203,7 +208,15 @@ def _share_still(looks: Mapping[View, _Look]) -> tuple[float, int]:
     still = (samples.std(axis=0, dtype=np.float32) <= most_apart).all(axis=-1) & seen
     if not still[[0, 0, -1, -1], [0, -1, 0, -1]].all():
         still &= samples.min(axis=(0, -1)) < SATURATED
-    return float(still.mean()), n
+    bars = still.all(axis=1)[:, None] | still.all(axis=0)
+    colours = samples.mean(axis=0)[still]
+    if (
+        still.mean() > BACKGROUND
+        and not bars[still].all()
+        and np.ptp(colours, axis=0).max() <= STILL
+    ):
+        return 0.0, len(alike)
+    return float(still.mean()), len(alike)
 
 
 def _frozen(samples: Mapping[View, bytes]) -> list[tuple[str, str]]:

@@ -163,7 +163,7 @@ class PhotoConsistency:
 
     def zoomed(self, factor: float) -> PhotoConsistency:
         """The same photographs, had their lenses so many times the focal length."""
-        return replace(self, zoom=factor * self.zoom)
+        return replace(self, zoom=factor)
 
     def apart(self) -> float:
         """How far off the neighbours of a reference are, by the median; see ``neighbours``."""

@@ -244,7 +244,8 @@ def _otherwise(file: Path, images: Sequence[ModelImage]) -> str:
     if file.suffix == ".txt":
         first = first_of_text(file)
         twins = [image for image in images if first is not None and image.name == first.name]
-        if first is not None and not all(_same_pose(first, image) for image in twins):
+        size = float(np.ptp([image.translation for image in images], axis=0).max(initial=0.0))
+        if first is not None and not all(_same_pose(first, image, size) for image in twins):
             return "has other poses"
         if _stated(file) == n:
             return ""
@@ -254,12 +255,19 @@ def _otherwise(file: Path, images: Sequence[ModelImage]) -> str:
     return "is damaged" if listed is None else f"has {listed}"
 
 
-def _same_pose(one: ModelImage, other: ModelImage) -> bool:
-    """Whether two images are of one pose, but for how it is rounded; q and -q are one rotation."""
-    q, r = np.array(one.rotation), np.array(other.rotation)
+def _same_pose(one: ModelImage, other: ModelImage, size: float) -> bool:
+    """Whether two images are of one pose, but for how it is rounded; q and -q are one rotation.
+
+    Args:
+        one: Of a model.
+        other: Of another.
+        size: Of the model, along its longest axis.
+    """
+    q, r = (np.array(image.rotation) / np.linalg.norm(image.rotation) for image in (one, other))
     at, there = np.array(one.translation), np.array(other.translation)
-    turned = np.linalg.norm(q - (r if q @ r > 0.0 else -r)) > ROUNDED * np.linalg.norm(r)
-    return not turned and bool(np.linalg.norm(at - there) <= ROUNDED * np.linalg.norm(there))
+    turned = np.linalg.norm(q - (r if q @ r > 0.0 else -r)) > ROUNDED
+    size = max(size, float(np.linalg.norm(there)))
+    return not turned and bool(np.linalg.norm(at - there) <= ROUNDED * size)
 
 
 def scene_folder(model: Path) -> Path:

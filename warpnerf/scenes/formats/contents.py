@@ -186,8 +186,10 @@ def _scenes_below(folder: Path) -> list[Path]:
     places = [folder]
     for _ in range(DEEPEST):
         places = [inner for place in places for inner in _folders(place) if not is_written(inner)]
-        scenes = [path for path in places[:MOST] if holds_scene(path)]
-        if scenes or len(places) > MOST:
+        if len(places) > MOST:
+            break
+        scenes = [path for path in places if holds_scene(path)]
+        if scenes:
             return scenes
     return []
 

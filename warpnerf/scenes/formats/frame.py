@@ -126,12 +126,13 @@ def lens_warnings(used: Sequence[tuple[Frame, Camera]]) -> list[str]:
         (frame, camera, frame.lens.other_focal_length(camera.width, camera.height))
         for frame, camera in used
     ]
-    if all(other is not None for *_, other in others):
+    if others and all(other is not None for *_, other in others):
         frame, camera, other = others[0]
         warnings.append(
             f"{frame.lens.file.name}: camera_angle_x is taken to be across the width of all "
-            f"images, which stand upright (first: {frame.name}): {camera.fx:.4g} pixels; that of "
-            f"Blender, with sensor fit Auto, is along the height: give fl_x, {other:.4g}, if so"
+            f"images, which stand upright (first: {frame.name}), a focal length of {camera.fx:.4g} "
+            f"pixels; Blender's, with sensor fit Auto, is along the height: if Blender wrote it, "
+            f"give fl_x, {other:.4g}"
         )
     shared: dict[tuple[tuple[str, float], ...], dict[tuple[int, int], tuple[Frame, Camera]]] = {}
     for frame, camera in used:

@@ -132,16 +132,19 @@ def find_photographs(
     found: dict[int, Path] = {}
     outside: OutsideError | None = None
     renamed: list[int] = []
+    named: dict[int, Path] = {}  # with endings that are not read; what is in them may be
     for index, name in enumerate(names):
         try:
             path = find_image(root, name, field=field(index))
         except OutsideError as error:
             outside = outside or error
             continue
-        if path is None or path.suffix.lower() in UNREAD_ENDINGS:
-            renamed.append(index)
-        else:
+        if path is not None and path.suffix.lower() not in UNREAD_ENDINGS:
             found[index] = path
+            continue
+        renamed.append(index)
+        if path is not None:
+            named[index] = path
     unchanged = {path.parent for path in found.values()}
     owners = dict.fromkeys([*found.values(), *taken], "")
     moved: dict[int, bool] = {}
@@ -177,6 +180,7 @@ def find_photographs(
             take(index, path, path is not None and there.is_elsewhere(name, path))
         if found:
             break
+    found = named | found
     if not found and outside is not None:
         raise outside
     return found, moved

@@ -83,6 +83,8 @@ class TransformsFile(PictureKeys, kw_only=True):
     applied_scale: float = 1.0
     integer_depth_scale: float | None = None
     """Of instant-ngp's depth_path: scene units in one of its units."""
+    enable_depth_loading: object = True
+    """Of instant-ngp: whether it reads depth_path."""
     train_filenames: list[str] | None = None
     val_filenames: list[str] | None = None
     test_filenames: list[str] | None = None
@@ -219,7 +221,8 @@ def read_frames(
             f"{file}: $.depth_unit_scale_factor: {data.depth_unit_scale_factor:g} with an "
             f"applied_scale of {data.applied_scale:g} is no unit of depth; give numbers above 0."
         )
-    if not unit_of_ngp > 0.0:
+    ngp_depth = data.enable_depth_loading is not False and any(e.depth_path for e in data.frames)
+    if ngp_depth and not unit_of_ngp > 0.0:
         raise InputError(
             f"{file}: $.integer_depth_scale: {unit_of_ngp:g} is no unit of depth; give a number "
             "above 0."
@@ -234,7 +237,7 @@ def read_frames(
             mask = _named_file(file, "$", "mask_path", data.mask_path, lost)
         depth = _named_file(file, place, "depth_file_path", entry.depth_file_path, lost)
         depth_unit = unit
-        if not entry.depth_file_path:
+        if ngp_depth and not entry.depth_file_path:
             depth = _named_file(file, place, "depth_path", entry.depth_path, lost)
             depth_unit = unit_of_ngp
         lens = read_lens(file, [(place, entry), ("$", data)])

@@ -33,6 +33,7 @@ keeps the other byte: L, B and N stand for little-endian, big-endian and this ma
 OTHER_KINDS = {
     "a HEIC": rb".{4}ftyp(hei|hev|mif1|msf1)",
     "an AVIF": rb".{4}ftypavi",
+    "a raw": rb".{4}ftypcrx",
     "a video": rb".{4}ftyp|\x1aE\xdf\xa3",
     "a JPEG XL": rb"\xff\x0a|\0\0\0\x0cJXL ",
     "a JPEG 2000": rb"\0\0\0\x0cjP  |\xff\x4f\xff\x51",
