@@ -264,13 +264,6 @@ MUTANTS = [
         f"{MODELS_TESTS}rounded_poses_in_the_other_form_are_the_same",
     ),
     of_host(
-        "models: an origin to the bit",
-        MODELS,
-        "size = max(size, float(",
-        "size = max(0.0, float(",
-        f"{MODELS_TESTS}rounded_poses_in_the_other_form_are_the_same",
-    ),
-    of_host(
         "models: the first image of each form",
         MODELS,
         "if first is not None and image.name == first.name]",
