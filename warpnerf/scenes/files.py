@@ -193,6 +193,18 @@ def exists(path: Path) -> bool:
     return os.path.exists(path)  # noqa: PTH110, whose way out raises
 
 
+def beginning(path: Path, n_bytes: int) -> bytes:
+    """The first bytes of a regular file, by which its kind is told; none of what is no such file
+    or cannot be read."""
+    try:
+        if not path.is_file():
+            return b""
+        with path.open("rb") as stream:
+            return stream.read(n_bytes)
+    except OSError:
+        return b""
+
+
 def resolve_inside(folder: Path, relative: str, *, field: str) -> Path:
     r"""Join a path out of a scene file to the scene's folder.
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from warpnerf.scenes.files import exists
+from warpnerf.scenes.files import beginning, exists
 from warpnerf.scenes.formats.assemble import Reading, assemble
 from warpnerf.scenes.formats.frame import Frame
 from warpnerf.scenes.formats.transforms import read_frames
@@ -51,13 +51,7 @@ def other_transforms(folder: Path) -> list[Path]:
 
 def is_frames(file: Path) -> bool:
     """Whether a file of JSON, of whatever name, begins as one of posed frames."""
-    try:
-        if not file.is_file():
-            return False
-        with file.open("rb") as stream:
-            head = stream.read(LOOKED_AT)
-    except OSError:
-        return False
+    head = beginning(file, LOOKED_AT)
     return b'"frames"' in head and b'"transform_matrix"' in head
 
 

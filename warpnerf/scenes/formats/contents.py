@@ -7,10 +7,18 @@ import os
 import re
 import shlex
 from contextlib import suppress
+from itertools import islice
 from pathlib import Path
 
 from warpnerf.checks import InputError
-from warpnerf.scenes.files import ANY_PHOTOGRAPHS, ENDINGS, UNREAD_ENDINGS, exists, printable
+from warpnerf.scenes.files import (
+    ANY_PHOTOGRAPHS,
+    ENDINGS,
+    UNREAD_ENDINGS,
+    beginning,
+    exists,
+    printable,
+)
 from warpnerf.scenes.formats import llff
 from warpnerf.scenes.formats.blender import SPLITS, other_transforms, split_file
 from warpnerf.scenes.formats.colmap_models import find_model, model_kind
@@ -42,7 +50,9 @@ POSES_IN_TEXT = re.compile(
 """Texts in which poses are recognised by what they begin with, of Metashape, RealityCapture, Pix4D,
 and, for exchange between programs, of ContextCapture."""
 LOOKED_AT = 4096
-"""Bytes at the beginning of a text, and texts at a place, at most, that are looked at."""
+"""Bytes at the beginning of a text."""
+MOST_TEXTS = 4096
+"""At a place, that are looked at."""
 
 NEEDED = 3
 """Photographs, at least, whose poses can be estimated."""
@@ -243,8 +253,9 @@ def _unread_poses(folder: Path) -> str:
             found += sorted(folder.glob(pattern))[:1]
         for place in PLACES_OF_TEXTS:
             for ending in TEXTS:
-                texts = _with_endings(folder / place, (ending,))[:LOOKED_AT]
-                found += [path for path in texts if _begins_with_poses(path)][:1]
+                texts = _with_endings(folder / place, (ending,))[:MOST_TEXTS]
+                with_poses = (t for t in texts if POSES_IN_TEXT.search(beginning(t, LOOKED_AT)))
+                found += islice(with_poses, 1)
     if not found:
         return ""
     named = ", ".join(printable(path.relative_to(folder).as_posix()) for path in found[:3])
@@ -252,16 +263,6 @@ def _unread_poses(folder: Path) -> str:
         f"it holds poses in a form that is not read ({named}); export them for COLMAP, as "
         "Metashape's XML, or as RealityCapture's internal and external camera parameters"
     )
-
-
-def _begins_with_poses(text: Path) -> bool:
-    try:
-        if not text.is_file():
-            return False
-        with text.open("rb") as opened:
-            return POSES_IN_TEXT.search(opened.read(LOOKED_AT)) is not None
-    except OSError:
-        return False
 
 
 def pose_command(source: str) -> str:

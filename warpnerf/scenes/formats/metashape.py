@@ -19,7 +19,7 @@ from warpnerf.checks import InputError
 from warpnerf.scenes.cameras.brown import brown_lens
 from warpnerf.scenes.cameras.lens import Lens
 from warpnerf.scenes.cameras.poses import check_pose
-from warpnerf.scenes.files import MAX_JSON_BYTES, printable, require_regular_file
+from warpnerf.scenes.files import MAX_JSON_BYTES, beginning, printable, require_regular_file
 from warpnerf.scenes.formats.assemble import Reading
 from warpnerf.scenes.formats.found_photographs import (
     Entry,
@@ -70,13 +70,7 @@ def find_metashape(folder: Path) -> list[Path]:
 
 def is_metashape(file: Path) -> bool:
     """Whether a file begins as Metashape's do."""
-    try:
-        if not file.is_file():
-            return False
-        with file.open("rb") as stream:
-            head = stream.read(LOOKED_AT)
-    except OSError:
-        return False
+    head = beginning(file, LOOKED_AT)
     return b"<document" in head and b"<chunk" in head
 
 

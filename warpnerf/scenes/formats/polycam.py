@@ -14,7 +14,7 @@ import msgspec
 from warpnerf.checks import InputError
 from warpnerf.scenes.cameras.lens import Lens
 from warpnerf.scenes.cameras.poses import check_pose
-from warpnerf.scenes.files import exists, read_json
+from warpnerf.scenes.files import beginning, exists, read_json
 from warpnerf.scenes.formats.assemble import Reading
 from warpnerf.scenes.formats.found_photographs import (
     Entry,
@@ -74,12 +74,9 @@ def _is_polycam(cameras: Path) -> bool:
     """Whether a folder's first file of JSON has a camera's keys."""
     try:
         first = min((path for path in cameras.iterdir() if path.suffix == ".json"), default=None)
-        if first is None or not first.is_file():
-            return False
-        with first.open("rb") as stream:
-            return b'"t_00"' in stream.read(LOOKED_AT)
     except OSError:
         return False
+    return first is not None and b'"t_00"' in beginning(first, LOOKED_AT)
 
 
 def load_polycam(cameras: Path, reading: Reading) -> Scene:
