@@ -21,6 +21,7 @@ from warpnerf.cli.main import main
 from warpnerf.presets import PRESETS
 from warpnerf.runs.checkpoint import load_checkpoint
 from warpnerf.runs.run import Run
+from warpnerf.training.photograph_errors import PhotographErrors
 from warpnerf.training.trainer import Trainer
 
 
@@ -44,6 +45,19 @@ def test_version() -> None:
     out, _ = process.communicate(timeout=240)
     assert process.returncode == 0
     assert out.startswith("warpnerf ")
+
+
+def test_photographs_that_do_not_fit_are_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def psnr(self: object, names: list[str]) -> dict[str, float]:
+        return {name: 12.0 if name == names[3] else 25.0 for name in names}
+
+    monkeypatch.setattr(PhotographErrors, "psnr", psnr)
+    command = ["train", *TINY, "--steps", "2", "--voxels", "512", "--eval-views", "none"]
+    assert main([*command, "--output", str(tmp_path / "run")]) == 0
+    out = capsys.readouterr().out
+    assert re.search(r"warning: photograph that the field does not explain: \S+ \(12.0 dB\)", out)
 
 
 def test_exposures_that_were_fitted_are_said(tmp_path: Path) -> None:

@@ -45,6 +45,7 @@ def train_to_the_end(
     options: TrainOptions,
 ) -> int:
     """Train to the end, or until asked to stop; look at the test views."""
+    from warpnerf.reports import misfits
     from warpnerf.reports.limits import voxel_pixels, what_limits
     from warpnerf.training.exposure import in_use
     from warpnerf.training.held_out import HeldOut
@@ -100,6 +101,9 @@ def train_to_the_end(
             run.draw_curves(scene.name)
             if (exposures := in_use(trainer.exposures)) is not None:
                 print(exposures.in_words(scene.training_names))
+            of_photographs = trainer.photograph_errors.psnr(scene.training_names)
+            if (sentence := misfits.in_words(of_photographs)) is not None:
+                print(f"warning: {sentence}")
         exit_code = processes.exit_code_of(stop, trainer)
     if session is not None:
         session.notify("The training has ended", f"warpnerf view {run.folder} shows what it left.")

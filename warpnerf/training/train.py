@@ -32,6 +32,9 @@ class TrainResult:
     """What was trained on, with the extent that was used: it may have been looked for first."""
     exposures: dict[str, Exposure] | None
     """Of the training views, by name, where ``TrainConfig.appearance`` fits them."""
+    photograph_psnr: dict[str, float]
+    """Of training views, by name, dB: over rays of the last third of the training, of each view of
+    which there were enough. A view far below the others may have a wrong pose."""
 
 
 @checked_arguments
@@ -96,11 +99,12 @@ def train(
         held_out = None if eval_every is None else HeldOut(trainer, eval_every)
         between = None if held_out is None else held_out.after_update
         end = trainer.run(report, on_checkpoint, between=between)
-    exposures = in_use(trainer.exposures)
+    exposures, names = in_use(trainer.exposures), scene.training_names
     return TrainResult(
         field=trainer.field(),
         content_distance=trainer.plan.content_distance,
         progress=last or end,
         scene=trainer.scene,
-        exposures=None if exposures is None else exposures.by_name(scene.training_names),
+        exposures=None if exposures is None else exposures.by_name(names),
+        photograph_psnr=trainer.photograph_errors.psnr(names),
     )

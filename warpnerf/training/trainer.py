@@ -37,6 +37,7 @@ from warpnerf.training.growth import (
 )
 from warpnerf.training.optim import adam_step, first_states
 from warpnerf.training.peers import ALONE, Peers, Signals
+from warpnerf.training.photograph_errors import PhotographErrors
 from warpnerf.training.plan import TrainingPlan, resolve
 from warpnerf.training.resampling import first_proposal, grown_proposal, resampling_of
 from warpnerf.training.state import (
@@ -138,6 +139,9 @@ class Trainer:
             self.exposures = exposures_of(scene, config.appearance, self.workers, kept)
         if self.exposures is not None:
             self._sampler.take_out_exposures(self.exposures.gains, self.exposures.offsets)
+        self.photograph_errors = PhotographErrors(len(scene.splits["train"]))
+        """Of the rays of reports, since it was set up."""
+        self._views: wp.array | None = None
         self._occupied = self.free.share()
         self._seen = self._cull_background()
         self._pass = self._training_pass()
@@ -246,6 +250,7 @@ class Trainer:
             self._resampling.propose(self.free, batch, self.fraction)
         share = self._seen * (batch.count / self._sampler.count(n_steps))
         self._pass.run(self.free, batch, n_steps, share)
+        self._views = batch.views
         if self._resampling is not None:
             self._resampling.learn(batch, n_steps * share, self._updates, self.fraction)
         if self.exposures is not None:
@@ -287,6 +292,9 @@ class Trainer:
             return self._progress
         error, loss = self._mean(self._pass.error), self._mean(self._pass.loss)
         require_finite([("the loss is", loss)], self.plan, self.steps_done)
+        if self._views is not None:
+            errors = self._pass.error.numpy()[: self._pass.n_rays]
+            self.photograph_errors.add(self._views.numpy(), errors, self.fraction)
         self._progress = Progress(
             step=self.steps_done,
             fraction=self.fraction,
