@@ -139,6 +139,10 @@ class TrainConfig:
     alpha_min: float = 0.05
     """A cell is free where the longest step that there can be would be less opaque than this: what
     light crosses twenty voxels of is fog in most scenes. Smoke needs less."""
+    settle_at: float | None = 0.5
+    """Share of the training after which surfaces stand where they will stay: free cells are then
+    those whose own nodes hold nothing, not their neighbours' as well, and rays end once 1 % of the
+    light is left. None: never."""
     seed: int = 0
     """Same seed, same number of threads: same bits on the CPU."""
     threads: int | None = None
@@ -292,6 +296,11 @@ class TrainConfig:
             raise InputError(
                 f"alpha_min must be an opacity in [0, 1), not {self.alpha_min}: from 1 on all "
                 "space is free, and nothing is seen."
+            )
+        if self.settle_at is not None and not 0.0 < self.settle_at <= 1.0:
+            raise InputError(
+                f"settle_at must be a share of the training in (0, 1], not {said(self.settle_at)}; "
+                "none leaves it out."
             )
         require_whole("seed", self.seed, 0)
         require_one_of("scaling", self.scaling, get_args(Scaling))

@@ -37,8 +37,9 @@ def config_from_json(tree: dict[str, Any]) -> dict[str, Any]:
 
     Where no model is named, there was only one, rgb, and all rays were drawn; where no losses are,
     there was the squared error alone; where no appearance is, photographs were taken as they are;
-    where no sampler is, rays were marched; where no box is, it was the scene's. Options that did
-    nothing beside the others are left out: they are refused now.
+    where no settle_at is, nothing settled; where no sampler is, rays were marched; where no box is,
+    it was the scene's. Options that did nothing beside the others are left out: they are refused
+    now.
     """
     if isinstance(grid := tree.get("grid"), dict):
         tree = tree | {"grid": {"box": "scene"} | grid}
@@ -47,6 +48,7 @@ def config_from_json(tree: dict[str, Any]) -> dict[str, Any]:
         "sampler": {"name": "march"},
         "skip_empty_rays": False,
         "appearance": "none",
+        "settle_at": None,
         "loss": {},
     }
     return _without_idle(before | tree)

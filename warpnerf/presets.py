@@ -95,6 +95,7 @@ _FAST = TrainConfig()
 
 _DVGO = TrainConfig(
     appearance="none",
+    settle_at=None,
     sampler=MARCHED,
     steps=20_000,
     rays_per_step=8192,
@@ -209,6 +210,7 @@ _PRESETS = {
     ),
     "ngp": TrainConfig(
         appearance="none",
+        settle_at=None,
         sampler=MARCHED,
         steps=35_000,
         background="random",
@@ -235,6 +237,7 @@ _PRESETS = {
     ),
     "mip360": TrainConfig(
         appearance="none",
+        settle_at=None,
         steps=25_000,
         model=PerSample(
             features=15, width=64, hidden_layers=2, residual=False, learning_rate_mlp=2e-3

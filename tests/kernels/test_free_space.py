@@ -125,10 +125,12 @@ def test_skipping_in_float32_changes_no_bit(contraction: str, kernels32: Kernels
         assert np.array_equal(short.rgb, leaping.rgb)
 
 
-def mark(kernels: Kernels, p: Problem, cells: Any, steps: Steps, alpha_min: float) -> Any:
+def mark(
+    kernels: Kernels, p: Problem, cells: Any, steps: Steps, alpha_min: float, margin: int = 1
+) -> Any:
     """By threads for a cell each, and for a row each."""
     by_cell, by_row = (
-        marked_by(kernels, p, tuple(map(int, cells)), steps, alpha_min, span)
+        marked_by(kernels, p, tuple(map(int, cells)), steps, alpha_min, margin, span)
         for span in (1, int(cells[2]))
     )
     assert np.array_equal(by_cell, by_row)
@@ -141,6 +143,7 @@ def marked_by(
     cells: tuple[int, int, int],
     steps: Steps,
     alpha_min: float,
+    margin: int,
     span: int,
 ) -> Any:
     occupancy, bound = kernels.module("sampling.occupancy"), kernels.module("fields.dense_bound")
@@ -152,10 +155,11 @@ def marked_by(
         return out
 
     x, y, _ = p.raw.shape[:3]
-    highest = launch(bound.find_highest_kernel(p.raw.shape[3]), (x, y, cells[2]), grid, cells[2])
+    of_columns = bound.find_highest_kernel(p.raw.shape[3])
+    highest = launch(of_columns, (x, y, cells[2]), grid, cells[2], margin)
     join = bound.join_highest
-    highest = launch(join, (x, *cells[1:]), highest, y, cells[1], cells[2])
-    highest = launch(join, cells, highest, x, cells[0], cells[1] * cells[2])
+    highest = launch(join, (x, *cells[1:]), highest, y, cells[1], cells[2], margin)
+    highest = launch(join, cells, highest, x, cells[0], cells[1] * cells[2], margin)
     out = wp.zeros(highest.size, dtype=wp.uint8, device=kernels.device)
     kernels.workers.launch(
         occupancy.mark_occupied_kernel(
@@ -174,21 +178,22 @@ def marked_by(
     return out.numpy().reshape(cells)
 
 
-def test_marked_cells(kernels64: Kernels) -> None:
-    """A cell is free if and only if no node in it or next to it could be seen."""
+@pytest.mark.parametrize("margin", [0, 1, 2])
+def test_marked_cells(margin: int, kernels64: Kernels) -> None:
+    """A cell is free if and only if no node in it or so many next to it could be seen."""
     for seed in range(N_SEEDS):
         rng = np.random.default_rng(seed)
         size, cells = rng.integers(3, 12, size=3), rng.integers(1, 7, size=3)
         raw = np.full((*size, 4), -12.0)
         raw[tuple(rng.integers(0, size))] = 3.0
         p = make_problem(seed, raw=raw, density_scale=2.0)
-        marked = mark(kernels64, p, cells, replace(p.steps, step=0.1), 1e-3)
+        marked = mark(kernels64, p, cells, replace(p.steps, step=0.1), 1e-3, margin)
         assert set(np.unique(marked)) <= {0, FAR + 1}
         node = np.argwhere(raw[..., 0] > 0)[0]
         for cell in np.ndindex(*cells):
             low = np.array(cell) * (size - 1) / cells
             high = (np.array(cell) + 1) * (size - 1) / cells
-            near = (np.floor(low) - 1 <= node) & (node <= np.ceil(high) + 1)
+            near = (np.floor(low) - margin <= node) & (node <= np.ceil(high) + margin)
             assert (marked[cell] == 0) == near.all()
 
 
@@ -213,7 +218,8 @@ def test_threshold_is_of_alpha(kernels64: Kernels) -> None:
     assert (mark(kernels64, p, (2, 2, 2), steps, alpha * (1.0 + 1e-6)) == FAR + 1).all()
 
 
-def test_what_free_space_hides_is_below_the_threshold(kernels64: Kernels) -> None:
+@pytest.mark.parametrize("margin", [0, 1])
+def test_what_free_space_hides_is_below_the_threshold(margin: int, kernels64: Kernels) -> None:
     """A render with marked cells differs by at most n_steps times alpha_min."""
     for seed in range(5):
         p = make_problem(seed, size=(17, 16, 18), n_rays=50)
@@ -221,7 +227,7 @@ def test_what_free_space_hides_is_below_the_threshold(kernels64: Kernels) -> Non
         raw[tuple(np.random.default_rng(seed).integers(4, 12, size=(3, 9)))] += 12.0
         p = replace(p, raw=raw)
         alpha_min = 0.01
-        marked = mark(kernels64, p, (8, 7, 8), p.steps, alpha_min) == 0
+        marked = mark(kernels64, p, (8, 7, 8), p.steps, alpha_min, margin) == 0
         assert 0 < marked.sum() < marked.size
         skipped = kernels64.forward(replace(p, free=spread(kernels64, marked)))
         full = kernels64.forward(p)

@@ -53,6 +53,7 @@ GIVEN: dict[str, tuple[str, Any]] = {
     "occupancy_every": ("7", 7),
     "skip_empty_rays": ("false", False),
     "alpha_min": ("0.01", 0.01),
+    "settle_at": ("none", None),
     "seed": ("4", 4),
     "threads": ("1", 1),
     "device": ("cuda:1", "cuda:1"),

@@ -88,6 +88,13 @@ FAR_BELOW, FEW_TELL, OPAQUE_COUNT, ARE_SAID = (
     "training/test_photograph_errors.py::test_late_rays_of_opaque_pixels_count",
     "cli/test_command.py::test_photographs_that_do_not_fit_are_said",
 )
+SETTLED, BEFORE_SETTLED = (
+    f"training/test_trainer.py::test_{what}"
+    for what in (
+        "once_surfaces_stand_less_is_sampled",
+        "before_surfaces_stand_nothing_changes",
+    )
+)
 ELSE_TOLD = "training/test_photograph_errors.py::test_a_photograph_of_something_else_is_told"
 SHORT_USES = "model/test_idle_options.py::test_a_short_training_takes_over_what_it_has_a_use_for"
 FACE = "training/test_optim.py::test_total_variation_counts_the_face_between_two_nodes"
@@ -185,7 +192,7 @@ MUTANTS = [
             "plan.background", BEHIND),
     of_host("before black, whatever they are", PLANNED, "\"white\" if scene.has_alpha else \"black\"",
             "\"black\"", BEHIND),
-    of_host("contracted space is left out", SKIPPED, " and lattice.kind.bounded:", ":", ALL_DRAWN),
+    of_host("contracted space is left out", SKIPPED, " and lattice.kind.bounded\n", "\n", ALL_DRAWN),
     of_host("total variation as of one step", TRAINER, "self._updates, fraction, n_steps)",
             "self._updates, fraction, 1)", VARIATION),
     of_host("total variation of the grid that is", GROWN, "voxels=config.grid.n_nodes,",
@@ -292,7 +299,7 @@ MUTANTS = [
     of_host("no gradient lies in shared memory", TRAINER, "config.threads, peers.zeros)", "config.threads)", PROCESSES),
     of_host("the shared are not summed", "torch/processes.py", "            add()\n", "            pass\n", PROCESSES),
     of_host("each process's mean is over its own rays", TRAINER,
-            "self._seen * (batch.count / self._sampler.count(n_steps))", "self._seen", PROCESSES),
+            "self._empty.seen * (batch.count / self._sampler.count(n_steps))", "self._empty.seen", PROCESSES),
     of_host("an older reach is the distance", PLANNED, "one, distances, self.reach)", "one, distances, one)", WITHOUT_PLAN),
     of_host("older distances are forgotten", PLANNED, "list(self.content_distances or [one] * n_views)",
             "[one] * n_views", OLDER_DISTANCES),
@@ -369,6 +376,13 @@ MUTANTS = [
     of_host("misfits: the best first", MISFITS, "key=psnr.__getitem__", "key=lambda name: -psnr[name]", FAR_BELOW),
     of_host("misfits: of few photographs", MISFITS, "if len(psnr) < FEWEST:", "if not psnr:", FEW_TELL),
     of_host("misfits: not said", "cli/training.py", 'print(f"warning: {sentence}")', "pass", ARE_SAID),
+    # free_space.py, from settle_at on
+    of_host("settled: never", SKIPPED, "at is None or fraction < at:", "True:", SETTLED),
+    of_host("settled: from the start", SKIPPED, "at is None or fraction < at:", "at is None:", BEFORE_SETTLED),
+    of_host("settled: neighbours count as well", SKIPPED, "margin = 0 if self._settled else 1", "margin = 1", SETTLED),
+    of_host("settled: rays end where they did", SKIPPED, "max(steps.transmittance_min, SETTLED_TRANSMITTANCE)", "steps.transmittance_min", SETTLED),
+    of_host("settled: rays end early", SKIPPED, "max(steps.transmittance_min, SETTLED_TRANSMITTANCE)", "SETTLED_TRANSMITTANCE", SETTLED),
+    of_host("settled: not where it is resumed", TRAINER, "        self._empty.settles(self.fraction)\n", "", BEFORE_SETTLED),
     # optim.py
     of_host("edges for faces", SMOOTHING, "** (2.0 / 3.0)", "** (1.0 / 3.0)", FACE),
     of_host("each update's own", SMOOTHING, "factor = face * self.every * ", "factor = face * ", FACE),

@@ -210,7 +210,7 @@ MUTANTS = [
            "wp.max(s, int(distance[n - s * stride]))",
            "s + int(distance[n - s * stride])", OCCUPANCY),
     Mutant("occupancy: margin of a node", "fields/dense_bound.py",
-           "// n_cells - 1)", "// n_cells)", OCCUPANCY),
+           "// n_cells - margin)", "// n_cells - 1)", OCCUPANCY),
     Mutant("occupancy: columns swapped", "fields/dense_bound.py",
            "column = (start // n_cells) * grid.size[2]", "column = (start // n_cells) * n_cells",
            OCCUPANCY),

@@ -135,10 +135,12 @@ def test_a_training_does_what_its_plan_says(
     trainer = Trainer(scene(), plan)
     passed = set()
     while trainer.fraction < 1.0:
+        settled = trainer.fraction >= 0.5
         trainer.update()
         stage = plan.stages[trainer._grown]
         passed.add(stage.begins)
-        assert trainer.lattice.size == stage.size and trainer.march_steps() == stage.steps
+        steps = replace(stage.steps, transmittance_min=1e-2 if settled else 1e-3)
+        assert trainer.lattice.size == stage.size and trainer.march_steps() == steps
     assert passed == {stage.begins for stage in plan.stages}
 
 

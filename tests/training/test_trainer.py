@@ -26,7 +26,7 @@ from tests.support.tiny_trainings import (
 )
 from tests.support.tiny_trainings import early_growth as early_growth
 from warpnerf.checks import InputError
-from warpnerf.config import GridConfig, TrainConfig
+from warpnerf.config import GridConfig, MarchConfig, TrainConfig
 from warpnerf.model.models import Deferred
 from warpnerf.optim_config import OptimConfig
 from warpnerf.scenes.scene import Scene
@@ -155,6 +155,39 @@ def test_resumed_it_draws_from_the_same_pixels(tmp_path: Path, on_cpu: None) -> 
         assert_same_state(without_seconds(resumed), without_seconds(whole))
 
 
+def test_once_surfaces_stand_less_is_sampled(on_cpu: None) -> None:
+    """Cells without their neighbours, and rays up to 1 % of the light."""
+
+    def trained(settle_at: float | None, **march: float) -> Trainer:
+        config = tiny_config(**QUICK, settle_at=settle_at, march=MarchConfig(**march))
+        trainer = Trainer(large_ball(), config)
+        trainer.run()
+        return trainer
+
+    never, settled = trained(None), trained(0.5)
+    assert settled.free.share() < 0.9 * never.free.share()
+    assert settled.report().samples_per_ray < 0.9 * never.report().samples_per_ray
+    assert never.field().steps.transmittance_min == 1e-3
+    assert settled.field().steps.transmittance_min == 1e-2
+    assert trained(0.5, transmittance_min=0.05).field().steps.transmittance_min == 0.05
+
+
+def test_before_surfaces_stand_nothing_changes(tmp_path: Path, on_cpu: None) -> None:
+    """Until then, and where it was resumed after, a training is that of one that never settles."""
+    settles, never = (tiny_config(**QUICK, settle_at=at) for at in (0.5, None))
+    states = [
+        stopped_at(30, tmp_path / "state", config, large_ball()) for config in (settles, never)
+    ]
+    np.testing.assert_array_equal(*(state.field.storage.values.numpy() for state in states))
+    whole = stopped_at(60, tmp_path / "whole", settles, large_ball())
+    for step in (29, 30, 31, 58):
+        begun = stopped_at(step, tmp_path / "begun", settles, large_ball())
+        steps = Trainer(large_ball(), settles, begun).field().steps
+        assert steps.transmittance_min == (1e-3 if step < 30 else 1e-2)
+        resumed = stopped_at(60, tmp_path / "resumed", settles, large_ball(), begun)
+        assert_same_state(without_seconds(resumed), without_seconds(whole))
+
+
 def test_resumed_with_a_single_cell_it_ends_the_same(tmp_path: Path, on_cpu: None) -> None:
     grid = GridConfig(voxels=30, grow_at=(), alpha_init=0.5)
     config = tiny_config(**QUICK | {"grid": grid, "optim": OptimConfig(accumulate_at=())})
@@ -166,6 +199,12 @@ def test_resumed_with_a_single_cell_it_ends_the_same(tmp_path: Path, on_cpu: Non
         assert begun.field.free.size == (1, 1, 1)
         resumed = stopped_at(60, tmp_path / "resumed", config, scene, begun)
         assert_same_state(without_seconds(resumed), without_seconds(whole))
+
+
+def test_where_the_time_was_spent_before_one_update_is_left(on_cpu: None) -> None:
+    trainer = Trainer(ball(), tiny_config(time_limit=0.5), seconds=0.6)
+    trainer.run()
+    assert trainer.steps_done == 1
 
 
 def test_total_variation_ends_when_it_is_told_to(tmp_path: Path, on_cpu: None) -> None:

@@ -49,6 +49,7 @@ class FreeCells:
         march: Any,
         alpha_min: float,
         sampler: Sampler = STEPS,
+        margin: int = 1,
     ) -> FreeCells:
         """Compute the occupancy grid of a field.
 
@@ -58,9 +59,10 @@ class FreeCells:
             march: The sampler's parameters: opacity is judged over the longest step there can be.
             alpha_min: The least opacity that counts as visible, of what nodes bound.
             sampler: Where steps lie.
+            margin: How many nodes around a cell count as well, along each axis.
         """
         lattice, size = storage.lattice, storage.lattice.cells
-        highest = storage.highest_densities(workers)
+        highest = storage.highest_densities(workers, margin)
         n, cells = math.prod(size), wp.vec3i(*size)
         distance = wp.empty(n, dtype=wp.uint8, device=workers.device)
         span = 1 if workers.device.is_cuda else size[2]  # a core takes a row

@@ -191,11 +191,12 @@ class Storage(ABC):
         """
         yield 0, self.node_densities(workers)
 
-    def highest_densities(self, workers: Workers) -> wp.array:
-        """The highest raw density of the nodes in and next to each cell of free space.
+    def highest_densities(self, workers: Workers, margin: int) -> wp.array:
+        """The highest raw density of the nodes of each cell of free space, and of those around.
 
         Args:
             workers: Where to work.
+            margin: How many nodes around a cell count as well, along each axis.
 
         Returns:
             [MX * MY * MZ]
@@ -216,6 +217,7 @@ class Storage(ABC):
                 n * of_plane,
                 grid_struct(dense, values, (n, *lattice.size[1:]), lattice.border),
                 size[2],
+                margin,
                 highest[first * of_plane : (first + n) * of_plane],
             )
         for axis in (1, 0):  # from nodes to cells
@@ -228,6 +230,7 @@ class Storage(ABC):
                 lattice.size[axis],
                 size[axis],
                 math.prod(shape[axis + 1 :]),
+                margin,
                 joined,
             )
             highest = joined

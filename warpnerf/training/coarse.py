@@ -142,6 +142,7 @@ def extent_by_training(
         # Without a decay: what is near is not known yet.
         optim=replace(config.optim, restart_at_growth=False, near_decay=0.0),
         appearance="none",
+        settle_at=None,
         field=DENSE,
         sampler=MARCHED,
     )

@@ -27,7 +27,7 @@ from warpnerf.scenes.extent.points import ObservedExtent, with_extent
 from warpnerf.scenes.scene import Scene
 from warpnerf.training.exposure import STATE, Exposures, exposures_of
 from warpnerf.training.extent import march_steps, require_samples
-from warpnerf.training.free_space import cull_background, free_cells, occupied_box, pixel_sampler
+from warpnerf.training.free_space import EmptySpace, occupied_box, pixel_sampler
 from warpnerf.training.growth import (
     first_storage,
     grown_states,
@@ -120,7 +120,6 @@ class Trainer:
         assert isinstance(config.model, Model)
         self.model = config.model
         self.peers = peers
-        self.free = FreeCells.none(self.workers)
         self._report_due = False
         self._started: float | None = None
         self._seconds = seconds
@@ -130,8 +129,11 @@ class Trainer:
             self.proposal = first_proposal(plan, self.workers.device)
             self.weights = first_weights(self.model, config.seed, self.workers)
             self.optimiser = first_states(self.parameters(), self.workers)
+            free = FreeCells.none(self.workers)
         else:
-            self._restore(resume)
+            free = self._restore(resume)
+        self._empty = EmptySpace(config, self._sampler, free, self.workers)
+        self._empty.settles(self.fraction)
         self.exposures: Exposures | None = None
         """Those of the training views, where it fits them."""
         if resume is None or STATE in self.optimiser:  # else they were dropped
@@ -142,8 +144,7 @@ class Trainer:
         self.photograph_errors = PhotographErrors(len(scene.splits["train"]))
         """Of the rays of reports, since it was set up."""
         self._views: wp.array | None = None
-        self._occupied = self.free.share()
-        self._seen = self._cull_background()
+        self._empty.cull_background(self.lattice)
         self._pass = self._training_pass()
         self._regularise_lattice()
 
@@ -181,7 +182,10 @@ class Trainer:
                 on_checkpoint(self.state())
                 self.peers.wait()
                 saved_step, saved_at = self.steps_done, time.monotonic()
-            if self.fraction >= 1.0 or agreed.stop:
+            done = (
+                self.fraction >= 1.0 and self.steps_done
+            )  # what came before may have taken all time
+            if done or agreed.stop:
                 break
             self.update()
             if between is not None and self._started is not None:
@@ -227,6 +231,9 @@ class Trainer:
             self._load_kernels()
         fraction = self.fraction
         self._grow(fraction)
+        if self._empty.settles(fraction):
+            self._drop_pass()
+            self._pass = self._training_pass()
         if self._updates % self.config.occupancy_every == 0:
             self._look_for_free_space()
         before = self.steps_done
@@ -248,7 +255,7 @@ class Trainer:
         """Add the gradient of a batch's losses to that of the update."""
         if self._resampling is not None:
             self._resampling.propose(self.free, batch, self.fraction)
-        share = self._seen * (batch.count / self._sampler.count(n_steps))
+        share = self._empty.seen * (batch.count / self._sampler.count(n_steps))
         self._pass.run(self.free, batch, n_steps, share)
         self._views = batch.views
         if self._resampling is not None:
@@ -303,8 +310,8 @@ class Trainer:
             psnr=-10.0 * math.log10(max(error / 3.0, 1e-12)),
             samples_per_ray=self._mean(self._pass.n_samples),
             size=self.lattice.size,
-            occupied=self._occupied,
-            seen=self._seen,
+            occupied=self._empty.occupied,
+            seen=self._empty.seen,
         )
         return self._progress
 
@@ -339,12 +346,12 @@ class Trainer:
         values = ((f"{p.name} of the model are", p.values.numpy()) for p in self.parameters())
         require_finite(values, self.plan, self.steps_done)
 
-    def _restore(self, state: TrainingState) -> None:
-        """Take over copies of a state's arrays, and where it stands."""
+    def _restore(self, state: TrainingState) -> FreeCells:
+        """Take over copies of a state's arrays, and where it stands; its free cells."""
         state = state.copied_to(self.workers.device)
         field = state.field
         self.storage, self.weights = field.storage, field.weights
-        self.proposal, self.free = field.proposal, field.free
+        self.proposal = field.proposal
         self.optimiser = state.optimiser
         self._grown = state.grown
         self._updates = state.updates
@@ -352,6 +359,12 @@ class Trainer:
         self._progress = state.progress
         self.steps_done = state.progress.step
         self._seconds = state.progress.seconds
+        return field.free
+
+    @property
+    def free(self) -> FreeCells:
+        """Which cells hold nothing."""
+        return self._empty.free
 
     @property
     def lattice(self) -> Lattice:
@@ -373,7 +386,8 @@ class Trainer:
 
     def march_steps(self) -> Steps:
         """How rays are marched through the grid as it stands."""
-        return march_steps(self.config.march, self.lattice, self.lattice.size, self.plan.reach)
+        steps = march_steps(self.config.march, self.lattice, self.lattice.size, self.plan.reach)
+        return self._empty.shortened(steps)
 
     def parameters(self) -> tuple[Parameter, ...]:
         """What is trained."""
@@ -400,6 +414,12 @@ class Trainer:
             Objective(config=self.plan.losses, content_distance=self.plan.content_distance),
         )
 
+    def _drop_pass(self) -> None:
+        """What holds its arrays gives their memory back before more is requested."""
+        if self.peers.count > 1 and self.steps_done:  # of which one may be lost meanwhile
+            self.report()
+        del self._pass, self._resampling
+
     def _load_kernels(self) -> None:
         """Compile what is not yet in the cache."""
         of_training = kernels_of(self.plan, self.lattice.contraction, self.workers.device)
@@ -413,10 +433,8 @@ class Trainer:
         if grown <= self._grown or self.steps_done < FIRST_LOOK:
             return
         config, box, nodes = self.config, self._tight_box(), self.plan.stages[grown].nodes
-        if self.peers.count > 1 and self.steps_done:  # of which one may be lost meanwhile
-            self.report()
-        # What holds the old arrays gives their memory back before more is requested.
-        del self._pass, self._resampling, self.regulariser, self._decays
+        self._drop_pass()
+        del self.regulariser, self._decays
         before, shift = self.storage, (grown - self._grown) * config.grid.shift_at_growth
         storage = grown_storage(before, box, nodes, shift, self.workers)
         restarts = config.optim.restart_at_growth
@@ -448,7 +466,7 @@ class Trainer:
         """The box around what is occupied, where space is bounded; never larger than before."""
         if self.lattice.contracted or self.config.field.box_is_fixed:
             return self.lattice.box_min, self.lattice.box_max
-        self._find_free_space()
+        self._empty.look(self.storage, self.march_steps())
         return occupied_box(self.lattice, self.free)
 
     def _look_for_free_space(self) -> None:
@@ -458,12 +476,5 @@ class Trainer:
         """
         if self.steps_done < FIRST_LOOK:
             return
-        self._find_free_space()
-        self._seen = self._cull_background()
-
-    def _cull_background(self) -> float:
-        return cull_background(self._sampler, self.config, self.lattice, self.free)
-
-    def _find_free_space(self) -> None:
-        self.free = free_cells(self.config, self.storage, self.march_steps(), self.workers)
-        self._occupied = self.free.share()
+        self._empty.look(self.storage, self.march_steps())
+        self._empty.cull_background(self.lattice)

@@ -11,15 +11,15 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def first_node(cell: int, n_cells: int, n_nodes: int) -> int:
-    """Lowest node, on one axis, that a cell's samples or their neighbours' can touch."""
-    return wp.max(0, (cell * (n_nodes - 1)) // n_cells - 1)
+def first_node(cell: int, n_cells: int, n_nodes: int, margin: int) -> int:
+    """Lowest node, on one axis, that a cell's samples can touch, or so many before it."""
+    return wp.max(0, (cell * (n_nodes - 1)) // n_cells - margin)
 
 
 @wp.func
-def last_node(cell: int, n_cells: int, n_nodes: int) -> int:
+def last_node(cell: int, n_cells: int, n_nodes: int, margin: int) -> int:
     """Highest such node."""
-    return wp.min(n_nodes - 1, ((cell + 1) * (n_nodes - 1) + n_cells - 1) // n_cells + 1)
+    return wp.min(n_nodes - 1, ((cell + 1) * (n_nodes - 1) + n_cells - 1) // n_cells + margin)
 
 
 @cache
@@ -36,6 +36,7 @@ def find_highest_kernel(n_floats: int) -> wp.Kernel:
         grid: Grid,
         # choices
         n_cells: int,  # MZ, along z
+        margin: int,  # nodes beyond those of a cell that count as well
         # out
         out_highest: wp.array(dtype=real),  # [X * Y * MZ]
     ):
@@ -48,9 +49,9 @@ def find_highest_kernel(n_floats: int) -> wp.Kernel:
         cell = start % n_cells
         for n in range(start, start + span):
             highest = real(-1.0e30)
-            for k in range(
-                first_node(cell, n_cells, grid.size[2]), last_node(cell, n_cells, grid.size[2]) + 1
-            ):
+            low = first_node(cell, n_cells, grid.size[2], margin)
+            high = last_node(cell, n_cells, grid.size[2], margin)
+            for k in range(low, high + 1):
                 raw = grid.values[column + k][0]  # compared with itself, as isnan is a slow call
                 highest = wp.max(highest, wp.where(raw == raw, raw, real(1.0e30)))
             out_highest[n] = highest
@@ -70,14 +71,15 @@ def join_highest(
     n_nodes: int,  # along the axis
     n_cells: int,  # along the axis
     stride: int,  # along the axis, a multiple of span
+    margin: int,  # nodes beyond those of a cell that count as well
     # out
     out_highest: wp.array(dtype=real),  # [... * n_cells * stride]
 ):
     """Of what was found for nodes along one axis, the highest in and next to a cell."""
     start = (first + wp.tid()) * span
     cell = (start // stride) % n_cells
-    low = first_node(cell, n_cells, n_nodes)
-    high = last_node(cell, n_cells, n_nodes)
+    low = first_node(cell, n_cells, n_nodes, margin)
+    high = last_node(cell, n_cells, n_nodes, margin)
     begin = start // (n_cells * stride) * n_nodes * stride + start % stride
     for n in range(span):
         raw = real(-1.0e30)
