@@ -57,6 +57,16 @@ def test_json(tmp_path: Path) -> None:
         )
 
 
+def test_json_does_not_replace_the_scene(tmp_path: Path) -> None:
+    write_transforms(tmp_path / "scene", 6)
+    file = tmp_path / "scene" / "transforms.json"
+    before = file.read_bytes()
+    for scene in (tmp_path / "scene", file):
+        with pytest.raises(InputError, match=r"--json .*is a file that is read from"):
+            inspect_command(InspectOptions(scene=str(scene), json=file))
+    assert file.read_bytes() == before
+
+
 @pytest.mark.parametrize("output", ["plan.jpg", "nowhere/plan.png", "folder.png"])
 def test_a_plan_that_cannot_be_written_is_refused(tmp_path: Path, output: str) -> None:
     write_transforms(tmp_path / "scene", 6)

@@ -42,6 +42,9 @@ class InspectOptions:
     """As training will be given."""
 
 
+READ = ("transforms*.json", "metadata.json", "pose.json")
+"""What scenes may be read from, as patterns of names; --json does not replace it."""
+
 USUAL = Usual(
     (
         "model",
@@ -72,7 +75,8 @@ def inspect_command(options: InspectOptions, given: Annotated[Given, USUAL] = NO
             raise InputError(f"--output {output}: the plan is a PNG; let its name end in .png.")
         if not output.parent.is_dir():
             raise InputError(f"--output {output}: its folder does not exist; make it first.")
-    require_writable(json)
+    scene = Path(options.scene)
+    require_writable(json, [scene, *(path for kind in READ for path in scene.glob(kind))])
     if options.plots is not None and options.plots.exists() and not options.plots.is_dir():
         raise InputError(f"--plots {options.plots} is a file; name a folder.")
     configs = {
