@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from warpnerf.checks import InputError, cannot_write
+from warpnerf.checks import InputError, cannot_write, said
 from warpnerf.cli.arguments import SceneName, Settings, Usual
 from warpnerf.cli.configured import begun_with, configured
 from warpnerf.cli.given import NOTHING, Given
@@ -86,6 +87,8 @@ def inspect_command(options: InspectOptions, given: Annotated[Given, USUAL] = NO
         for name in DEFAULT_PRESETS
     }
     first = configs[DEFAULT_PRESETS[0]]
+    if not re.fullmatch(r"cpu|cuda(:\d+)?", first.device):
+        raise InputError(f"--device must be cpu, cuda, or cuda:1, ..., not {said(first.device)}.")
     distance = first.content_distance
     found = inspect(
         options.scene,
