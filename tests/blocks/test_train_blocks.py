@@ -55,6 +55,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert f"{folder}: block-0 has not been trained" in refused("eval", folder)
     code, out, err = run("train-blocks", folder, "--threads", "1")  # options are kept
     assert code == 0 and "block-0 is done" in out and "block-1 begins" not in out, (out, err)
+    assert "2 of 2 blocks done\n" in out
     return folder
 
 
@@ -177,6 +178,11 @@ def test_blocks_that_are_not_those_of_a_cut_are_refused(untrained: Path, tmp_pat
 
 
 @pytest.mark.ci  # a process of its own, in which Warp starts
+def test_blocks_are_not_resumed_as_a_run(trained: Path) -> None:
+    said = refused("train", "--resume", trained)
+    assert f"--resume {trained} holds blocks; warpnerf train-blocks {trained} continues" in said
+
+
 def test_blocks_are_read_in_silence(trained: Path) -> None:
     done = cli_process.run("eval", trained, env=dict(os.environ))
     assert done.returncode == 0 and done.stderr == ""

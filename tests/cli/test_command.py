@@ -121,11 +121,20 @@ def test_eval_repeats_the_figures(trained: tuple[Path, str], tmp_path: Path) -> 
     code, out, err = run("eval", folder, "--json", target, "--threads", "1")
     assert code == 0, err
     figures = json.loads(target.read_text())
-    assert list(figures) == ["mean", "floaters", "images"]
+    assert list(figures) == ["split", "mean", "floaters", "images"]
     for row in (figures["mean"], *figures["images"]):
         assert np.isfinite([row["psnr"], row["ssim"]]).all()
     assert figures == json.loads((folder / "metrics.json").read_text())
     assert f"{figures['mean']['psnr']:.2f}" in out
+
+
+@pytest.mark.parametrize("name", ["config.json", "metrics.json"])
+def test_eval_does_not_replace_what_the_run_keeps(trained: tuple[Path, str], name: str) -> None:
+    file = trained[0] / name
+    before = file.read_bytes()
+    code, _, err = run("eval", trained[0], "--split", "train", "--json", file)
+    assert code == 2 and f"--json {file}: is a file that is read from; choose another" in err
+    assert file.read_bytes() == before
 
 
 def test_eval_with_lpips(trained: tuple[Path, str], tmp_path: Path) -> None:

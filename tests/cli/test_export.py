@@ -134,7 +134,10 @@ def test_bad_input_is_refused_and_nothing_is_written(
 
 @pytest.mark.ci
 def test_several_files_are_written_in_one_pass(
-    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run_folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """Each with the bytes that it has alone; cameras, surface and splats are computed once."""
     names = ("a.glb", "b.ply", "c.splat.ply", "d.npz", "e")
@@ -158,6 +161,7 @@ def test_several_files_are_written_in_one_pass(
     (tmp_path / "all").mkdir()
     together = tuple(tmp_path / "all" / name for name in names)
     assert export_command(run_folder, together, threads=1) == 0
+    assert "nodes as a mesh, splats, a volume and a scene\n" in capsys.readouterr().out
     assert counted == {"visibility": 1, "extract_surface": 1, "splats_of": 1}
     for name in names[:-1]:
         assert (tmp_path / "all" / name).read_bytes() == (tmp_path / name).read_bytes(), name

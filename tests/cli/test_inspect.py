@@ -34,6 +34,22 @@ def test_a_table_and_a_plan(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert {path.name for path in (tmp_path / "plots").iterdir()} == {"cameras.png", "sampling.png"}
 
 
+def test_time_is_estimated_of_the_cpu_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_transforms(tmp_path / "scene", 6)
+    options = InspectOptions(scene=str(tmp_path / "scene"), json=tmp_path / "facts.json")
+    assert inspect_command(options, {"threads": ("1",)}) == 0
+    assert " on 1 CPU thread\n" in capsys.readouterr().out
+    assert inspect_command(options, {"device": ("cuda:1",)}) == 0
+    said = capsys.readouterr().out
+    assert "GiB of memory; time on cuda:1 is not estimated\n" in said and "CPU" not in said
+    costs = json.loads((tmp_path / "facts.json").read_text())["costs"].values()
+    assert [cost["seconds"] for cost in costs] == [None, None]
+    with pytest.raises(InputError, match=r"must be cpu, cuda, or cuda:1, \.\.\., not 'gpu'"):
+        inspect_command(options, {"device": ("gpu",)})
+
+
 def test_plots_are_not_written_through_a_link(tmp_path: Path) -> None:
     write_transforms(tmp_path / "scene", 6)
     (tmp_path / "plots").mkdir()
@@ -55,6 +71,16 @@ def test_json(tmp_path: Path) -> None:
         inspect_command(
             InspectOptions(scene=options.scene, json=tmp_path / "nowhere" / "facts.json")
         )
+
+
+def test_json_does_not_replace_the_scene(tmp_path: Path) -> None:
+    write_transforms(tmp_path / "scene", 6)
+    file = tmp_path / "scene" / "transforms.json"
+    before = file.read_bytes()
+    for scene in (tmp_path / "scene", file):
+        with pytest.raises(InputError, match=r"--json .*is a file that is read from"):
+            inspect_command(InspectOptions(scene=str(scene), json=file))
+    assert file.read_bytes() == before
 
 
 @pytest.mark.parametrize("output", ["plan.jpg", "nowhere/plan.png", "folder.png"])

@@ -146,14 +146,17 @@ def test_a_path_of_nerfstudio_is_followed(
     tree = {"camera_path": frames, "render_width": 30, "render_height": 20, "fps": 10}
     file = tmp_path / "camera_path.json"
     file.write_text(json.dumps(tree))
-    options: dict[str, Any] = {"fps": 10.0, "threads": 1, "show": ("colour",)}
+    options: dict[str, Any] = {"threads": 1, "show": ("colour",)}
     assert render_command(run_folder, path=str(file), output=tmp_path / "f", **options) == 0
-    assert "taken to be in the scene's coordinates" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "taken to be in the scene's coordinates" in out and "rendering 3 frames, path" in out
     assert len(list((tmp_path / "f").iterdir())) == 3
     transforms = {"transform": np.eye(3, 4).tolist(), "scale": 1.0}
     (tmp_path / "dataparser_transforms.json").write_text(json.dumps(transforms))
     assert render_command(run_folder, path=str(file), output=tmp_path / "g", **options) == 0
     assert "taken to be" not in capsys.readouterr().out
+    assert render_command(run_folder, path=str(file), output=tmp_path / "h", fps=5, **options) == 0
+    assert len(list((tmp_path / "h").iterdir())) == 2
     for name in ("00000.png", "00002.png"):
         first, second = (np.asarray(Image.open(tmp_path / f / name)) for f in "fg")
         np.testing.assert_array_equal(first, second)

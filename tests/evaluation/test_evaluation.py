@@ -112,7 +112,7 @@ def test_a_view_that_is_fog_is_told() -> None:
 def test_json_has_the_promised_form() -> None:
     field = tiny_field()
     without = json.loads(evaluate(field, scene_of(field, depth=False)).to_json())
-    assert list(without) == ["mean", "floaters", "images"]
+    assert list(without) == ["split", "mean", "floaters", "images"]
     assert list(without["mean"]) == ["psnr", "cc_psnr", "ssim", "flip"]
     assert list(without["floaters"]) == ["within", "near_mass", "near_rays"]
     assert [list(image) for image in without["images"]] == [

@@ -34,7 +34,7 @@ FLAGS = [
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    field, scene = ball_field(), ball_scene()
+    field, scene = ball_field(), replace(ball_scene(), name="a <b>")
     views = [scene.views[index] for index in scene.splits["train"]]
     splats = splats_of(field, visibility(field, views))
     file = tmp_path_factory.mktemp("page") / "b.html"
@@ -62,6 +62,7 @@ def test_an_exported_page_begins_where_most_is_seen(
 def test_the_page_loads_nothing(page: Path, capfd: pytest.CaptureFixture[str]) -> None:
     text = page.read_text()
     assert text.lstrip().lower().startswith("<!doctype html>")
+    assert "<title>a &lt;b&gt;</title>" in text
     assert not re.search(r"<(script|img|iframe)[^>]* src=[\"']?(https?:)?//", text)
     assert not re.search(r"<link[^>]* href=[\"']?(https?:)?//", text)
 

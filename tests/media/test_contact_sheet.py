@@ -202,3 +202,11 @@ def test_a_sheet_goes_where_its_run_goes(tmp_path: Path) -> None:
     run.sheet.write_bytes(b"older")
     run.create(small_scene(), "builtin:room", 1, 2.0, TrainConfig())
     assert not run.sheet.exists()
+
+
+def test_what_the_typeface_has_not_is_not_drawn_as_boxes() -> None:
+    name, plain = (
+        contact_sheet([row(60, 40, name=f"{letter}.png")], f"{letter}: 1 view", 1.0, 3.0)
+        for letter in "\u00fcu"
+    )
+    np.testing.assert_array_equal(name, plain)

@@ -50,7 +50,8 @@ def test_frames_are_the_cameras_in_the_scenes_coordinates(tmp_path: Path) -> Non
     transform = np.concatenate([TURN, shift[:, None]], axis=1).tolist()
     transforms.write_text(json.dumps({"transform": transform, "scale": scale}))
     read = read_nerfstudio_path(write(tmp_path, moved), transforms)
-    assert read.seconds == pytest.approx(0.5) and (read.width, read.height) == (64, 36)
+    assert read.seconds == pytest.approx(0.5) and read.fps == pytest.approx(10.0)
+    assert (read.width, read.height) == (64, 36)
     for k, camera in enumerate(read.cameras(5)):
         np.testing.assert_allclose(camera.c2w, poses[k][:3], atol=1e-9)
         assert camera.fy == pytest.approx(18.0 / np.tan(np.radians(20.0 + 0.5 * k)))

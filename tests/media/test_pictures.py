@@ -12,6 +12,8 @@ from warpnerf.media.pictures import (
     comparison,
     depth_colours,
     depth_legend,
+    drawable,
+    font,
     picture_files,
     write_png,
 )
@@ -164,3 +166,15 @@ def test_names_of_pictures_fit_a_file_system(tmp_path: Path) -> None:
         write_png(tmp_path / name, np.zeros((2, 2, 3)))
     assert len(list(tmp_path.iterdir())) == len(names)
     assert files[names[0]].endswith("x1.png")
+
+
+def test_names_are_drawn_in_letters_that_the_typeface_has() -> None:
+    assert drawable("a_1 (b).png") == "a_1 (b).png"
+    assert (
+        drawable("caf\u00e9 cafe\u0301 Stra\u00dfe \u0141\u00f3d\u017a") == "cafe cafe Strasse Lodz"
+    )
+    assert drawable("\u4e2d\u6587\n.jpg") == "???.jpg"
+    missing = bytes(font(20).getmask("\u4e2d"))
+    drawn = {c for c in map(chr, range(0x3000)) if drawable(c) == c and c != " "}
+    assert "~" in drawn and "\u201c" in drawn
+    assert all(bytes(font(20).getmask(letter)) != missing for letter in drawn)

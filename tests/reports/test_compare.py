@@ -225,14 +225,21 @@ def test_a_sentence_tells_better_from_worse_and_from_chance() -> None:
     }
     said, caution = sentences([row(plain), row(other, plain)])
     assert said.startswith("b against a: better in PSNR (+1.00, ")
-    assert "worse in light at surfaces, training rays (-0.1000" in said
-    assert "changed in light in front, training rays (-0.1000" in said
-    assert "no significant difference in optical depth near cameras" in said
+    assert ". Worse in light at surfaces, training rays (-0.1000" in said
+    assert ". Changed in light in front, training rays (-0.1000" in said
+    assert ". No significant difference in optical depth near cameras." in said
     assert "by Student's t" in caution
     assert "Of 4 differences, 0.2 are expected to look significant by chance." in caution
     single = replace(row({"psnr": [21.0]}, {"psnr": [20.0]}), seconds=[1.0])
     (said,) = sentences([single])
     assert said.startswith("One seed")
+
+
+def test_names_with_commas_are_told_apart() -> None:
+    plain = {"psnr": [20.0] * 3, "front_train": [0.5] * 3, "hit_train": [0.4] * 3}
+    other = {"psnr": [20.1, 19.9, 20.0], "front_train": [0.5] * 3, "hit_train": [0.4, 0.5, 0.3]}
+    said, _ = sentences([row(plain), row(other, plain)])
+    assert "in PSNR; light in front, training rays; light at surfaces, training rays." in said
 
 
 def test_each_is_compared_with_the_first_scaling_of_its_own_kind() -> None:

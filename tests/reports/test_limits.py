@@ -61,6 +61,22 @@ def test_the_largest_is_named(
     assert says in str(limit)
 
 
+def test_a_fall_is_called_so_and_is_for_want_of_time_where_the_grid_has_just_grown() -> None:
+    """Colours of what is not yet clear come closer where they are corrected, too."""
+    test = {"psnr": 28.0, "cc_psnr": 30.2}
+    fallen = what_limits(reports(-5.0), 1.3, test)
+    assert fallen is not None and fallen.name == "exposures"
+    grown = [
+        replace(report, size=(20, 20, 20)) if report.fraction > 0.75 else report
+        for report in reports(-5.0)
+    ]
+    limit = what_limits(grown, 1.3, test)
+    assert limit is not None and limit.name == "time"
+    assert "fell by 4.9 dB in the last third, in which the grid grew; try more --st" in str(limit)
+    nothing = what_limits(reports(-0.9), 1.3, metrics_of(29.0))
+    assert nothing is not None and str(nothing).endswith("and fell by 0.9 dB in the last third")
+
+
 def test_exposures_are_named_where_corrected_colours_come_closer() -> None:
     for test, corrected, name in ((28.1, 28.4, "nothing"), (26.4, 27.9, "exposures")):
         limit = what_limits(reports(0.3), 1.3, {"psnr": test, "cc_psnr": corrected})

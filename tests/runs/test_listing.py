@@ -62,6 +62,15 @@ def test_the_table(
     assert runs_table(runs_in(Path()), Path()).splitlines()[1].startswith("a ")
 
 
+def test_figures_of_training_views_are_told_from_those_of_test_views(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = folder / "a" / "metrics.json"
+    file.write_text(json.dumps({"split": "train", **json.loads(file.read_text())}))
+    assert main(["runs", str(folder)]) == 0
+    assert "2:05  2 train  31.42" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("name", wn.PRESETS)
 def test_a_configuration_in_words(name: str) -> None:
     config = wn.PRESETS[name]

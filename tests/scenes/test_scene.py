@@ -9,7 +9,7 @@ import pytest
 
 from tests.support.tiny_scenes import camera_at, picture, ring
 from warpnerf.checks import InputError
-from warpnerf.scenes.scene import Scene, View
+from warpnerf.scenes.scene import Scene, View, require_split
 
 
 def view_of(**changes: Any) -> View:
@@ -80,3 +80,8 @@ def test_kinds_of_scenes() -> None:
     assert scene_of(views=views, splits=scene.splits, unbounded=True).kind == "unbounded"
     plain = scene_of(views=views, splits={"train": (0, 2), "test": (1,)})
     assert not plain.has_alpha and plain.kind == "bounded"
+
+
+def test_a_split_without_views_is_not_among_those_that_there_are() -> None:
+    with pytest.raises(InputError, match=r"by hand has no 'test' views; it has train or all\.$"):
+        require_split(scene_of(), "test")

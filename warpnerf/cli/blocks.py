@@ -204,7 +204,9 @@ class _Board:
             return
         running = [f"{s.name} {s.fraction:.0%}" for s in states if s.state == "training"]
         done = sum(state.state == "done" for state in states)
-        line = f"{done} of {len(states)} blocks done; training {', '.join(running) or 'none'}"
+        line = f"{done} of {len(states)} blocks done"
+        if running:
+            line += f"; training {', '.join(running)}"
         if line != self._last:
             print(line, flush=True)
             self._last = line

@@ -98,7 +98,8 @@ def export_command(
     n_cameras = len(views.training_cameras)
     grid = " x ".join(map(str, field.lattice.size))
     kinds = dict.fromkeys(FORMATS[ending] for ending in endings)
-    what = " and ".join(kind if kind.endswith("s") else f"a {kind}" for kind in kinds)
+    *most, last = (kind if kind.endswith("s") else f"a {kind}" for kind in kinds)
+    what = f"{', '.join(most)} and {last}" if most else last
     print(f"exporting a grid of {grid} nodes as {what}", flush=True)
     with ProgressBar("first training camera") as bar:
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from warpnerf.checks import InputError, cannot_write
+from warpnerf.checks import InputError, cannot_write, said
 from warpnerf.cli.arguments import SceneName, Settings, Usual
 from warpnerf.cli.configured import begun_with, configured
 from warpnerf.cli.given import NOTHING, Given
@@ -42,6 +43,9 @@ class InspectOptions:
     """As training will be given."""
 
 
+READ = ("transforms*.json", "metadata.json", "pose.json")
+"""What scenes may be read from, as patterns of names; --json does not replace it."""
+
 USUAL = Usual(
     (
         "model",
@@ -72,7 +76,8 @@ def inspect_command(options: InspectOptions, given: Annotated[Given, USUAL] = NO
             raise InputError(f"--output {output}: the plan is a PNG; let its name end in .png.")
         if not output.parent.is_dir():
             raise InputError(f"--output {output}: its folder does not exist; make it first.")
-    require_writable(json)
+    scene = Path(options.scene)
+    require_writable(json, [scene, *(path for kind in READ for path in scene.glob(kind))])
     if options.plots is not None and options.plots.exists() and not options.plots.is_dir():
         raise InputError(f"--plots {options.plots} is a file; name a folder.")
     configs = {
@@ -82,6 +87,8 @@ def inspect_command(options: InspectOptions, given: Annotated[Given, USUAL] = NO
         for name in DEFAULT_PRESETS
     }
     first = configs[DEFAULT_PRESETS[0]]
+    if not re.fullmatch(r"cpu|cuda(:\d+)?", first.device):
+        raise InputError(f"--device must be cpu, cuda, or cuda:1, ..., not {said(first.device)}.")
     distance = first.content_distance
     found = inspect(
         options.scene,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -96,8 +97,16 @@ def warmup_command(
     return 0
 
 
-def require_writable(path: Path | None) -> None:
-    """Raise InputError where --json names a folder, or a file in none or in one of others'."""
+def require_writable(path: Path | None, inputs: Iterable[Path] = ()) -> None:
+    """Refuse what --json names before anything is computed.
+
+    Args:
+        path: What it names; None: nothing.
+        inputs: Files that are not replaced, whether or not they exist: a run's or a scene's.
+
+    Raises:
+        InputError: It is a folder, a file in none or in one of others', or one of ``inputs``.
+    """
     if path is None:
         return
     if path.is_dir():
@@ -106,6 +115,8 @@ def require_writable(path: Path | None) -> None:
         raise InputError(f"--json {path}: its folder does not exist; make it first.")
     if not os.access(path.parent if path.is_file() or not path.exists() else path, os.W_OK):
         raise InputError(f"--json {path}: its folder cannot be written to; choose another one.")
+    if path.exists() and any(own.exists() and path.samefile(own) for own in inputs):
+        raise InputError(f"--json {path}: is a file that is read from; choose another name.")
 
 
 def write_json(path: Path, text: str) -> None:

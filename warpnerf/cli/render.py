@@ -10,6 +10,7 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_args
 
 import tyro
+from msgspec import UNSET
 
 from warpnerf.checks import InputError, cannot_write, require_positive
 from warpnerf.cli.arguments import Corners, RunFolder
@@ -63,7 +64,7 @@ class RenderOptions:
     size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="WIDTH HEIGHT")] = None
     """Of the colour picture, pixels; by default as the photographs, or as recorded."""
     fps: float | None = None
-    """Frames per second, by default 30."""
+    """Frames per second, by default 30, or those of nerfstudio's path."""
     seconds: float | None = None
     """Length of the video; by default 8, or as recorded."""
     distance: float | None = None
@@ -137,7 +138,9 @@ def render_command(
     config = run.read_config()
     recorded = options.recorded(scene, config)
     path, stills, output = options.path, options.only_stills, options.output
-    fps = FPS if options.fps is None else options.fps
+    fps = options.fps
+    if fps is None:
+        fps = FPS if recorded is None or recorded.fps is UNSET else recorded.fps
     if not stills:
         name = "video" if path == "auto" else path if recorded is None else Path(path).stem
         ending = "mov" if options.transparent else "mp4"
@@ -160,7 +163,7 @@ def render_command(
         length = recorded.seconds or SECONDS  # one place only takes no time
         n_frames = _n_frames(fps, length if options.seconds is None else options.seconds)
         cameras = recorded.cameras(n_frames, options.size)
-        what = f"{n_frames} frames, path {path}"
+        what = f"{_frames(n_frames)}, path {path}"
     elif not stills:
         from warpnerf.media.camera_path import PathKind, camera_path, natural_path
 
@@ -168,7 +171,7 @@ def render_command(
         kind = natural_path(views) if path == "auto" else cast(PathKind, path)
         n_frames = _n_frames(fps, SECONDS if options.seconds is None else options.seconds)
         cameras = camera_path(views, kind, n_frames, size=options.size, distance=options.distance)
-        what = f"{n_frames} frames, path {kind!r}"
+        what = f"{_frames(n_frames)}, path {kind!r}"
     else:
         views = load_run_scene(config, scene, threads)
         named = _still_cameras(views, options)
@@ -232,6 +235,10 @@ def _recorded(path: str, transforms: Path | None, config: TrainedScene) -> Recor
             "--path-transforms names that of its nerfstudio run"
         )
     return read_nerfstudio_path(Path(path), transforms, Path(config.scene), config.offset)
+
+
+def _frames(count: int) -> str:
+    return f"{count} frame{'s' if count > 1 else ''}"
 
 
 def _n_frames(fps: float, seconds: float) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shlex
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -183,8 +184,14 @@ def _resume(
     peers: Peers,
 ) -> int:
     """Train from the last checkpoint on."""
+    from warpnerf.blocks.folder import FILE
     from warpnerf.runs.run import Run
 
+    if (folder / FILE).is_file():
+        raise InputError(
+            f"--resume {folder} holds blocks; warpnerf train-blocks {shlex.quote(str(folder))} "
+            "continues their trainings."
+        )
     run = Run(folder)
     run.read_config()
     with ExitStack() as stack:  # the first process alone writes

@@ -89,6 +89,8 @@ class Evaluation:
     """Image metrics of all views of a split, PSNR, SSIM and others, and floater metrics before the
     training cameras."""
 
+    split: str
+    """Of which: test, train, val or all."""
     images: tuple[ImageMetrics, ...]
     """In the scene's order."""
     near_field: NearField
@@ -108,13 +110,15 @@ class Evaluation:
         return means
 
     def to_json(self) -> str:
-        """Metrics as JSON: {"mean": {"psnr": ..., ...}, "floaters": {...}, "images": [{"name": ...,
-        ...}, ...], "measures": {...}}, the last where they were measured."""
+        """Metrics as JSON: {"split": "test", "mean": {"psnr": ..., ...}, "floaters": {...},
+        "images": [{"name": ..., ...}, ...], "measures": {...}}, the last where they were
+        measured."""
         images = [
             {key: value for key, value in vars(image).items() if value is not None}
             for image in self.images
         ]
         content: dict[str, Any] = {
+            "split": self.split,
             "mean": self.mean,
             "floaters": self.near_field.to_dict(),
             "images": images,
@@ -225,7 +229,7 @@ def evaluate(
     if measuring is not None:
         found = measuring.finish(masses, lambda words: on_progress(so_far, words))
     on_progress(1.0, "what is near the cameras")
-    return Evaluation(images=tuple(images), near_field=near_field, measures=found)
+    return Evaluation(split=split, images=tuple(images), near_field=near_field, measures=found)
 
 
 def require_measurable(scene: Scene, split: str) -> None:

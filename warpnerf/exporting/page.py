@@ -5,11 +5,14 @@ Needs viser, the extra ``viewer``.
 
 from __future__ import annotations
 
+import html
+
 import numpy as np
 
 from warpnerf.checks import require_extra
 from warpnerf.exporting.splats import Splats
 from warpnerf.scenes.cameras.camera import Camera
+from warpnerf.scenes.files import printable
 from warpnerf.scenes.scene import Scene
 from warpnerf.viewer.server import close_server, open_server
 from warpnerf.viewer.viewpoint import World, first_look
@@ -26,7 +29,7 @@ def splats_html(
     background: tuple[float, float, float],
     begin: Camera | None = None,
 ) -> list[bytes]:
-    """A page of splats.
+    """A page of splats, whose title is the scene's name.
 
     Args:
         splats: What it shows.
@@ -59,4 +62,5 @@ def splats_html(
         text = server.scene.as_html()
     finally:
         close_server(server)
-    return [text.encode()]
+    title = f"<title>{html.escape(printable(scene.name))}</title>"
+    return [text.replace("<title>Viser</title>", title, 1).encode()]

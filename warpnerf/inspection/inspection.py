@@ -57,6 +57,15 @@ class Cost:
     threads: int
     """For so many threads."""
 
+    @property
+    def time(self) -> str:
+        """The seconds in words, or that they are not known of the device to be trained on."""
+        device = self.plan.config.device
+        if device != "cpu":
+            return f"time on {device} is not estimated"
+        of = f"{self.threads} CPU thread{'s' if self.threads > 1 else ''}"
+        return f"very roughly {duration(self.seconds)} on {of}"
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Inspection:
@@ -133,7 +142,7 @@ class Inspection:
                 name: {
                     "model": to_json(cost.plan.config.model),
                     "memory": cost.plan.memory,
-                    "seconds": cost.seconds,
+                    "seconds": cost.seconds if cost.plan.config.device == "cpu" else None,
                     "threads": cost.threads,
                     "contraction": cost.plan.space.contraction,
                     "box_min": cost.plan.space.box_min.tolist(),
@@ -195,8 +204,7 @@ class Inspection:
                 (
                     f"training, {name}",
                     f"model {cost.plan.config.model.name}, rays {cost.plan.sampler.past}: about "
-                    f"{cost.plan.memory / 2**30:.2g} GiB of memory; "
-                    f"very roughly {duration(cost.seconds)} on {cost.threads} CPU threads",
+                    f"{cost.plan.memory / 2**30:.2g} GiB of memory; {cost.time}",
                 )
             )
             if cost.plan.config.field.as_fine_as_nodes:

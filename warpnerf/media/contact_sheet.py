@@ -15,6 +15,7 @@ from warpnerf.media.pictures import (
     depth_legend,
     depth_picture,
     dimmed,
+    drawable,
     font,
     to_bytes,
 )
@@ -74,6 +75,7 @@ def contact_sheet(rows: Sequence[SheetRow], title: str, near: float, far: float)
     Returns:
         [H, W, 3] uint8, W at most ``MAX_WIDTH``.
     """
+    title = drawable(title)
     columns = ["truth", "rendering", "depth"]
     if any(row.depth is not None for row in rows):
         columns.append("true depth")
@@ -97,7 +99,7 @@ def contact_sheet(rows: Sequence[SheetRow], title: str, near: float, far: float)
         at = (left + width / 2, top - _TEXT)
         draw.text(at, column, INK, font(_TEXT), anchor="mm")
     for row, images, tall in zip(rows, panels, heights, strict=True):
-        name = _shortened(row.name, _LABELS - _GAP, _TEXT)
+        name = _shortened(drawable(row.name), _LABELS - _GAP, _TEXT)
         draw.text((_MARGIN, top), name, INK, font(_TEXT))
         draw.text((_MARGIN, top + 1.6 * _TEXT), f"PSNR {row.psnr:.2f} dB", FAINT, font(_TEXT))
         for left, image in zip(lefts, images, strict=False):

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image, ImageDraw
 
-from warpnerf.media.pictures import INK, font
+from warpnerf.media.pictures import INK, drawable, font
 from warpnerf.media.plots import Frame
 
 SIZE = (1200, 760)
@@ -52,7 +52,7 @@ def curves(points: Sequence[CurvePoint], title: str) -> np.ndarray:
     """
     sheet = Image.new("RGB", SIZE, "white")
     draw = ImageDraw.Draw(sheet)
-    draw.text((12, 8), title, INK, font(_TITLE))
+    draw.text((12, 8), drawable(title), INK, font(_TITLE))
     width, height = SIZE[0] // 2, (SIZE[1] - 2 * _TITLE) // 2
     loss = np.array([math.log10(max(p.loss, 1e-12)) for p in points])
     psnr = np.array([p.psnr for p in points])

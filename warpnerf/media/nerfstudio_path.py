@@ -71,7 +71,7 @@ def read_nerfstudio_path(
         offset: [3] what the scene's coordinates are less than those of its file; None: nothing.
 
     Returns:
-        A path whose keys are the frames.
+        A path whose keys are the frames, with their number per second.
 
     Raises:
         InputError: A file cannot be read, or holds what no camera can do.
@@ -104,7 +104,7 @@ def read_nerfstudio_path(
         for at, frame, pose in zip(times, read.camera_path, poses, strict=True)
     ]
     width, height = map(round, sizes)
-    return checked_path(RecordedPath(width=width, height=height, keys=keys), path)
+    return checked_path(RecordedPath(width=width, height=height, keys=keys, fps=n / seconds), path)
 
 
 def _applied(scene: Path | None) -> Applied:

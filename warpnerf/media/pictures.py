@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import unicodedata
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
@@ -33,6 +34,13 @@ PHOTOGRAPH = re.compile(r"\.(?:jpe?g|png|tiff?|bmp|webp|heic|exr|dng)$", re.IGNO
 
 INK, FAINT = (30, 30, 34), (120, 120, 128)
 """Of text, and of what is less important; sRGB of 8 bits."""
+
+_DRAWN = "«»°±“”"
+"""What the typeface has besides ASCII."""
+_WITHOUT_PARTS = str.maketrans(
+    {"ß": "ss", "æ": "ae", "Æ": "AE", "œ": "oe", "Œ": "OE", "ø": "o", "Ø": "O", "ł": "l", "Ł": "L"}
+)
+"""Letters that are no others with an accent."""
 
 
 def depth_colours(depth: np.ndarray, near: float, far: float) -> np.ndarray:
@@ -202,6 +210,19 @@ def _round_depths(near: float, far: float) -> list[float]:
 def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     """The typeface of our pictures, that Pillow brings along, in a size in pixels."""
     return ImageFont.load_default(size)
+
+
+def drawable(text: str) -> str:
+    """A text in letters that the typeface of our pictures has.
+
+    It has no accents and one alphabet: letters are drawn without accents, and ? for all others.
+
+    Args:
+        text: Any, such as a scene's or a photograph's name.
+    """
+    plain = unicodedata.normalize("NFKD", text.translate(_WITHOUT_PARTS))
+    letters = (letter for letter in plain if not unicodedata.combining(letter))
+    return "".join(c if " " <= c <= "~" or c in _DRAWN else "?" for c in letters)
 
 
 def picture_files(names: Sequence[str], *, stems: bool = False) -> dict[str, str]:

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 from PIL import Image, ImageDraw
 
-from warpnerf.media.pictures import FAINT, INK, font
+from warpnerf.media.pictures import FAINT, INK, drawable, font
 
 COLOURS = (
     (31, 119, 180),
@@ -60,7 +60,7 @@ def line_plot(
             places[name] = [np.log10(v) if is_log else np.asarray(v, float) for v, is_log in both]
     sheet = Image.new("RGB", SIZE, "white")
     draw = ImageDraw.Draw(sheet)
-    draw.text((12, 8), title, INK, font(_TITLE))
+    draw.text((12, 8), drawable(title), INK, font(_TITLE))
     if not places:
         return np.asarray(sheet)
     along, up = (np.concatenate([place[k] for place in places.values()]) for k in range(2))

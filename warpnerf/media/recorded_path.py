@@ -60,6 +60,8 @@ class RecordedPath(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     """Of the picture, pixels."""
     keys: list[Key]
     """In the order of their times; at least one."""
+    fps: float | msgspec.UnsetType = msgspec.UNSET
+    """Frames per second, where a key is a frame; unset: any number."""
 
     @property
     def seconds(self) -> float:

@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw
 from warpnerf.checked import checked_arguments
 from warpnerf.evaluation.near_plan import NearPlan
 from warpnerf.inspection.inspection import Inspection
-from warpnerf.media.pictures import FAINT, INK, font
+from warpnerf.media.pictures import FAINT, INK, drawable, font
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.cameras.focus import horizontal_axes
 from warpnerf.scenes.cameras.observations import Observations
@@ -124,7 +124,7 @@ def blocks_picture(scene: Scene, cores: np.ndarray, boxes: np.ndarray) -> np.nda
     size = (_PANEL + 2 * _MARGIN, _HEADER + _PANEL + _MARGIN // 2)
     sheet = Image.new("RGB", size, "white")
     draw = ImageDraw.Draw(sheet)
-    draw.text((_MARGIN, 12 * _FINE), scene.name, INK, font(24 * _FINE))
+    draw.text((_MARGIN, 12 * _FINE), drawable(scene.name), INK, font(24 * _FINE))
     legend: list[tuple[str, Colour]] = [
         ("core", _BOX),
         ("trained for", _WIDER),
@@ -165,7 +165,7 @@ def near_picture(scene: Scene, plans: Mapping[str, NearPlan]) -> np.ndarray:
     size = (across * (_PANEL + _MARGIN) + _MARGIN, _HEADER + down * (_PANEL + _MARGIN))
     sheet = Image.new("RGB", size, "white")
     draw = ImageDraw.Draw(sheet)
-    title = f"{scene.name}: optical depth around the training cameras"
+    title = f"{drawable(scene.name)}: optical depth around the training cameras"
     draw.text((_MARGIN, 12 * _FINE), title, INK, font(20 * _FINE))
     width, x = 12 * _FINE, float(_MARGIN)
     for share in (0.0, 0.25, 0.5, 0.75, 1.0):
@@ -196,7 +196,7 @@ def _density_colour(share: np.ndarray) -> np.ndarray:
 
 def _header(draw: ImageDraw.ImageDraw, inspection: Inspection) -> None:
     scene = inspection.scene
-    draw.text((_MARGIN, 12 * _FINE), scene.name, INK, font(24 * _FINE))
+    draw.text((_MARGIN, 12 * _FINE), drawable(scene.name), INK, font(24 * _FINE))
     legend: list[tuple[str, Colour]] = [
         (f"{len(scene.splits['train'])} training cameras", _TRAIN),
         (f"{len(scene.splits['test'])} test cameras", _TEST),

@@ -225,7 +225,10 @@ def sentences(rows: Sequence[Row]) -> list[str]:
 
 
 def _verdict(row: Row) -> str:
-    """Figures that are better, worse, changed and not significantly different, in words."""
+    """Figures that are better, worse, changed and not significantly different, in words.
+
+    Names and intervals have commas; so lists are divided by semicolons, and groups by full stops.
+    """
     groups: dict[str, list[str]] = {"better in": [], "worse in": [], "changed in": []}
     rest = []
     for name, difference in row.differences.items():
@@ -239,10 +242,10 @@ def _verdict(row: Row) -> str:
         groups[how].append(
             f"{figure.heading.partition(' [')[0]} ({in_words(difference, figure.digits)})"
         )
-    parts = [f"{how} {', '.join(names)}" for how, names in groups.items() if names]
+    parts = [f"{how} {'; '.join(names)}" for how, names in groups.items() if names]
     if rest:
-        parts.append(f"no significant difference in {', '.join(rest)}")
-    return "; ".join(parts)
+        parts.append(f"no significant difference in {'; '.join(rest)}")
+    return ". ".join(part[0].upper() + part[1:] if k else part for k, part in enumerate(parts))
 
 
 def in_words(difference: Difference, digits: int) -> str:

@@ -42,6 +42,7 @@ class Report(msgspec.Struct, frozen=True):
 class Metrics(msgspec.Struct, frozen=True):
     """metrics.json, as far as it is listed."""
 
+    split: str = "test"
     mean: dict[str, float] = {}
     images: list[msgspec.Raw] = []
 
@@ -61,7 +62,9 @@ class RunSummary:
     seconds: float
     """Of training."""
     metrics: Mapping[str, float]
-    """Means over the test views, by name; empty: they were not looked at."""
+    """Means over the views that were measured, by name; empty: none were."""
+    split: str
+    """Which these are: test, or train of a run without test views."""
     n_views: int
     """Over how many views; 0: none, or it is not known."""
     n_bytes: int
@@ -186,7 +189,8 @@ def runs_table(runs: Sequence[RunSummary], folder: Path) -> str:
             for key, (_, how) in metrics.items()
         ]
         if metrics:
-            found.insert(0, str(run.n_views or ""))
+            kind = " train" if run.split == "train" else ""
+            found.insert(0, f"{run.n_views}{kind}" if run.n_views else "")
         rows.append(
             [
                 printable(folder.resolve().name) if name == "." else name,
@@ -215,6 +219,7 @@ def _summary(folder: Path) -> RunSummary:
         fraction=last.fraction,
         seconds=last.seconds,
         metrics=metrics.mean,
+        split=metrics.split,
         n_views=len(metrics.images),
         n_bytes=_disk_usage(folder),
     )

@@ -321,7 +321,6 @@ def require_split(scene: Scene, split: str) -> tuple[int, ...]:
     if split == "all":
         return tuple(range(len(scene.views)))
     if not scene.splits.get(split):
-        raise InputError(
-            f"{scene.name} has no {split!r} views; it has {', '.join(sorted(scene.splits))} or all."
-        )
+        there = ", ".join(name for name in sorted(scene.splits) if scene.splits[name])
+        raise InputError(f"{scene.name} has no {split!r} views; it has {there} or all.")
     return scene.splits[split]
