@@ -62,7 +62,8 @@ class MarchConfig:
     auto: 0.02 / grid.border, so that as many fall into a voxel of a wide shell as of a thin one, at
     most 0.1."""
     transmittance_min: float = 1e-3
-    """A ray ends where less light than this would pass."""
+    """Early ray termination: a ray ends where less light than this would pass; where it is as by
+    default, 0.01 once the training has settled (``TrainConfig.settle_at``)."""
     jitter: bool = True
     """Shift each training ray's samples by a random part of a step."""
 
@@ -140,9 +141,10 @@ class TrainConfig:
     """A cell is free where the longest step that there can be would be less opaque than this: what
     light crosses twenty voxels of is fog in most scenes. Smoke needs less."""
     settle_at: float | None = 0.5
-    """Share of the training after which surfaces stand where they will stay: free cells are then
-    those whose own nodes hold nothing, not their neighbours' as well, and rays end once 1 % of the
-    light is left. None: never."""
+    """Share of the training after which it settles, once the grid has its final size and 1000 steps
+    are done: surfaces then stand where they will stay. Free cells are from then on those whose own
+    nodes hold nothing, not their neighbours' as well (but for a hash), and rays end at 1 % of the
+    light, where ``march.transmittance_min`` is not configured. None: never."""
     seed: int = 0
     """Same seed, same number of threads: same bits on the CPU."""
     threads: int | None = None
@@ -297,9 +299,9 @@ class TrainConfig:
                 f"alpha_min must be an opacity in [0, 1), not {self.alpha_min}: from 1 on all "
                 "space is free, and nothing is seen."
             )
-        if self.settle_at is not None and not 0.0 < self.settle_at <= 1.0:
+        if self.settle_at is not None and not 0.0 < self.settle_at < 1.0:
             raise InputError(
-                f"settle_at must be a share of the training in (0, 1], not {said(self.settle_at)}; "
+                f"settle_at must be a share of the training in (0, 1), not {said(self.settle_at)}; "
                 "none leaves it out."
             )
         require_whole("seed", self.seed, 0)

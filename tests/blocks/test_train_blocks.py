@@ -177,12 +177,12 @@ def test_blocks_that_are_not_those_of_a_cut_are_refused(untrained: Path, tmp_pat
     assert f"{part} is a part of a capture already" in says and not (tmp_path / "parts").exists()
 
 
-@pytest.mark.ci  # a process of its own, in which Warp starts
 def test_blocks_are_not_resumed_as_a_run(trained: Path) -> None:
     said = refused("train", "--resume", trained)
     assert f"--resume {trained} holds blocks; warpnerf train-blocks {trained} continues" in said
 
 
+@pytest.mark.ci  # a process of its own, in which Warp starts
 def test_blocks_are_read_in_silence(trained: Path) -> None:
     done = cli_process.run("eval", trained, env=dict(os.environ))
     assert done.returncode == 0 and done.stderr == ""

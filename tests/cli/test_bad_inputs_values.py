@@ -188,10 +188,10 @@ def test_an_opacity_that_makes_all_space_free() -> None:
         wn.TrainConfig(alpha_min=5.0)
 
 
-@pytest.mark.parametrize("share", [0.0, 1.01, float("nan")])
+@pytest.mark.parametrize("share", [0.0, 1.0, float("nan")])
 def test_a_share_of_the_training_that_is_none(share: float) -> None:
     with pytest.raises(
-        InputError, match=rf"settle_at must be a share .* \(0, 1\], not {share}; none"
+        InputError, match=rf"settle_at must be a share .* \(0, 1\), not {share}; none"
     ):
         wn.TrainConfig(settle_at=share)
 

@@ -128,12 +128,12 @@ def test_eval_repeats_the_figures(trained: tuple[Path, str], tmp_path: Path) -> 
     assert f"{figures['mean']['psnr']:.2f}" in out
 
 
-@pytest.mark.parametrize("name", ["config.json", "metrics.json"])
+@pytest.mark.parametrize("name", ["config.json", "metrics.json", "field.safetensors"])
 def test_eval_does_not_replace_what_the_run_keeps(trained: tuple[Path, str], name: str) -> None:
     file = trained[0] / name
     before = file.read_bytes()
     code, _, err = run("eval", trained[0], "--split", "train", "--json", file)
-    assert code == 2 and f"--json {file}: is a file that is read from; choose another" in err
+    assert code == 2 and f"--json {file}: is another file, which would be replaced; choose" in err
     assert file.read_bytes() == before
 
 

@@ -78,7 +78,7 @@ def test_json_does_not_replace_the_scene(tmp_path: Path) -> None:
     file = tmp_path / "scene" / "transforms.json"
     before = file.read_bytes()
     for scene in (tmp_path / "scene", file):
-        with pytest.raises(InputError, match=r"--json .*is a file that is read from"):
+        with pytest.raises(InputError, match=r"--json .*is another file, which would be replaced"):
             inspect_command(InspectOptions(scene=str(scene), json=file))
     assert file.read_bytes() == before
 

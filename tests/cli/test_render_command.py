@@ -150,6 +150,11 @@ def test_a_path_of_nerfstudio_is_followed(
     assert render_command(run_folder, path=str(file), output=tmp_path / "f", **options) == 0
     out = capsys.readouterr().out
     assert "taken to be in the scene's coordinates" in out and "rendering 3 frames, path" in out
+    one = tmp_path / "one.json"
+    one.write_text(json.dumps(tree | {"camera_path": frames[:1], "fps": None, "seconds": 0.001}))
+    assert render_command(run_folder, path=str(one), output=tmp_path / "one", **options) == 0
+    assert len(list((tmp_path / "one").iterdir())) == 1
+    capsys.readouterr()
     assert len(list((tmp_path / "f").iterdir())) == 3
     transforms = {"transform": np.eye(3, 4).tolist(), "scale": 1.0}
     (tmp_path / "dataparser_transforms.json").write_text(json.dumps(transforms))

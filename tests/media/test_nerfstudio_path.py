@@ -87,6 +87,8 @@ def test_what_was_applied_before_and_an_offset_are_accounted_for(tmp_path: Path)
         ({"camera_type": "equirectangular"}, "only perspective is rendered"),
         ({"camera_path": []}, "has 0 frames"),
         ({"render_width": 0}, "render_width and render_height"),
+        ({"fps": -24}, r"json: fps is -24, but must be a number from 0 on"),
+        ({"seconds": -1}, r"json: seconds is -1, but must be"),
         ({"camera_path": [{"camera_to_world": [1.0] * 12, "fov": 50}]}, "must be 16 numbers"),
         ({"camera_path": [{"camera_to_world": [1.0] * 16, "fov": 50}]}, r"keys\[0\].c2w must turn"),
         ({"camera_path": 3}, "camera_path"),

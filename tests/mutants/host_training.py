@@ -88,11 +88,13 @@ FAR_BELOW, FEW_TELL, OPAQUE_COUNT, ARE_SAID = (
     "training/test_photograph_errors.py::test_late_rays_of_opaque_pixels_count",
     "cli/test_command.py::test_photographs_that_do_not_fit_are_said",
 )
-SETTLED, BEFORE_SETTLED = (
+SETTLED, BEFORE_SETTLED, HASH_SETTLED, SHORT_SETTLED = (
     f"training/test_trainer.py::test_{what}"
     for what in (
-        "once_surfaces_stand_less_is_sampled",
-        "before_surfaces_stand_nothing_changes",
+        "once_it_has_settled_less_is_sampled",
+        "settled_it_is_resumed_as_it_was",
+        "a_hash_is_judged_with_its_neighbours",
+        "short_trainings_do_not_settle",
     )
 )
 ELSE_TOLD = "training/test_photograph_errors.py::test_a_photograph_of_something_else_is_told"
@@ -299,7 +301,7 @@ MUTANTS = [
     of_host("no gradient lies in shared memory", TRAINER, "config.threads, peers.zeros)", "config.threads)", PROCESSES),
     of_host("the shared are not summed", "torch/processes.py", "            add()\n", "            pass\n", PROCESSES),
     of_host("each process's mean is over its own rays", TRAINER,
-            "self._empty.seen * (batch.count / self._sampler.count(n_steps))", "self._empty.seen", PROCESSES),
+            "self._space.seen * (batch.count / self._sampler.count(n_steps))", "self._space.seen", PROCESSES),
     of_host("an older reach is the distance", PLANNED, "one, distances, self.reach)", "one, distances, one)", WITHOUT_PLAN),
     of_host("older distances are forgotten", PLANNED, "list(self.content_distances or [one] * n_views)",
             "[one] * n_views", OLDER_DISTANCES),
@@ -377,12 +379,15 @@ MUTANTS = [
     of_host("misfits: of few photographs", MISFITS, "if len(psnr) < FEWEST:", "if not psnr:", FEW_TELL),
     of_host("misfits: not said", "cli/training.py", 'print(f"warning: {sentence}")', "pass", ARE_SAID),
     # free_space.py, from settle_at on
-    of_host("settled: never", SKIPPED, "at is None or fraction < at:", "True:", SETTLED),
-    of_host("settled: from the start", SKIPPED, "at is None or fraction < at:", "at is None:", BEFORE_SETTLED),
-    of_host("settled: neighbours count as well", SKIPPED, "margin = 0 if self._settled else 1", "margin = 1", SETTLED),
-    of_host("settled: rays end where they did", SKIPPED, "max(steps.transmittance_min, SETTLED_TRANSMITTANCE)", "steps.transmittance_min", SETTLED),
-    of_host("settled: rays end early", SKIPPED, "max(steps.transmittance_min, SETTLED_TRANSMITTANCE)", "SETTLED_TRANSMITTANCE", SETTLED),
-    of_host("settled: not where it is resumed", TRAINER, "        self._empty.settles(self.fraction)\n", "", BEFORE_SETTLED),
+    of_host("settled: never", SKIPPED, "if self._settled or at is None or fraction < at", "if True or at is None or fraction < at", SETTLED),
+    of_host("settled: from the start", SKIPPED, "or fraction < at or", "or", BEFORE_SETTLED),
+    of_host("settled: neighbours count as well", SKIPPED, "margin = 0 if self._settled and", "margin = 0 if False and", SETTLED),
+    of_host("settled: a hash without neighbours", SKIPPED, " and storage.kind.seen_share == 1.0 else 1", " else 1", HASH_SETTLED),
+    of_host("settled: in short trainings", SKIPPED, " or steps_done < FIRST_SETTLED", "", SHORT_SETTLED),
+    of_host("settled: rays end where they did", SKIPPED, "transmittance_min=SETTLED_TRANSMITTANCE)", "transmittance_min=MarchConfig.transmittance_min)", SETTLED),
+    of_host("settled: whatever is configured", SKIPPED, "if not (self._settled and usual):", "if not self._settled:", SETTLED),
+    of_host("settled: before the grid has grown", TRAINER, "return grown and self._space", "return self._space", SETTLED),
+    of_host("settled: not where it is resumed", TRAINER, "resume is not None and has_settled(resume)", "False", BEFORE_SETTLED),
     # optim.py
     of_host("edges for faces", SMOOTHING, "** (2.0 / 3.0)", "** (1.0 / 3.0)", FACE),
     of_host("each update's own", SMOOTHING, "factor = face * self.every * ", "factor = face * ", FACE),

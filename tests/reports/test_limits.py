@@ -73,6 +73,9 @@ def test_a_fall_is_called_so_and_is_for_want_of_time_where_the_grid_has_just_gro
     limit = what_limits(grown, 1.3, test)
     assert limit is not None and limit.name == "time"
     assert "fell by 4.9 dB in the last third, in which the grid grew; try more --st" in str(limit)
+    before = [replace(r, size=(20, 20, 20)) if r.fraction > 0.6 else r for r in reports(-5.0)]
+    fallen = what_limits(before, 1.3, test)
+    assert fallen is not None and fallen.name == "exposures"
     nothing = what_limits(reports(-0.9), 1.3, metrics_of(29.0))
     assert nothing is not None and str(nothing).endswith("and fell by 0.9 dB in the last third")
 

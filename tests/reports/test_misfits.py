@@ -65,4 +65,4 @@ def test_few_photographs_do_not_tell() -> None:
 def test_the_worst_are_named_first(below: tuple[float, ...], says: str) -> None:
     sentence = in_words(psnr_of(0.5, *below, n=8))
     assert sentence is not None and says in sentence
-    assert sentence.endswith("leave them out, as --split FILE does with those that FILE names")
+    assert sentence.endswith("take such ones out of the scene's folder or file of poses")

@@ -15,6 +15,7 @@ from warpnerf.config import GridConfig, TrainConfig
 from warpnerf.optim_config import OptimConfig
 from warpnerf.runs.checkpoint import load_checkpoint, save_checkpoint
 from warpnerf.scenes.scene import Scene
+from warpnerf.training import free_space
 from warpnerf.training import trainer as training
 from warpnerf.training.state import TrainingState
 from warpnerf.training.trainer import Trainer
@@ -26,9 +27,10 @@ FIRST_LOOK, GROWING = 4, (7, 13)
 
 @pytest.fixture(autouse=True)
 def early_growth(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Free space is looked for, and the grid grows, within a short training."""
+    """Free space is looked for, the grid grows, and all settles, within a short training."""
     monkeypatch.setattr(training, "FIRST_LOOK", FIRST_LOOK)
     monkeypatch.setattr(training, "REPORT_EVERY", 3)
+    monkeypatch.setattr(free_space, "FIRST_SETTLED", FIRST_LOOK)
 
 
 NO_GROWTH = GridConfig(voxels=6000, grow_at=(), alpha_init=0.1)

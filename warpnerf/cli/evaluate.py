@@ -10,9 +10,6 @@ from warpnerf.cli.arguments import RunFolder
 from warpnerf.cli.machine import require_writable, write_json
 from warpnerf.runtime.progress import ProgressBar
 
-KEPT = ("config.json", "metrics.json", "log.jsonl", "blocks.json", "train.json")
-"""What a run or blocks keep in their folder, which --json does not replace."""
-
 
 def eval_command(
     folder: RunFolder,
@@ -49,7 +46,7 @@ def eval_command(
     from warpnerf.runs.scene import path_of
     from warpnerf.scenes.formats.load import load_scene
 
-    require_writable(json, [folder / name for name in KEPT])
+    require_writable(json, ("mean", "images", "floaters"), folder / "metrics.json")
     distance = None
     if lpips is not None:
         from warpnerf.evaluation.lpips import Lpips

@@ -43,9 +43,6 @@ class InspectOptions:
     """As training will be given."""
 
 
-READ = ("transforms*.json", "metadata.json", "pose.json")
-"""What scenes may be read from, as patterns of names; --json does not replace it."""
-
 USUAL = Usual(
     (
         "model",
@@ -76,8 +73,7 @@ def inspect_command(options: InspectOptions, given: Annotated[Given, USUAL] = NO
             raise InputError(f"--output {output}: the plan is a PNG; let its name end in .png.")
         if not output.parent.is_dir():
             raise InputError(f"--output {output}: its folder does not exist; make it first.")
-    scene = Path(options.scene)
-    require_writable(json, [scene, *(path for kind in READ for path in scene.glob(kind))])
+    require_writable(json, ("costs", "plans"))
     if options.plots is not None and options.plots.exists() and not options.plots.is_dir():
         raise InputError(f"--plots {options.plots} is a file; name a folder.")
     configs = {

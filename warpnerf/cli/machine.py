@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterable
+from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import msgspec
 
 from warpnerf.checks import InputError, cannot_write
 from warpnerf.cli.arguments import Settings
@@ -30,7 +32,7 @@ def check_command(device: str = "cpu", threads: int | None = None, json: Path | 
         threads: CPU threads; by default one per usable core.
         json: Also write the results to this file.
     """
-    require_writable(json)
+    require_writable(json, ("passed", "checks"))
     from warpnerf.runtime.terminal import print_table
     from warpnerf.verification.verify import report, verify
 
@@ -97,15 +99,19 @@ def warmup_command(
     return 0
 
 
-def require_writable(path: Path | None, inputs: Iterable[Path] = ()) -> None:
+def require_writable(path: Path | None, written: Collection[str], kept: Path | None = None) -> None:
     """Refuse what --json names before anything is computed.
+
+    What is replaced is what this command has written before, and nothing else: not a run, nor a
+    scene.
 
     Args:
         path: What it names; None: nothing.
-        inputs: Files that are not replaced, whether or not they exist: a run's or a scene's.
+        written: Names that the objects have which the command writes.
+        kept: A file that has them too, and is not replaced.
 
     Raises:
-        InputError: It is a folder, a file in none or in one of others', or one of ``inputs``.
+        InputError: It is a folder, a file in none or in one of others', or of something else.
     """
     if path is None:
         return
@@ -115,8 +121,17 @@ def require_writable(path: Path | None, inputs: Iterable[Path] = ()) -> None:
         raise InputError(f"--json {path}: its folder does not exist; make it first.")
     if not os.access(path.parent if path.is_file() or not path.exists() else path, os.W_OK):
         raise InputError(f"--json {path}: its folder cannot be written to; choose another one.")
-    if path.exists() and any(own.exists() and path.samefile(own) for own in inputs):
-        raise InputError(f"--json {path}: is a file that is read from; choose another name.")
+    if not path.exists() or path.stat().st_size == 0:
+        return
+    try:
+        content = msgspec.json.decode(path.read_bytes())
+    except (msgspec.DecodeError, OSError):
+        content = None
+    ours = isinstance(content, dict) and set(written) <= content.keys()
+    if not ours or (kept is not None and kept.exists() and path.samefile(kept)):
+        raise InputError(
+            f"--json {path}: is another file, which would be replaced; choose another name."
+        )
 
 
 def write_json(path: Path, text: str) -> None:

@@ -161,7 +161,10 @@ def render_command(
     cameras: list[Camera]
     if recorded is not None:
         length = recorded.seconds or SECONDS  # one place only takes no time
-        n_frames = _n_frames(fps, length if options.seconds is None else options.seconds)
+        if recorded.fps is not UNSET and options.fps is None and options.seconds is None:
+            n_frames = len(recorded.keys)
+        else:
+            n_frames = _n_frames(fps, length if options.seconds is None else options.seconds)
         cameras = recorded.cameras(n_frames, options.size)
         what = f"{_frames(n_frames)}, path {path}"
     elif not stills:

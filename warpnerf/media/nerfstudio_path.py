@@ -7,6 +7,7 @@ turned, moved and scaled by what its runs keep as dataparser_transforms.json.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -96,6 +97,9 @@ def read_nerfstudio_path(
         poses = _in_scene(poses, transforms, _applied(scene))
     if offset is not None:
         poses[:, :, 3] -= np.asarray(offset)
+    for name, value in (("fps", read.fps), ("seconds", read.seconds)):
+        if value is not None and not 0.0 <= value < math.inf:
+            raise InputError(f"{path}: {name} is {value:g}, but must be a number from 0 on.")
     fps = read.fps or 24.0
     seconds = read.seconds if read.seconds and not read.fps else n / fps
     times = np.linspace(0.0, seconds, n) if n > 1 else [0.0]

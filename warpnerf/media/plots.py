@@ -152,7 +152,7 @@ class Frame:
         """Names of lines in their colours, in the lower right corner."""
         for number, (name, colour) in enumerate(reversed(entries)):
             at = (self._right - 8, self._bottom - 8 - 1.3 * _TEXT * number)
-            self._draw.text(at, name, colour, font(_TEXT), anchor="rb")
+            self._draw.text(at, drawable(name), colour, font(_TEXT), anchor="rb")
 
 
 def _ticks(low: float, high: float, logarithmic: bool) -> list[float]:

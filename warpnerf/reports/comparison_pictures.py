@@ -11,7 +11,7 @@ from warpnerf.evaluation.metrics import truth
 from warpnerf.evaluation.near_field import PULLED_SHARE
 from warpnerf.evaluation.near_plan import near_plan
 from warpnerf.media.curves import running_mean
-from warpnerf.media.pictures import INK, depth_legend, depth_picture, font, to_bytes
+from warpnerf.media.pictures import INK, depth_legend, depth_picture, drawable, font, to_bytes
 from warpnerf.media.plots import line_plot
 from warpnerf.media.scene_plan import near_picture
 from warpnerf.rendering.field import Rendering
@@ -107,7 +107,7 @@ def moments_picture(experiment: Experiment) -> np.ndarray | None:
         draw.text((k * (width + _GAP), 4), title, INK, font(15))
     for number, (candidate, seen) in enumerate(rows):
         top = _TITLE + number * (height + _LABEL + _GAP)
-        draw.text((0, top), candidate.name, INK, font(17))
+        draw.text((0, top), drawable(candidate.name), INK, font(17))
         for k, panel in enumerate(_panels(seen, far)):
             image = Image.fromarray(panel).resize((width, height), Image.Resampling.NEAREST)
             sheet.paste(image, (k * (width + _GAP), top + _LABEL))

@@ -91,7 +91,7 @@ def what_limits(
     reached = float(psnr[late].mean())
     rise = reached - float(psnr[before].mean())
     # A field that has become finer is worse at first: with more time it gets past where it was.
-    grew = math.prod(reports[-1].size) > math.prod(reports[int(np.argmax(before))].size)
+    grew = math.prod(reports[-1].size) > math.prod(reports[int(np.sum(done <= 2.0 / 3.0)) - 1].size)
     change = abs(rise) if grew else rise
     risen = f"{'fell' if rise < 0.0 else 'rose'} by {abs(rise):.1f} dB in the last third"
     psnr_of_test = reached if test is None else test["cc_psnr" if exposed else "psnr"]

@@ -56,5 +56,5 @@ def in_words(psnr: Mapping[str, float]) -> str | None:
     return (
         f"photograph{'s' if several else ''} that the field does not explain: {listed}, where half "
         f"of all have {median:.1f} dB or more; poses may be wrong, or something moved there; look "
-        "at them, and leave them out, as --split FILE does with those that FILE names"
+        "at them, and take such ones out of the scene's folder or file of poses"
     )

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from warpnerf.config import TrainConfig
+from warpnerf.config import MarchConfig, TrainConfig
 from warpnerf.fields.lattice import Lattice
 from warpnerf.fields.occupancy import FreeCells
 from warpnerf.fields.storage import Storage
@@ -18,10 +18,13 @@ from warpnerf.rendering.structs import march_struct
 from warpnerf.runtime.parallel import Workers
 from warpnerf.scenes.scene import Scene
 from warpnerf.training.plan import TrainingPlan
+from warpnerf.training.state import TrainingState
 
+FIRST_SETTLED = 1000
+"""Steps before a training settles: in short ones surfaces do not stand yet."""
 SETTLED_TRANSMITTANCE = 1e-2
-"""Light below which rays end from ``TrainConfig.settle_at`` on. Before that, what lies behind fog
-learns from as little light as ``MarchConfig.transmittance_min``."""
+"""Early ray termination once a training has settled: less light than this is not followed. Before
+that, what lies behind fog learns from as little light as ``MarchConfig.transmittance_min``."""
 
 
 def pixel_sampler(scene: Scene, plan: TrainingPlan, workers: Workers) -> PixelSampler:
@@ -44,19 +47,34 @@ def pixel_sampler(scene: Scene, plan: TrainingPlan, workers: Workers) -> PixelSa
     )
 
 
-class EmptySpace:
-    """What a training neither samples nor draws: free cells, pixels that see nothing, and, once
-    surfaces stand where they will stay, what lies behind them."""
+def has_settled(state: TrainingState) -> bool:
+    """Whether a training to be resumed has settled: rays of its field end earlier than configured.
+
+    Args:
+        state: Of that training.
+    """
+    return state.field.steps.transmittance_min != state.config.march.transmittance_min
+
+
+class SampledSpace:
+    """What a training samples and draws: cells that are not free, pixels that see some, and once it
+    has settled, as surfaces then stand where they will stay, rays that end earlier."""
 
     def __init__(
-        self, config: TrainConfig, sampler: PixelSampler, free: FreeCells, workers: Workers
+        self,
+        config: TrainConfig,
+        sampler: PixelSampler,
+        free: FreeCells,
+        settled: bool,
+        workers: Workers,
     ) -> None:
-        """Free cells as they are known, all pixels, and nothing settled.
+        """Free cells as they are known, and all pixels.
 
         Args:
             config: Of the training.
             sampler: Draws its batches.
             free: Of the first lattice, or of that of a training to be resumed.
+            settled: Whether the training to be resumed has settled.
             workers: Where to work.
         """
         self._config = config
@@ -68,34 +86,40 @@ class EmptySpace:
         """The share of the others."""
         self.seen = 1.0
         """Share of the pixels that are drawn from, (0, 1]."""
-        self._settled = False
+        self._settled = settled
 
-    def settles(self, fraction: float) -> bool:
-        """Whether surfaces stand where they will stay from now on, and did not before.
+    def settle(self, fraction: float, steps_done: int) -> bool:
+        """Settle, if it is time to.
 
         Args:
             fraction: Of the training, that is done.
+            steps_done: Of its steps.
+
+        Returns:
+            Whether it has settled just now.
         """
         at = self._config.settle_at
-        if self._settled or at is None or fraction < at:
+        if self._settled or at is None or fraction < at or steps_done < FIRST_SETTLED:
             return False
         self._settled = True
         return True
 
-    def shortened(self, steps: Steps) -> Steps:
-        """How rays are marched: they end earlier once what lies behind surfaces learns no more.
+    def terminated(self, steps: Steps) -> Steps:
+        """How rays are marched, with early termination as it stands.
 
         Args:
-            steps: How they are marched before that.
+            steps: As configured. A least transmittance that is not the usual one is left as it is.
         """
-        if not self._settled:
+        usual = steps.transmittance_min == MarchConfig.transmittance_min
+        if not (self._settled and usual):
             return steps
-        return replace(steps, transmittance_min=max(steps.transmittance_min, SETTLED_TRANSMITTANCE))
+        return replace(steps, transmittance_min=SETTLED_TRANSMITTANCE)
 
-    def look(self, storage: Storage, steps: Steps) -> None:
+    def update_occupancy(self, storage: Storage, steps: Steps) -> None:
         """Compute the occupancy grid: which cells need not be sampled.
 
-        Until surfaces stand, the nodes around a cell count as well, so that they can grow into it.
+        Until the training has settled, the nodes around a cell count as well, so that surfaces can
+        grow into it; always where there may be more between nodes than at them.
 
         Args:
             storage: What the field is stored in.
@@ -105,7 +129,7 @@ class EmptySpace:
         assert isinstance(config.model, Model)
         march = march_struct(config.model, "float32", steps, self._workers)
         sampler = parts_of(config.model, "float32", config.field).sampler
-        margin = 0 if self._settled else 1
+        margin = 0 if self._settled and storage.kind.seen_share == 1.0 else 1
         self.free = FreeCells.of(storage, self._workers, march, config.alpha_min, sampler, margin)
         self.occupied = self.free.share()
 

@@ -50,7 +50,7 @@ class Stage:
     size: tuple[int, int, int]
     """Along each axis."""
     steps: Steps
-    """How rays are marched."""
+    """How rays are marched, until the training settles (``TrainConfig.settle_at``)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

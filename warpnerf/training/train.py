@@ -33,8 +33,9 @@ class TrainResult:
     exposures: dict[str, Exposure] | None
     """Of the training views, by name, where ``TrainConfig.appearance`` fits them."""
     photograph_psnr: dict[str, float]
-    """Of training views, by name, dB: over rays of the last third of the training, of each view of
-    which there were enough. A view far below the others may have a wrong pose."""
+    """Of training views, by name, dB: over the rays of reports in the last third of the training,
+    since it was resumed, and in this process; of views of which these were enough. A view far below
+    the others may have a wrong pose."""
 
 
 @checked_arguments

@@ -27,7 +27,7 @@ from warpnerf.scenes.extent.points import ObservedExtent, with_extent
 from warpnerf.scenes.scene import Scene
 from warpnerf.training.exposure import STATE, Exposures, exposures_of
 from warpnerf.training.extent import march_steps, require_samples
-from warpnerf.training.free_space import EmptySpace, occupied_box, pixel_sampler
+from warpnerf.training.free_space import SampledSpace, has_settled, occupied_box, pixel_sampler
 from warpnerf.training.growth import (
     first_storage,
     grown_states,
@@ -132,8 +132,8 @@ class Trainer:
             free = FreeCells.none(self.workers)
         else:
             free = self._restore(resume)
-        self._empty = EmptySpace(config, self._sampler, free, self.workers)
-        self._empty.settles(self.fraction)
+        settled = resume is not None and has_settled(resume)
+        self._space = SampledSpace(config, self._sampler, free, settled, self.workers)
         self.exposures: Exposures | None = None
         """Those of the training views, where it fits them."""
         if resume is None or STATE in self.optimiser:  # else they were dropped
@@ -144,7 +144,7 @@ class Trainer:
         self.photograph_errors = PhotographErrors(len(scene.splits["train"]))
         """Of the rays of reports, since it was set up."""
         self._views: wp.array | None = None
-        self._empty.cull_background(self.lattice)
+        self._space.cull_background(self.lattice)
         self._pass = self._training_pass()
         self._regularise_lattice()
 
@@ -182,9 +182,8 @@ class Trainer:
                 on_checkpoint(self.state())
                 self.peers.wait()
                 saved_step, saved_at = self.steps_done, time.monotonic()
-            done = (
-                self.fraction >= 1.0 and self.steps_done
-            )  # what came before may have taken all time
+            # One update at least, where what came before has taken all the time.
+            done = self.fraction >= 1.0 and self.steps_done > 0
             if done or agreed.stop:
                 break
             self.update()
@@ -231,7 +230,7 @@ class Trainer:
             self._load_kernels()
         fraction = self.fraction
         self._grow(fraction)
-        if self._empty.settles(fraction):
+        if self._settle(fraction):
             self._drop_pass()
             self._pass = self._training_pass()
         if self._updates % self.config.occupancy_every == 0:
@@ -255,7 +254,7 @@ class Trainer:
         """Add the gradient of a batch's losses to that of the update."""
         if self._resampling is not None:
             self._resampling.propose(self.free, batch, self.fraction)
-        share = self._empty.seen * (batch.count / self._sampler.count(n_steps))
+        share = self._space.seen * (batch.count / self._sampler.count(n_steps))
         self._pass.run(self.free, batch, n_steps, share)
         self._views = batch.views
         if self._resampling is not None:
@@ -310,8 +309,8 @@ class Trainer:
             psnr=-10.0 * math.log10(max(error / 3.0, 1e-12)),
             samples_per_ray=self._mean(self._pass.n_samples),
             size=self.lattice.size,
-            occupied=self._empty.occupied,
-            seen=self._empty.seen,
+            occupied=self._space.occupied,
+            seen=self._space.seen,
         )
         return self._progress
 
@@ -364,7 +363,7 @@ class Trainer:
     @property
     def free(self) -> FreeCells:
         """Which cells hold nothing."""
-        return self._empty.free
+        return self._space.free
 
     @property
     def lattice(self) -> Lattice:
@@ -387,7 +386,7 @@ class Trainer:
     def march_steps(self) -> Steps:
         """How rays are marched through the grid as it stands."""
         steps = march_steps(self.config.march, self.lattice, self.lattice.size, self.plan.reach)
-        return self._empty.shortened(steps)
+        return self._space.terminated(steps)
 
     def parameters(self) -> tuple[Parameter, ...]:
         """What is trained."""
@@ -456,6 +455,11 @@ class Trainer:
         self._regularise_lattice()
         self._look_for_free_space()
 
+    def _settle(self, fraction: float) -> bool:
+        """Sample less from now on, if it is time to: not before the grid has its final size."""
+        grown = self._grown >= self.schedule.growths(1.0)
+        return grown and self._space.settle(fraction, self.steps_done)
+
     def _regularise_lattice(self) -> None:
         """Find what regularises the nodes that there are."""
         training = trained_on(self.scene, self.plan)
@@ -466,7 +470,7 @@ class Trainer:
         """The box around what is occupied, where space is bounded; never larger than before."""
         if self.lattice.contracted or self.config.field.box_is_fixed:
             return self.lattice.box_min, self.lattice.box_max
-        self._empty.look(self.storage, self.march_steps())
+        self._space.update_occupancy(self.storage, self.march_steps())
         return occupied_box(self.lattice, self.free)
 
     def _look_for_free_space(self) -> None:
@@ -476,5 +480,5 @@ class Trainer:
         """
         if self.steps_done < FIRST_LOOK:
             return
-        self._empty.look(self.storage, self.march_steps())
-        self._empty.cull_background(self.lattice)
+        self._space.update_occupancy(self.storage, self.march_steps())
+        self._space.cull_background(self.lattice)

@@ -24,7 +24,7 @@ def last_node(cell: int, n_cells: int, n_nodes: int, margin: int) -> int:
 
 @cache
 def find_highest_kernel(n_floats: int) -> wp.Kernel:
-    """The highest raw density in and next to a cell, in one of its columns of nodes along z."""
+    """The highest raw density in a cell and the margin around, in a column of nodes along z."""
     Grid = grid_type(n_floats)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -40,7 +40,7 @@ def find_highest_kernel(n_floats: int) -> wp.Kernel:
         # out
         out_highest: wp.array(dtype=real),  # [X * Y * MZ]
     ):
-        """The highest raw density in and next to a cell, in one of its columns of nodes along z.
+        """The highest raw density in a cell and the margin around, in a column of nodes along z.
 
         What is not a number counts as dense: it must be seen to be noticed.
         """
@@ -75,7 +75,7 @@ def join_highest(
     # out
     out_highest: wp.array(dtype=real),  # [... * n_cells * stride]
 ):
-    """Of what was found for nodes along one axis, the highest in and next to a cell."""
+    """Of what was found for nodes along one axis, the highest in a cell and the margin around."""
     start = (first + wp.tid()) * span
     cell = (start // stride) % n_cells
     low = first_node(cell, n_cells, n_nodes, margin)
