@@ -82,11 +82,9 @@ def by_field(records: Records) -> str:
         text(
             f"""{settings["steps"]} equal steps of {settings["rays"]} rays, what clamped
             scaling gains over none, PSNR in dB (negative: it loses;
-            [by capture](decisions/fields.md)): {gains(record["rows"])}; with the sampler of the
-            preset, one seed, {gains(records["scaling_fields_sampler"]["rows"])}; with other
+            [by capture](decisions/fields.md)): {gains(record["rows"])}; with marched rays and other
             epsilons of Adam, {gains(epsilons["rows"])}.""",
-            records.source("scaling_fields", THEN_MARCHED),
-            records.source("scaling_fields_sampler"),
+            records.source("scaling_fields"),
             records.source("scaling_fields_epsilon", THEN_MARCHED),
         ),
     )
