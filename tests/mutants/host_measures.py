@@ -31,6 +31,16 @@ PLAN = (
 )
 OVERLAP = "scenes/test_overlap.py::test_overlap_along_rays_of_two_cameras_side_by_side"
 
+FAR_BELOW, FEW_TELL, OPAQUE_COUNT, ARE_SAID = (
+    "reports/test_misfits.py::test_those_far_below_the_others_are_found",
+    "reports/test_misfits.py::test_few_photographs_do_not_tell",
+    "training/test_photograph_errors.py::test_late_rays_of_opaque_pixels_count",
+    "cli/test_command.py::test_photographs_that_do_not_fit_are_said",
+)
+ELSE_TOLD = "training/test_photograph_errors.py::test_a_photograph_of_something_else_is_told"
+ERRORS, MISFITS = "training/photograph_errors.py", "reports/misfits.py"
+TRAINER = "training/trainer.py"
+
 MUTANTS = [
     of_host("light: front up to the surface", LIGHT, "FRONT, BEHIND = 0.8, 1.25", "FRONT, BEHIND = 1.0, 1.25", SUM),
     of_host("light: behind from the surface on", LIGHT, "FRONT, BEHIND = 0.8, 1.25", "FRONT, BEHIND = 0.8, 1.0", SUM),
@@ -88,4 +98,16 @@ MUTANTS = [
     of_host("compare: any folder", "reports/experiment.py", "if names and RECORD not in names:", "if False:", REFUSED),
     of_host("overlap: rays thin out by the distance", "scenes/cameras/overlap.py", "np.maximum(squared, distances[0] ** 2)",
             "np.sqrt(squared)", OVERLAP),
+    # photograph_errors.py
+    of_host("photographs: early rays count", ERRORS, "if fraction < LATE:", "if False:", OPAQUE_COUNT),
+    of_host("photographs: transparent pixels are of the last", ERRORS, "counts = views >= 0", "counts = views >= -1; views = abs(views)", OPAQUE_COUNT),
+    of_host("photographs: few rays tell", ERRORS, "if count >= FEWEST_RAYS", "if count", OPAQUE_COUNT),
+    of_host("photographs: the error of all channels", ERRORS, "(3.0 * count)", "count", OPAQUE_COUNT),
+    of_host("photographs: none looked at", TRAINER, "self.photograph_errors.add(self._views.numpy(), errors, self.fraction)", "pass", ELSE_TOLD),
+    of_host("misfits: few dB", MISFITS, "max(BELOW, DEVIATIONS * deviation)", "DEVIATIONS * deviation", FAR_BELOW),
+    of_host("misfits: few deviations", MISFITS, "max(BELOW, DEVIATIONS * deviation)", "BELOW", FAR_BELOW),
+    of_host("misfits: mean deviations", MISFITS, "NORMAL * np.median(", "NORMAL * np.mean(", FAR_BELOW),
+    of_host("misfits: the best first", MISFITS, "key=psnr.__getitem__", "key=lambda name: -psnr[name]", FAR_BELOW),
+    of_host("misfits: of few photographs", MISFITS, "if len(psnr) < FEWEST:", "if not psnr:", FEW_TELL),
+    of_host("misfits: not said", "cli/training.py", 'print(f"warning: {sentence}")', "pass", ARE_SAID),
 ]  # fmt: skip

@@ -82,14 +82,8 @@ CORRECTED = "evaluation/test_metrics.py::test_corrected_colours_are_those_of_ano
 LIMIT_EXPOSURES = (
     "reports/test_limits.py::test_exposures_are_named_where_corrected_colours_come_closer"
 )
-FAR_BELOW, FEW_TELL, OPAQUE_COUNT, ARE_SAID = (
-    "reports/test_misfits.py::test_those_far_below_the_others_are_found",
-    "reports/test_misfits.py::test_few_photographs_do_not_tell",
-    "training/test_photograph_errors.py::test_late_rays_of_opaque_pixels_count",
-    "cli/test_command.py::test_photographs_that_do_not_fit_are_said",
-)
 SETTLED, BEFORE_SETTLED, HASH_SETTLED, SHORT_SETTLED = (
-    f"training/test_trainer.py::test_{what}"
+    f"training/test_settling.py::test_{what}"
     for what in (
         "once_it_has_settled_less_is_sampled",
         "settled_it_is_resumed_as_it_was",
@@ -97,7 +91,6 @@ SETTLED, BEFORE_SETTLED, HASH_SETTLED, SHORT_SETTLED = (
         "short_trainings_do_not_settle",
     )
 )
-ELSE_TOLD = "training/test_photograph_errors.py::test_a_photograph_of_something_else_is_told"
 SHORT_USES = "model/test_idle_options.py::test_a_short_training_takes_over_what_it_has_a_use_for"
 FACE = "training/test_optim.py::test_total_variation_counts_the_face_between_two_nodes"
 ADAM_WEIGHTS = (
@@ -145,7 +138,6 @@ TRAINER, EXTENT, SMOOTHING = (
 )
 NEAR, SKIPPED = "fields/near_decay.py", "training/free_space.py"
 PLANNED, GROWN = "training/plan.py", "training/growth.py"
-ERRORS, MISFITS = "training/photograph_errors.py", "reports/misfits.py"
 OPTIM, STATE, COARSE = (f"training/{name}.py" for name in ("optim", "state", "coarse"))
 SPACE_PLAN = "scenes/extent/space_plan.py"
 SCHEDULE, CHECKPOINT = "training/schedule.py", "runs/checkpoint.py"
@@ -366,18 +358,6 @@ MUTANTS = [
     of_host("corrected by the whole picture", "evaluation/metrics.py", "(a, b) if mask is None else (a[mask], b[mask])", "(a, b)", CORRECTED),
     of_host("corrected beyond white", "evaluation/metrics.py", "np.clip(mean_y + gain * (a - mean_x), 0.0, 1.0)", "mean_y + gain * (a - mean_x)", CORRECTED),
     of_host("exposures are photographs that are missing", "reports/limits.py", "cost=gap - of_exposures - USUAL_GAP", "cost=gap - USUAL_GAP", LIMIT_EXPOSURES),
-    # photograph_errors.py
-    of_host("photographs: early rays count", ERRORS, "if fraction < LATE:", "if False:", OPAQUE_COUNT),
-    of_host("photographs: transparent pixels are of the last", ERRORS, "counts = views >= 0", "counts = views >= -1; views = abs(views)", OPAQUE_COUNT),
-    of_host("photographs: few rays tell", ERRORS, "if count >= FEWEST_RAYS", "if count", OPAQUE_COUNT),
-    of_host("photographs: the error of all channels", ERRORS, "(3.0 * count)", "count", OPAQUE_COUNT),
-    of_host("photographs: none looked at", TRAINER, "self.photograph_errors.add(self._views.numpy(), errors, self.fraction)", "pass", ELSE_TOLD),
-    of_host("misfits: few dB", MISFITS, "max(BELOW, DEVIATIONS * deviation)", "DEVIATIONS * deviation", FAR_BELOW),
-    of_host("misfits: few deviations", MISFITS, "max(BELOW, DEVIATIONS * deviation)", "BELOW", FAR_BELOW),
-    of_host("misfits: mean deviations", MISFITS, "NORMAL * np.median(", "NORMAL * np.mean(", FAR_BELOW),
-    of_host("misfits: the best first", MISFITS, "key=psnr.__getitem__", "key=lambda name: -psnr[name]", FAR_BELOW),
-    of_host("misfits: of few photographs", MISFITS, "if len(psnr) < FEWEST:", "if not psnr:", FEW_TELL),
-    of_host("misfits: not said", "cli/training.py", 'print(f"warning: {sentence}")', "pass", ARE_SAID),
     # free_space.py, from settle_at on
     of_host("settled: never", SKIPPED, "if self._settled or at is None or fraction < at", "if True or at is None or fraction < at", SETTLED),
     of_host("settled: from the start", SKIPPED, "or fraction < at or", "or", BEFORE_SETTLED),

@@ -36,6 +36,15 @@ def early_growth(monkeypatch: pytest.MonkeyPatch) -> None:
 NO_GROWTH = GridConfig(voxels=6000, grow_at=(), alpha_init=0.1)
 
 
+# Rates at which most of the empty space is found within a few steps.
+QUICK: dict[str, Any] = {
+    "steps": 60,
+    "model": "rgb",
+    "optim": OptimConfig(learning_rate_density=3.0, accumulate_at=()),
+    "grid": GridConfig(voxels=20_000, grow_at=(), alpha_init=0.1),
+}
+
+
 def ball() -> Scene:
     """Something round of many colours, with nothing around it."""
     scene = small_scene()

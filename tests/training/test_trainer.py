@@ -17,7 +17,7 @@ from tests.support.tiny_fields import assert_same_state
 from tests.support.tiny_scenes import ring, tiny_scene
 from tests.support.tiny_trainings import (
     GROWING,
-    NO_GROWTH,
+    QUICK,
     STEPS,
     ball,
     large_ball,
@@ -27,10 +27,8 @@ from tests.support.tiny_trainings import (
 )
 from tests.support.tiny_trainings import early_growth as early_growth
 from warpnerf.checks import InputError
-from warpnerf.config import GridConfig, MarchConfig, TrainConfig
-from warpnerf.fields.occupancy import FreeCells
+from warpnerf.config import GridConfig, TrainConfig
 from warpnerf.model.models import Deferred
-from warpnerf.model.storage_kinds import Dense, Hash
 from warpnerf.optim_config import OptimConfig
 from warpnerf.scenes.scene import Scene
 from warpnerf.training import trainer as training
@@ -125,15 +123,6 @@ def test_the_grid_of_an_object_grows_earlier_into_a_tighter_box(on_cpu: None) ->
         GridConfig(grow_at="never")  # type: ignore[arg-type]
 
 
-# Rates at which most of the empty space is found within a few steps.
-QUICK: dict[str, Any] = {
-    "steps": 60,
-    "model": "rgb",
-    "optim": OptimConfig(learning_rate_density=3.0, accumulate_at=()),
-    "grid": GridConfig(voxels=20_000, grow_at=(), alpha_init=0.1),
-}
-
-
 def test_pixels_that_see_nothing_are_left_out_of_bounded_scenes(on_cpu: None) -> None:
     def seen(scene: Scene, **changes: Any) -> tuple[float, float]:
         config = tiny_config(**QUICK, **changes)
@@ -156,78 +145,6 @@ def test_resumed_it_draws_from_the_same_pixels(tmp_path: Path, on_cpu: None) -> 
         assert begun.progress.seen < 1.0
         resumed = stopped_at(60, tmp_path / "resumed", config, scene, begun)
         assert_same_state(without_seconds(resumed), without_seconds(whole))
-
-
-def test_once_it_has_settled_less_is_sampled(on_cpu: None) -> None:
-    """Cells without their neighbours, and rays up to 1 % of the light."""
-
-    def trained(settle_at: float | None, **changes: Any) -> Trainer:
-        config = tiny_config(**QUICK | {"settle_at": settle_at} | changes)
-        trainer = Trainer(large_ball(), config)
-        trainer.run()
-        return trainer
-
-    def ends(trainer: Trainer) -> float:
-        return trainer.field().steps.transmittance_min
-
-    never, settled = trained(None), trained(0.5)
-    assert settled.free.share() < 0.9 * never.free.share()
-    assert settled.report().samples_per_ray < 0.9 * never.report().samples_per_ray
-    assert ends(never) == 1e-3 and ends(settled) == 1e-2
-    configured = trained(0.5, march=MarchConfig(transmittance_min=1e-4))
-    assert ends(configured) == 1e-4
-    assert configured.free.share() < 0.9 * never.free.share()
-    growing = GridConfig(voxels=20_000, grow_at=(0.7,), alpha_init=0.1)
-    trainer = Trainer(large_ball(), tiny_config(**QUICK | {"settle_at": 0.5, "grid": growing}))
-    while ends(trainer) == 1e-3:
-        assert trainer.fraction <= 0.7
-        trainer.update()
-    assert trainer.steps_done == 43 and trainer._grown == 1
-
-
-def test_short_trainings_do_not_settle(monkeypatch: pytest.MonkeyPatch, on_cpu: None) -> None:
-    monkeypatch.setattr("warpnerf.training.free_space.FIRST_SETTLED", 60)
-    trainer = Trainer(large_ball(), tiny_config(**QUICK, settle_at=0.5))
-    trainer.run()
-    assert trainer.field().steps.transmittance_min == 1e-3
-
-
-def test_a_hash_is_judged_with_its_neighbours(on_cpu: None) -> None:
-    """There may be more between its nodes than at them."""
-    hashed = Hash(levels=2, coarsest=4, finest=16, features=2, table=256)
-    margins: list[int] = []
-    find = FreeCells.of
-
-    def finding(*arguments: Any) -> FreeCells:
-        margins.append(arguments[-1])
-        return find(*arguments)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(FreeCells, "of", staticmethod(finding))
-        for field in (Dense(), hashed):
-            optim = OptimConfig(accumulate_at=())
-            Trainer(ball(), tiny_config(field=field, optim=optim, grid=NO_GROWTH)).run()
-    n = len(margins) // 2
-    assert 0 in margins[:n] and margins[n:] == [1] * n
-
-
-def test_settled_it_is_resumed_as_it_was(tmp_path: Path, on_cpu: None) -> None:
-    """Until then a training is that of one that never settles."""
-    settles, never = (tiny_config(**QUICK, settle_at=at) for at in (0.5, None))
-    state, other = (
-        stopped_at(30, tmp_path / "state", how, large_ball()) for how in (settles, never)
-    )
-    values, others = (one.field.storage.tensors()["values"] for one in (state, other))
-    np.testing.assert_array_equal(values, others)
-    grows = GridConfig(voxels=20_000, grow_at=(0.3, 0.5), alpha_init=0.1)
-    for config in (settles, replace(settles, grid=grows)):
-        whole = stopped_at(60, tmp_path / "whole", config, large_ball())
-        for step in (29, 30, 31, 58):
-            begun = stopped_at(step, tmp_path / "begun", config, large_ball())
-            steps = Trainer(large_ball(), config, begun).field().steps
-            assert steps.transmittance_min == (1e-3 if step <= 30 else 1e-2)
-            resumed = stopped_at(60, tmp_path / "resumed", config, large_ball(), begun)
-            assert_same_state(without_seconds(resumed), without_seconds(whole))
 
 
 def test_resumed_with_a_single_cell_it_ends_the_same(tmp_path: Path, on_cpu: None) -> None:

@@ -13,7 +13,7 @@ BELOW = 3.5
 DEVIATIONS = 5.5
 """Likewise, in standard deviations, as the median absolute deviation tells them. Of captures whose
 poses are right, photographs lie up to 5.2 deviations below it; one that is turned by 3 degrees, or
-has the pose of another, 5.7 to 17, where the others are alike and many show the same."""
+has the pose of another, 6.4 to 17, where the others are alike and many show the same."""
 NORMAL = 1.4826
 """Standard deviations of a normal distribution in one median absolute deviation."""
 NAMED = 3
