@@ -26,8 +26,10 @@ SHARED = [
 """Modules of the kernels that all models share."""
 
 
-def compiled(module: wp.Module, folder: Path) -> str:
-    wp.compile_aot_module(module, arch=75, module_dir=folder, use_ptx=True)
+def compiled(module: wp.Module, folder: Path, *, arch: int = 75) -> str:
+    """PTX for a compute capability times ten."""
+    folder.mkdir(exist_ok=True)
+    wp.compile_aot_module(module, arch=arch, module_dir=folder, use_ptx=True)
     return "".join(path.read_text() for path in folder.glob("*.ptx"))
 
 
@@ -119,13 +121,19 @@ def test_factors_compile_for_cuda(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_code_does_not_grow_with_layers(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "pair",
+    [
+        pytest.param((Deferred(width=32), Deferred(width=64)), id="units"),
+        pytest.param((Deferred(frequencies=0), Deferred(frequencies=2)), id="inputs"),
+    ],
+)
+def test_code_does_not_grow_with_layers(pair: tuple[Model, Model], tmp_path: Path) -> None:
     """Layers that the compiler writes out take it minutes."""
     assembly = precision.load("float32", "launch.assembly")
     sizes = []
-    for width in (32, 64):
-        model = Deferred(width=width)
+    for number, model in enumerate(pair):
         variant = variant_of(model, "float32", "none", "none", "none", packed=False)
         module = assembly.render_forward_kernel(variant).module
-        sizes.append(len(compiled(module, tmp_path / str(width))))
+        sizes.append(len(compiled(module, tmp_path / str(number))))
     assert sizes[1] < 1.1 * sizes[0]

@@ -16,6 +16,7 @@ from typing import Any
 
 import warp as wp
 
+from ..base.atomics import add_to
 from ..base.parts import Encoding
 from ..base.tiles import tile_of
 from ..base.types import real, vec3, vector
@@ -130,10 +131,10 @@ def adj_in_plane(at: Corner, adj: Any, gradient: Any):
     gradient.touched[tile_of(n + at.row)] = wp.uint8(1)
     high = at.across * adj
     low = adj - high
-    wp.atomic_add(gradient.planes, n, (real(1.0) - at.along) * low)
-    wp.atomic_add(gradient.planes, n + 1, at.along * low)
-    wp.atomic_add(gradient.planes, n + at.row, (real(1.0) - at.along) * high)
-    wp.atomic_add(gradient.planes, n + at.row + 1, at.along * high)
+    add_to(gradient.planes, n, (real(1.0) - at.along) * low)
+    add_to(gradient.planes, n + 1, at.along * low)
+    add_to(gradient.planes, n + at.row, (real(1.0) - at.along) * high)
+    add_to(gradient.planes, n + at.row + 1, at.along * high)
 
 
 @cache

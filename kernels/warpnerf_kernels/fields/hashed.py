@@ -19,6 +19,7 @@ from typing import Any
 
 import warp as wp
 
+from ..base.atomics import add_to
 from ..base.parts import Encoding
 from ..base.tiles import tile_of
 from ..base.types import real, vec3, vector
@@ -146,8 +147,8 @@ def adj_in_level(at: Corner, adj: Any, gradient: Any):
         n = at.entries[row]
         gradient.touched[tile_of(n)] = wp.uint8(1)
         share = share_of(at.fraction, row) * adj
-        wp.atomic_add(gradient.values, n, (real(1.0) - up) * share)
-        wp.atomic_add(gradient.values, n + 1, up * share)
+        add_to(gradient.values, n, (real(1.0) - up) * share)
+        add_to(gradient.values, n + 1, up * share)
 
 
 # Loops run to a number that compilers do not know, as in networks.mlp.

@@ -4,6 +4,7 @@ from typing import Any
 
 import warp as wp
 
+from ..base.atomics import add_to
 from ..base.tiles import tile_of
 from ..base.types import real, vec3
 
@@ -85,17 +86,17 @@ def adj_gather(
     gradient.touched[tile_of(n10)] = yes
     gradient.touched[tile_of(n11)] = yes
     low = gx * gy * adj_value
-    wp.atomic_add(gradient.values, n00, gz * low)
-    wp.atomic_add(gradient.values, n00 + 1, fz * low)
+    add_to(gradient.values, n00, gz * low)
+    add_to(gradient.values, n00 + 1, fz * low)
     low = gx * fy * adj_value
-    wp.atomic_add(gradient.values, n01, gz * low)
-    wp.atomic_add(gradient.values, n01 + 1, fz * low)
+    add_to(gradient.values, n01, gz * low)
+    add_to(gradient.values, n01 + 1, fz * low)
     low = fx * gy * adj_value
-    wp.atomic_add(gradient.values, n10, gz * low)
-    wp.atomic_add(gradient.values, n10 + 1, fz * low)
+    add_to(gradient.values, n10, gz * low)
+    add_to(gradient.values, n10 + 1, fz * low)
     low = fx * fy * adj_value
-    wp.atomic_add(gradient.values, n11, gz * low)
-    wp.atomic_add(gradient.values, n11 + 1, fz * low)
+    add_to(gradient.values, n11, gz * low)
+    add_to(gradient.values, n11 + 1, fz * low)
 
 
 @wp.func

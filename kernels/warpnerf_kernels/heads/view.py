@@ -4,6 +4,7 @@ from functools import cache
 
 import warp as wp
 
+from ..base.loops import runtime
 from ..base.types import real, vec3, vector
 
 wp.set_module_options({"enable_backward": False})
@@ -25,10 +26,11 @@ def encoding(n_frequencies: int) -> wp.Function:
     @wp.func
     def encode(direction: vec3) -> Encoded:
         out = Encoded()
-        for axis in range(3):
+        n_axes, n_doublings = runtime(3), runtime(n_frequencies)
+        for axis in range(n_axes):
             out[axis] = direction[axis]
             frequency = real(1.0)
-            for k in range(n_frequencies):
+            for k in range(n_doublings):
                 out[3 + 6 * k + axis] = wp.sin(frequency * direction[axis])
                 out[6 + 6 * k + axis] = wp.cos(frequency * direction[axis])
                 frequency *= real(2.0)

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
+from ..base.loops import runtime
 from ..base.simd import LANES
 from ..base.types import real, vec3, vector
 from .mlp_rows import BEGIN_ROWS, prelude_of
@@ -178,17 +179,17 @@ def mlp(layout: Layout) -> Mlp:
 
     @wp.func
     def add_inputs(weights: Weights, begin: int, x: Any, out: Units) -> Units:
-        n_units = weights.width
-        for i in range(len(x)):
+        n_units, n_inputs = weights.width, runtime(len(x))
+        for i in range(n_inputs):
             for j in range(n_units):
                 out[j] += x[i] * weights.values[(begin + i) * width + j]
         return out
 
     @wp.func
     def adj_add_inputs(weights: Weights, begin: int, x: Any, adj: Units, gradient: Any):
-        n_units = weights.width
+        n_units, n_inputs = weights.width, runtime(len(x))
         adj_x = x * real(0.0)
-        for i in range(len(x)):
+        for i in range(n_inputs):
             for j in range(n_units):
                 n = (begin + i) * width + j
                 adj_x[i] += adj[j] * weights.values[n]
