@@ -48,7 +48,7 @@ def add_fields(parser: argparse.ArgumentParser) -> None:
 def models_of(
     parser: argparse.ArgumentParser, args: argparse.Namespace
 ) -> list[tuple[str, ModelName]]:
-    """Fields and models that --fields and --models ask for; there is one, or the parser exits."""
+    """Fields and models that --fields and --models request; there is one, or the parser exits."""
     found = [
         (field, model)
         for field in args.fields
