@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from cases import Case, make_cases
 from measuring import (
     ROOT,
     commit,
@@ -37,7 +38,7 @@ from measuring import (
     show,
     write_record,
 )
-from throughput import TOLERANCE, Case, make_cases
+from throughput import TOLERANCE
 
 Times = tuple[float, float]
 """Seconds of a step, and of the cores in it."""

@@ -41,7 +41,7 @@ from candidates import warpnerf_step
 from candidates.torch_adam import MaskedAdam, Way
 from candidates.torch_fields import FieldChoices, TorchFields
 from candidates.torch_models import Choices, TorchModels
-from field_workload import FieldWorkload, late_field
+from field_workload import FIELDS, OF_FIELDS, FieldWorkload, late_field
 from measuring import (
     Stopwatch,
     default_threads,
@@ -70,10 +70,6 @@ RATE = 1e-8
 AT_ENDS = 1e-4
 """The share of the gradient's values that may differ by more where rays end early: which sample is
 the last may hang on rounding."""
-FIELDS = ("vm", "hash")
-"""What fields are stored in besides dense grids."""
-OF_FIELDS: tuple[ModelName, ...] = ("deferred", "sh", "rgb")
-"""Models whose samples are all read alike, which torch has with these."""
 MADE = ("dense", "sphere")
 """Scenes of throughput.py."""
 

@@ -1,12 +1,17 @@
-"""A batch of rays through a field with a decoder, and where its samples lie: late in a training."""
+"""A batch of rays through a field with a decoder, and where its samples lie.
+
+The field is one late in a training, or made of random numbers.
+"""
 
 from __future__ import annotations
 
+import argparse
 import itertools
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
+import warp as wp
 from candidates.warpnerf_step import WarpStep
 from measuring import named
 from models import train_until_late
@@ -14,12 +19,45 @@ from workload import MODELS, ModelName, Workload, split_network
 
 import warpnerf as wn
 from warpnerf.fields.decoded import Decoded
+from warpnerf.fields.hashed import level_shapes
 from warpnerf.fields.lattice import Lattice
 from warpnerf.fields.occupancy import FreeCells
-from warpnerf.model.storage_kinds import storage_of
+from warpnerf.fields.storages import class_of
+from warpnerf.model.storage_kinds import Hash, storage_of
 from warpnerf.rendering.steps import Steps
 from warpnerf.runtime.parallel import Workers
 from warpnerf.training.trainer import Trainer
+
+FIELDS = ("vm", "hash")
+"""What fields are stored in besides dense grids."""
+OF_FIELDS: tuple[ModelName, ...] = ("deferred", "sh", "rgb")
+"""Models whose samples are all read alike, which torch has with these."""
+
+
+def add_fields(parser: argparse.ArgumentParser) -> None:
+    """The option --fields, beside --models."""
+    parser.add_argument(
+        "--fields",
+        nargs="+",
+        default=["dense"],
+        choices=["dense", *FIELDS],
+        help=f"what raw values are stored in; other than dense: of {', '.join(OF_FIELDS)}",
+    )
+
+
+def models_of(
+    parser: argparse.ArgumentParser, args: argparse.Namespace
+) -> list[tuple[str, ModelName]]:
+    """Fields and models that --fields and --models request; there is one, or the parser exits."""
+    found = [
+        (field, model)
+        for field in args.fields
+        for model in args.models
+        if field == "dense" or model in OF_FIELDS
+    ]
+    if not found:
+        parser.error(f"--fields {' '.join(args.fields)} goes with {', '.join(OF_FIELDS)}")
+    return found
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -109,6 +147,49 @@ def late_field(
         distances=t[seen],
         lengths=dt[seen],
         ray_of_sample=ray[seen],
+    )
+
+
+def made_field(field: str, work: Workload, seed: int = 0) -> FieldWorkload:
+    """The rays of a workload through a field of random numbers, in all of the box.
+
+    Entries are standard normal, and what decodes them keeps about that size. Finer levels of a hash
+    have smaller entries, as trained ones have.
+
+    Args:
+        field: The kind of storage, by name.
+        work: Of a dense grid, of which nodes along each axis, rays and steps are taken.
+        seed: Of the numbers.
+    """
+    kind, device = storage_of(field), wp.get_device("cpu")
+    size = work.values.shape[:3]
+    lattice = Lattice(size=(size[0], size[1], size[2]), box_min=work.box[0], box_max=work.box[1])
+    model, rng = work.warp_model(), np.random.default_rng(seed)
+    made = class_of(kind).first(kind, model, lattice, seed, device)
+    assert isinstance(made, Decoded)
+    tensors = {
+        name: rng.normal(size=values.shape).astype(np.float32)
+        for name, values in made.tensors().items()
+    }
+    tensors["decoder"] /= math.sqrt(len(tensors["decoder"]))
+    tensors["decoder"][:, made.n_decoded :] = 0.0  # padding
+    if isinstance(kind, Hash):
+        for level, cells in zip(level_shapes(kind, lattice), kind.resolutions, strict=True):
+            tensors["values"][level.begin : level.end] *= kind.coarsest / cells
+    made = type(made).from_tensors(kind, model, lattice, tensors, device)
+    made = replace(made, density_shift=work.density_shift, density_scale=work.density_scale)
+    position, t, dt, ray = samples_of(
+        lattice, work.free, work.steps(), work.n_steps, work.origins, work.directions
+    )
+    plain = {one.name: getattr(work, one.name) for one in fields(work)}
+    return FieldWorkload(
+        **plain | {"values": np.empty((*size, 0), np.float32)},
+        trained=made,
+        march=work.steps(),
+        positions_in_field=position,
+        distances=t,
+        lengths=dt,
+        ray_of_sample=ray,
     )
 
 

@@ -11,8 +11,9 @@
     torch backward     the same rendering in torch, with the paper's operation against without
     operation alone    the backward of the paper's operation on 300 000 samples
 
-Of rgb all five, of the other models the first three; each model's launches are compared with
-torch's gradient before. What one model takes turns with is its own.
+Of rgb with a dense grid all five, of other models and fields the first three; the launches of each
+are compared with torch's gradient before. What one takes turns with is its own. Fields besides
+dense grids (`--fields vm hash`) are of random numbers.
 
 The two of a pair take turns (ABBA), each counts its fastest; the figure is the median over pairs
 of their difference, with a 95 % interval from order statistics. Shares are of the unscaled backward
@@ -25,158 +26,26 @@ from __future__ import annotations
 import argparse
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 import torch
-import warp as wp
+from adjoint_launches import Call, WarpAdjoint
 from candidates import Candidate, torch_models
 from candidates.torch_eager import Choices, ScaleGradient, TorchPipeline, fastest
+from candidates.torch_fields import FieldChoices, TorchFields
+from field_workload import FieldWorkload, add_fields, made_field, models_of
 from measuring import Stopwatch, machine, median_interval, options, write_record
-from warpnerf_kernels.base.types import real, vec3
-from warpnerf_kernels.launch import assembly
-from workload import DEFAULT_MODELS, Workload, make_workload
+from workload import DEFAULT_MODELS, ModelName, Workload, make_workload
 
 from warpnerf.config import Scaling
-from warpnerf.fields.gradients import Gradients
-from warpnerf.fields.occupancy import FreeCells
-from warpnerf.rendering.adjoint import AdjointLaunch
-from warpnerf.rendering.render import TrainingPass
-from warpnerf.rendering.structs import (
-    FieldStructs,
-    render_outputs_struct,
-    render_params_struct,
-    scratch_struct,
-    variant_of,
-)
 from warpnerf.runtime.memory import usable_cores
-from warpnerf.runtime.parallel import Workers
 
 N_RAYS = 1500
 N_STEPS = 200
 N_SAMPLES = 300_000
 SCALED: tuple[Scaling, ...] = ("none", "clamped")
-
-Call = Callable[[], object]
-
-
-class WarpAdjoint:
-    """The workload's launches in warpnerf, for each scaling, on the same arrays."""
-
-    def __init__(self, work: Workload, device: str, threads: int) -> None:
-        """Load a workload and render it once, for what the adjoint starts from."""
-        self._workers = workers = Workers(device, threads)
-        self._model = work.warp_model()
-        self._grid = work.voxel_grid(workers)
-        self._weights = work.weights(workers)
-        self._free = FreeCells.none(workers)
-        self._steps = work.steps()
-        self._batch = work.batch(workers)
-        self._scene = render_params_struct(
-            self._model,
-            "float32",
-            FieldStructs.of(self._grid, self._weights, self._free, self._steps, self._workers),
-            self._steps,
-            workers,
-        )
-        self._seen = self._render()
-        n = int(self._seen.n_samples.numpy().sum())
-        if n != N_SAMPLES:
-            raise SystemExit(f"gradient_scaling: {n} samples were visited, not {N_SAMPLES}.")
-        rgb = self._seen.rgb.numpy()
-        self._adj_rgb = wp.array(
-            2.0 / len(rgb) * (rgb - work.target_rgb), dtype=vec3, device=workers.device
-        )
-        self._nothing = wp.zeros(len(rgb), dtype=real, device=workers.device)
-        self._passes = {scaling: self._training_pass(scaling) for scaling in ("none", "clamped")}
-        share_memory(self._passes["none"], self._passes["clamped"])
-
-    def _variant(self, scaling: Scaling) -> assembly.Variant:
-        packed = not self._workers.device.is_cuda
-        return variant_of(self._model, "float32", "none", scaling, "none", packed)
-
-    def _render(self) -> Any:
-        variant, n = self._variant("none"), self._batch.count
-        seen = render_outputs_struct(variant, n, self._workers, assembly)
-        self._workers.launch_owned(
-            assembly.render_forward_kernel(variant),
-            -(-n // variant.batch),
-            n,
-            self._scene,
-            self._batch.struct,
-            scratch_struct(variant, 1, self._workers, assembly),
-            seen,
-        )
-        return seen
-
-    def _training_pass(self, scaling: Scaling) -> TrainingPass:
-        return TrainingPass(
-            self._batch.count,
-            self._model,
-            self._grid,
-            self._weights,
-            self._steps,
-            scaling,
-            "none",
-            self._workers,
-        )
-
-    @property
-    def gradients(self) -> Gradients:
-        """What all launches add to."""
-        return self._passes["none"].gradients
-
-    def train(self, scaling: Scaling) -> Call:
-        """The fused launch."""
-        training_pass = self._passes[scaling]
-        return lambda: training_pass.run(self._free, self._batch)
-
-    def backward(self, scaling: Scaling) -> Call:
-        """The adjoint launch."""
-        variant = self._variant(scaling)
-        launch = AdjointLaunch(
-            assembly.render_backward_kernel(variant),
-            variant,
-            self._model.most_steps(self._steps, self._grid.lattice.diagonal),
-            self._batch.count,
-            self._workers,
-        )
-        share_sink(self._passes["none"].launch, launch)
-        arguments = (
-            self._scene,
-            self._batch.struct,
-            self._seen,
-            self._adj_rgb,
-            self._nothing,
-            self._nothing,
-            scratch_struct(variant, 1, launch.workers, assembly),
-        )
-        gradient = self.gradients.struct
-        return lambda: launch.run(self._batch.count, gradient, *arguments)
-
-    def gradient_of(self, launch: Call) -> np.ndarray:
-        """What a launch adds, [X, Y, Z, n_values]."""
-        self.gradients.values.zero_()
-        launch()
-        return self.gradients.values.numpy().reshape(*self._grid.lattice.size, self._grid.n_floats)
-
-
-def share_memory(of: TrainingPass, to: TrainingPass) -> None:
-    """Give one pass the other's arrays, so that the two differ in what they do and not where."""
-    for name, value in vars(of).items():
-        if isinstance(value, wp.array | Gradients):
-            vars(to)[name] = value
-    to._scene, to._outputs = of._scene, of._outputs
-    if of.launch.sink is not None:
-        to._scratch.packs, to._scratch.rows = of._scratch.packs, of._scratch.rows
-    share_sink(of.launch, to.launch)
-
-
-def share_sink(of: AdjointLaunch, to: AdjointLaunch) -> None:
-    """Have two launches leave records in the same place, with where workers meet."""
-    to.sink = of.sink
 
 
 AT_KINKS = 1e-3
@@ -188,16 +57,19 @@ def check(ours: WarpAdjoint, theirs: dict[Scaling, Candidate], at_kinks: float =
     """Raise SystemExit unless all launches have the gradient that torch has, but for a share."""
     for scaling, pipeline in theirs.items():
         pipeline.step()
-        expected = pipeline.gradient()
         for launch in (ours.backward(scaling), ours.train(scaling)):
-            apart = np.sort(np.abs(ours.gradient_of(launch) - expected), axis=None)
-            apart = apart[: len(apart) - int(at_kinks * len(apart))]
-            error = apart[-1] / np.abs(expected).max()
-            if not error < 1e-4:
-                raise SystemExit(
-                    f"gradient_scaling: scaling {scaling!r} differs from torch by {error:.1e} of "
-                    "the largest gradient; there is nothing to time."
-                )
+            for name, found in ours.gradient_of(launch).items():
+                of_field = hasattr(pipeline, "gradients")
+                expected = pipeline.gradients()[name] if of_field else pipeline.gradient()
+                apart = np.sort(np.abs(found.ravel() - expected.ravel()))
+                apart = apart[: len(apart) - int(at_kinks * len(apart))]
+                error = apart[-1] / np.abs(expected).max()
+                if not error < 1e-4:
+                    raise SystemExit(
+                        f"gradient_scaling: with scaling {scaling!r} the gradient of {name} "
+                        f"differs from torch's by {error:.1e} of the largest; there is nothing to "
+                        "time."
+                    )
 
 
 def operation_alone(device: str, threads: int) -> Call:
@@ -218,10 +90,15 @@ class Pairs:
     """Times of two calls, taken in turns."""
 
     def __init__(
-        self, model: str, name: str, without: Call, with_it: Call, stopwatch: Stopwatch
+        self,
+        of: dict[str, str],
+        name: str,
+        without: Call,
+        with_it: Call,
+        stopwatch: Stopwatch,
     ) -> None:
-        """Run both once, so that they are compiled and warm."""
-        self.model = model
+        """Run both once, so that they are compiled and warm; `of` is a model and a field."""
+        self.of = of
         self.name = name
         self._calls = (without, with_it)
         self._stopwatch = stopwatch
@@ -247,7 +124,7 @@ class Pairs:
         """The median difference and its interval, also as shares of a backward pass."""
         difference = median_interval([1e6 * (t[1] - t[0]) for t in self._times])
         return {
-            "model": self.model,
+            **self.of,
             "name": self.name,
             "pairs": len(self._times),
             "without_us": self.without_us(),
@@ -258,7 +135,7 @@ class Pairs:
         }
 
 
-def counted_instructions(grid: int, model: str, scaling: Scaling) -> float | None:
+def counted_instructions(grid: int, field: str, model: str, scaling: Scaling) -> float | None:
     """Instructions of one sample's adjoint, by the hardware's counter; None where there is none.
 
     A process that launches more often is set against one that launches less often, so that all but
@@ -268,7 +145,8 @@ def counted_instructions(grid: int, model: str, scaling: Scaling) -> float | Non
     counts = []
     for launches in (few, many):
         command = ["perf", "stat", "-x", ",", "-e", "instructions:u", sys.executable, __file__]
-        command += ["--grid", str(grid), "--models", model, "--launch", scaling, str(launches)]
+        command += ["--grid", str(grid), "--fields", field, "--models", model]
+        command += ["--launch", scaling, str(launches)]
         try:
             done = subprocess.run(command, capture_output=True, text=True, timeout=300)
         except (OSError, subprocess.TimeoutExpired):
@@ -308,22 +186,36 @@ def pairs_in_torch(
         loss = pipeline.loss()
         return lambda: pipeline.backward(loss, keep_graph=True)
 
+    of = {"model": "rgb", "field": "dense"}
     return [
         Pairs(
-            "rgb",
+            of,
             "torch backward",
             backward(pipelines["none"]),
             backward(pipelines["clamped"]),
             stopwatch,
         ),
         Pairs(
-            "rgb",
+            of,
             "operation alone",
             lambda: None,
             operation_alone(device, choices.threads),
             stopwatch,
         ),
     ]
+
+
+def inside(field: str, model: ModelName, grid: int) -> Workload:
+    """All of its samples lie in the box, of random numbers."""
+    work = make_workload("inside", grid, N_RAYS, N_STEPS, model=model)
+    return work if field == "dense" else made_field(field, work)
+
+
+def torch_of(work: Workload, threads: int, device: str) -> Candidate:
+    """What launches of models besides rgb, or with other fields, are compared with."""
+    if isinstance(work, FieldWorkload):
+        return TorchFields(work, FieldChoices(threads=threads, parts=4))
+    return torch_models.TorchModels(work, torch_models.Choices(threads=threads), device)
 
 
 def main() -> None:
@@ -335,46 +227,44 @@ def main() -> None:
     parser.add_argument(
         "--models", nargs="+", default=list(DEFAULT_MODELS), choices=list(DEFAULT_MODELS)
     )
+    add_fields(parser)
     parser.add_argument("--launch", nargs=2, metavar=("SCALING", "N"), help=argparse.SUPPRESS)
     args = parser.parse_args()
+    pairs_asked = models_of(parser, args)
     if args.launch:  # the process that counted_instructions watches
-        work = make_workload("inside", args.grid, N_RAYS, N_STEPS, model=args.models[0])
-        launch = WarpAdjoint(work, "cpu", 1).backward(args.launch[0])
+        ((field, model),) = pairs_asked
+        launches = WarpAdjoint(inside(field, model, args.grid), "cpu", 1, N_SAMPLES)
+        launch = launches.backward(args.launch[0])
         for _ in range(int(args.launch[1])):
             launch()
         return
+    if args.device != "cpu" and args.fields != ["dense"]:
+        parser.error("fields besides dense grids are compared with torch on the CPU")
 
     stopwatch = Stopwatch(args.device)
     records: list[dict[str, Any]] = []
     best: Choices | None = None
-    for model in args.models:
-        work = make_workload("inside", args.grid, N_RAYS, N_STEPS, model=model)
-        ours = WarpAdjoint(work, args.device, args.threads)
+    for field, model in pairs_asked:
+        of = {"model": model, "field": field}
+        work = inside(field, model, args.grid)
+        ours = WarpAdjoint(work, args.device, args.threads, N_SAMPLES)
+        sides: dict[Scaling, Workload] = {s: replace(work, scaled=s != "none") for s in SCALED}
         in_torch: list[Pairs] = []
-        if model == "rgb":
+        if model == "rgb" and field == "dense":
             best = fastest_choices(work, args, stopwatch)
-            theirs = {
-                s: TorchPipeline(replace(work, scaled=s != "none"), best, args.device)
-                for s in SCALED
-            }
+            theirs = {s: TorchPipeline(side, best, args.device) for s, side in sides.items()}
             check(ours, theirs)
             in_torch = pairs_in_torch(theirs, best, args.device, stopwatch)
         else:
-            choices = torch_models.Choices(threads=args.threads)
             check(
                 ours,
-                {
-                    s: torch_models.TorchModels(
-                        replace(work, scaled=s != "none"), choices, args.device
-                    )
-                    for s in SCALED
-                },
+                {s: torch_of(side, args.threads, args.device) for s, side in sides.items()},
                 AT_KINKS if model in ("deferred", "per_sample") else 0.0,
             )
         plain = ours.backward("none")
-        backward = Pairs(model, "render_backward", plain, ours.backward("clamped"), stopwatch)
-        train = Pairs(model, "render_train", ours.train("none"), ours.train("clamped"), stopwatch)
-        control = Pairs(model, "control", plain, plain, stopwatch)
+        backward = Pairs(of, "render_backward", plain, ours.backward("clamped"), stopwatch)
+        train = Pairs(of, "render_train", ours.train("none"), ours.train("clamped"), stopwatch)
+        control = Pairs(of, "control", plain, plain, stopwatch)
         all_pairs = (backward, train, control, *in_torch)
         for _ in range(args.pairs):
             for pairs in all_pairs:
@@ -387,22 +277,25 @@ def main() -> None:
         f"{f' (torch: {best.threads})' if best else ''}; median difference [95 % interval]\n"
     )
     print(
-        f"{'':27s}{'without us':>11s}{'with us':>11s}   {'difference us':26s}   "
+        f"{'':34s}{'without us':>11s}{'with us':>11s}   {'difference us':26s}   "
         "of the backward pass"
     )
     for r in records:
         d, s = r["difference_us"], r["share_of_backward"]
+        whose = f"{r['model']}, {r['field']}"
         difference = f"{d['median']:+.1f} [{d['low']:+.1f}, {d['high']:+.1f}]"
         print(
-            f"{r['model']:10s}{r['name']:17s}{r['without_us']:11.0f}{r['with_us']:11.0f}   "
+            f"{whose:17s}{r['name']:17s}{r['without_us']:11.0f}{r['with_us']:11.0f}   "
             f"{difference:26s}   {s['median']:+.2%} [{s['low']:+.2%}, {s['high']:+.2%}]"
         )
 
     instructions: dict[str, dict[str, float | None]] | None = None
     if not args.device.startswith("cuda") and has_counters():
         instructions = {
-            model: {s: counted_instructions(args.grid, model, s) for s in SCALED}
-            for model in args.models
+            f"{model}, {field}": {
+                s: counted_instructions(args.grid, field, model, s) for s in SCALED
+            }
+            for field, model in pairs_asked
         }
         print(f"\ninstructions of a sample's adjoint: {instructions}")
     else:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from measuring import show
-from page_parts import Records, below, place, table, text
+from page_parts import Records, below, place, text
 
 EXCHANGES = {
     "shared": "sum in shared memory",
@@ -22,15 +22,10 @@ def jobs(records: Records) -> str:
         float(np.median([block[name] for block in late]))
         for name in ("threads_ms", "processes_ms", "exchange_ms", "exchange_mb")
     )
-    rows = [
-        [
-            row["way"],
-            f"{row['wall']:.0f}",
-            f"{row['training']:.0f}",
-            f"{row['psnr']:.2f}",
-        ]
+    reached = "; ".join(
+        f"{row['way']} {row['wall']:.0f} s ({row['training']:.0f} s), {row['psnr']:.2f} dB"
         for row in cut["rows"]
-    ]
+    )
     return below(
         text(
             f"""One training of {place(record["scene"])}, {record["steps"]} steps of `fast`: two
@@ -43,9 +38,8 @@ def jobs(records: Records) -> str:
         text(
             f"""`{cut["scene"]}` in {cut["count"]} blocks of {cut["voxels"]:,} voxels and
             {cut["steps"]} steps each, and in one training of as many voxels and steps as all blocks
-            have: seconds with reading, compiling and saving, seconds of training as the jobs
-            counted them, and PSNR of the test views.""",
+            have: time with reading, compiling and saving (that of training as the jobs counted it),
+            and PSNR of the test views: {reached}.""",
             records.source("blocks"),
         ),
-        table(["", "s", "s of training", "PSNR [dB]"], rows),
     )

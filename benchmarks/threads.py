@@ -21,8 +21,8 @@ import numpy as np
 import roofline
 import warp as wp
 from candidates.warpnerf_step import WarpStep
+from cases import make_cases
 from measuring import Stopwatch, machine, median_interval, options, show, write_record
-from throughput import make_cases
 
 from warpnerf.runtime.parallel import Workers
 

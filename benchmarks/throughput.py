@@ -14,6 +14,9 @@ above 1e-4 only, whoever runs it. A case is one workload:
     dense    random values everywhere
     sphere   a solid sphere in empty space, which may be skipped: where it is free is given to all
 
+Fields besides dense grids (`--fields vm hash`) are of random numbers in all of the box, and only
+eager torch has them; it is told where samples lie.
+
 All are checked against each other before anything is timed. Then they take turns, in an order that
 changes from round to round; in a turn the better of two steps counts. Ratios are formed within a
 round; all figures are medians over the rounds with 95 % intervals from order statistics. With two
@@ -28,7 +31,7 @@ import argparse
 import gc
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import candidates
@@ -36,6 +39,8 @@ import numpy as np
 import roofline
 from candidates import Candidate, Load, torch_eager
 from candidates.warpnerf_step import WarpStep
+from cases import Case, FieldCase, make_cases
+from field_workload import FieldWorkload, add_fields, models_of
 from measuring import (
     Interval,
     Stopwatch,
@@ -47,7 +52,7 @@ from measuring import (
     write_record,
 )
 from plotting import plot_throughput
-from workload import DEFAULT_MODELS, ModelName, Rays, Scene, Workload, make_workload
+from workload import DEFAULT_MODELS, Workload, make_workload
 
 TOLERANCE = 1e-4
 """Of the largest value: by how much candidates may differ from the first."""
@@ -55,54 +60,10 @@ AT_KINKS = {"per_sample": 1e-4, "dvgo": 4e-4}
 """The share of the gradient's values that may differ by more: where a unit of a sample is next to
 0, or its weight next to the threshold, rounding decides what flows back; dvgo has four times the
 units."""
+AT_FINE = 1e-4
+"""Likewise where a hash is read, whose fine levels amplify rounding of positions."""
 OURS = "warpnerf"
 IN_TURN, AT_ONCE = "apart, in turn", "apart, at once"
-
-
-@dataclass(frozen=True)
-class Case:
-    """One workload."""
-
-    rays: Rays
-    grid: int
-    scene: Scene = "dense"
-    scaled: bool = True
-    model: ModelName = "rgb"
-
-    def __str__(self) -> str:
-        """In words."""
-        scaling = "scaled" if self.scaled else "not scaled"
-        return f"{self.model}, {self.rays} rays, {self.grid}^3, {self.scene}, {scaling}"
-
-    def workload(self, n_rays: int, n_steps: int) -> Workload:
-        """Make it."""
-        return make_workload(
-            self.rays,
-            self.grid,
-            n_rays,
-            n_steps,
-            scene=self.scene,
-            scaled=self.scaled,
-            model=self.model,
-        )
-
-
-def make_cases(grids: Sequence[int]) -> list[Case]:
-    """Of rgb every grid once, and on the last everything else once; there the other models too."""
-    last = grids[-1]
-    scenes: tuple[Scene, ...] = ("dense", "sphere")
-    return [
-        *(Case("random", grid) for grid in grids),
-        Case("patches", last),
-        Case("random", last, scene="sphere"),
-        Case("random", last, scaled=False),
-        *(
-            Case("random", last, scene=scene, model=model)
-            for model in DEFAULT_MODELS
-            if model != "rgb"
-            for scene in scenes
-        ),
-    ]
 
 
 def check(
@@ -251,13 +212,18 @@ def run_case(
 ) -> dict[str, Any]:
     """Load, check, time and describe one case."""
     work = case.workload(args.rays, args.steps)
-    needed = roofline.needs(work)
-    print(f"\n{case}: {needed.n_samples} samples")
-    found, missing = wanted(case.model, args)
-    if case.model != "rgb" and missing:
+    of_field = isinstance(work, FieldWorkload)
+    if isinstance(work, FieldWorkload):
+        counts = {"n_samples": len(work.distances)}
+    else:
+        counts = asdict(roofline.needs(work))
+    print(f"\n{case}: {counts['n_samples']} samples")
+    found, missing = wanted(case, args)
+    if (case.model != "rgb" or of_field) and missing:
         print(f"  left out: {'; '.join(f'{name}, {reason}' for name, reason in missing.items())}")
     runs = {(n, t): load(work, t, args.device) for n, load in found.items() for t in args.threads}
-    differences = check(runs, AT_KINKS.get(work.model, 0.0))
+    kinks = AT_KINKS.get(work.model, AT_FINE if of_field else 0.0)
+    differences = check(runs, kinks, of_field=of_field)
     calls = {key: run.step for key, run in runs.items()}
     several = [t for t in args.threads if t > 1 and 1 in args.threads]
     for t in several:
@@ -268,12 +234,12 @@ def run_case(
     for threads in args.threads:
         row: dict[str, Any] = {
             "threads": threads,
-            "candidates": summarise(seconds, list(found), threads, needed.n_samples),
+            "candidates": summarise(seconds, list(found), threads, counts["n_samples"]),
         }
         if threads in several:
             row |= compare_threads(seconds, threads)
-        if threads in machines and case.model == "rgb":  # whose operations are counted
-            bound = roofline.bounds(work, needed, machines[threads])
+        if threads in machines and case.model == "rgb" and not of_field:  # that is counted
+            bound = roofline.bounds(work, roofline.Needs(**counts), machines[threads])
             row["bounds_ms"] = {key: 1e3 * value for key, value in asdict(bound).items()}
             row["least_ms"] = 1e3 * bound.least
         rows.append(row)
@@ -281,16 +247,18 @@ def run_case(
     return {
         "name": str(case),
         **asdict(case),
-        **asdict(needed),
+        **counts,
         "left_out": missing,
         "differences": differences,
         "rows": rows,
     }
 
 
-def wanted(model: ModelName, args: argparse.Namespace) -> tuple[dict[str, Load], dict[str, str]]:
-    """Who takes part with a model, and why the others do not."""
-    found, missing = candidates.find(args.device, model)
+def wanted(case: Case, args: argparse.Namespace) -> tuple[dict[str, Load], dict[str, str]]:
+    """Who takes part in a case, and why the others do not."""
+    found, missing = candidates.find(
+        args.device, case.model, case.field if isinstance(case, FieldCase) else "dense"
+    )
     missing |= {name: "not wanted" for name in args.without if found.pop(name, None)}
     return found, missing
 
@@ -385,6 +353,7 @@ def main() -> None:
     parser.add_argument(
         "--models", nargs="+", default=list(DEFAULT_MODELS), choices=list(DEFAULT_MODELS)
     )
+    add_fields(parser)
     parser.add_argument(
         "--without", nargs="+", default=[], choices=list(candidates.MODULES)[1:], metavar="NAME"
     )
@@ -395,21 +364,23 @@ def main() -> None:
     on_cuda = args.device.startswith("cuda")
     if on_cuda:
         args.threads = [1]
+    cases = make_cases(args.grids, models_of(parser, args))
+    dense = "dense" in args.fields
 
-    found, missing = wanted("rgb", args)
+    found, missing = wanted(Case("random", args.grids[0]) if dense else cases[0], args)
     print(
         f"{args.rays} rays x {args.steps} steps, {args.rounds} rounds; median [95 % interval]\n"
         f"compared: {', '.join(found)}"
     )
     for name, reason in missing.items():
         print(f"left out: {name}, {reason}")
-    machines = {} if on_cuda else {t: roofline.measure(t, args.grids) for t in args.threads}
+    measured_on = [] if on_cuda or not dense else args.threads
+    machines = {t: roofline.measure(t, args.grids) for t in measured_on}
     for measured in machines.values():
         print(roofline.describe(measured))
     records = []
-    for case in make_cases(args.grids):
-        if case.model in args.models:
-            records.append(run_case(case, args, machines))
+    for case in cases:
+        records.append(run_case(case, args, machines))
         gc.collect()
     print_summary(records)
     record = {
@@ -422,7 +393,7 @@ def main() -> None:
         "roofline": [asdict(measured) for measured in machines.values()],
         "operations_per_sample": roofline.OPERATIONS,
         "cases": records,
-        "memory": memory(args.grids[0], args),
+        "memory": memory(args.grids[0], args) if dense else [],
     }
     path = write_record(record, args.output, "throughput", args.device)
     print(f"\nrecord: {path}")

@@ -47,8 +47,12 @@ def page(folder: Path = RESULTS) -> str:
 
 
 def cost(records: Records) -> str:
-    names = ["gradient_scaling", "gradient_scaling_models"]
-    results = [{"model": "rgb", **row} for name in names for row in records[name]["results"]]
+    names = ["gradient_scaling", "gradient_scaling_models", "gradient_scaling_fields"]
+    results = [
+        {"model": "rgb", "field": "dense", **row}
+        for name in names
+        for row in records[name]["results"]
+    ]
     said = {
         "render_train": "fused launch, as in trainings",
         "render_backward": "backward launch",
@@ -56,34 +60,42 @@ def cost(records: Records) -> str:
         "torch backward": "torch with the paper's operation, one thread",
         "operation alone": "that operation alone",
     }
-    models, rows = values(results, "model"), []
+    columns = list(dict.fromkeys((row["model"], row["field"]) for row in results))
+    rows = []
     for name, words in said.items():
         cells = []
-        for model in models:
-            for row in of(results, model=model, name=name):
+        for model, field in columns:
+            for row in of(results, model=model, field=field, name=name):
                 percent = {key: 100 * share for key, share in row["share_of_backward"].items()}
                 cells.append(f"{show(row['difference_us'], 0)}; {show(percent, 2)} %")
-        rows.append([words, *cells, *[""] * (len(models) - len(cells))])
+        rows.append([words, *cells, *[""] * (len(columns) - len(cells))])
     return below(
         text(
             f"""Scaled against without: microseconds per {records[names[0]]["n_samples"]:,} samples,
             and share of the unscaled backward pass. Of warpnerf these are two compiled programs,
-            which differ a little whatever they leave out.""",
+            which differ a little whatever they leave out. Fields besides dense grids were measured
+            on cores that other programs used as well.""",
             *(records.source(name) for name in names),
         ),
-        table(["", *(f"`{model}`" for model in models)], rows),
+        table(["", *(kind(model, field) for model, field in columns)], rows),
     )
 
 
+def kind(model: str, field: str) -> str:
+    """A model, and what it is stored in besides a dense grid."""
+    return f"`{model}`" if field == "dense" else f"`{model}`, `{field}`"
+
+
 def throughput(records: Records) -> str:
-    names = ["throughput", "throughput_models"]
+    names = ["throughput", "throughput_models", "throughput_fields"]
     cases = [case for name in names for case in records[name]["cases"]]
     others = list(dict.fromkeys(key for case in cases for key in case["rows"][-1]["candidates"]))
     others.remove("warpnerf")
     rows = []
     for case in cases:
         found = case["rows"][-1]["candidates"]
-        what = [f"`{case.get('model', 'rgb')}`", case["rays"], f"{case['grid']}³", case["scene"]]
+        model, field = case.get("model", "rgb"), case.get("field", "dense")
+        what = [kind(model, field), case["rays"], f"{case['grid']}³", case["scene"]]
         what += [] if case["scaled"] else ["not scaled"]
         times = (
             f"{middle(found[key]['ms'], 0)} ({middle(found[key]['over_warpnerf'], 1)})"
@@ -93,7 +105,7 @@ def throughput(records: Records) -> str:
         )
         cells = [f"{case['n_samples']:,}", middle(found["warpnerf"]["ms"], 1)]
         rows.append([", ".join(what), *cells, *times])
-    record, memory = (records[name] for name in names)
+    record, memory = (records[name] for name in names[:2])
     last = [case["rows"][-1] for case in record["cases"]]
     second = [row["candidates"]["warpnerf"]["over_one_thread"] for row in last]
     quiet = [case["undisturbed"]["times_as_fast"] for case in records["threads"]["cases"]]
@@ -109,7 +121,9 @@ def throughput(records: Records) -> str:
             median over rounds ([plot](../benchmarks/results/throughput_cpu.png) of the first run).
             So many threads are {medians(second)} times as fast as one there, and {medians(quiet)}
             times where controls find the cores idle. Besides grid, gradient and optimiser a step
-            takes {ours} MB with {steps} steps a ray, torch {theirs} MB between the passes.""",
+            takes {ours} MB with {steps} steps a ray, torch {theirs} MB between the passes. Fields
+            besides dense grids, where torch is told where samples lie, were measured on cores that
+            other programs used as well: of these rows ratios compare, not times.""",
             *(records.source(name) for name in (*names, "threads")),
         ),
         table(["model, rays, grid", "samples", "warpnerf", *others], rows),

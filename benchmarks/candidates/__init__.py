@@ -55,12 +55,20 @@ MODULES_OF_OTHERS = {
 MODULES_OF_DVGO = {"warpnerf": "warpnerf_step", "torch": "torch_models"}
 """The same, of `per_sample` with a network as wide as DVGO's."""
 
+MODULES_OF_FIELDS = {"warpnerf": "warpnerf_step", "torch": "torch_fields"}
+"""The same, of fields that are no dense grids; they have `gradients()`, of each array by its
+name, in place of `gradient()`."""
 
-def find(device: str, model: ModelName = "rgb") -> tuple[dict[str, Load], dict[str, str]]:
-    """What can run a model on a device, and why the others cannot."""
+
+def find(
+    device: str, model: ModelName = "rgb", field: str = "dense"
+) -> tuple[dict[str, Load], dict[str, str]]:
+    """What can run a model with a field on a device, and why the others cannot."""
     found: dict[str, Load] = {}
     missing: dict[str, str] = {}
     modules = {"rgb": MODULES, "dvgo": MODULES_OF_DVGO}.get(model, MODULES_OF_OTHERS)
+    if field != "dense":
+        modules = MODULES_OF_FIELDS
     for name in MODULES:
         module = modules.get(name)
         if module is None:

@@ -25,6 +25,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from field_workload import FieldWorkload
+from measuring import Stopwatch
 from warpnerf_kernels.fields.hashed_packs import PRIME_X, PRIME_Y
 from workload import Workload
 
@@ -231,3 +232,21 @@ class TorchFields(TorchModels):
             return {"values": entries[0], "decoder": of_decoder}
         planes, lines = np.concatenate(entries[:3]), np.concatenate(entries[3:])
         return {"planes": planes, "lines": lines, "decoder": of_decoder}
+
+
+def load(work: Workload, threads: int, device: str) -> TorchFields:
+    """Read in the way whose step takes least time here, on that many threads."""
+    seconds = Stopwatch(device).seconds
+    found = TorchFields(work, FieldChoices(threads=threads), device)
+    spent: dict[Choices, float] = {}
+    found.step()
+    for choices in found.ways():  # steps so long that one of each tells
+        found.choices = choices
+        spent[choices] = seconds(found.step)
+    found.choices = min(spent, key=lambda choices: spent[choices])
+    return found
+
+
+def obstacle(device: str) -> str | None:
+    """Where samples lie, and what they read, is in memory of the CPU."""
+    return None if device == "cpu" else "reads fields on the CPU only"

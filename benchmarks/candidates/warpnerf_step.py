@@ -21,6 +21,8 @@ from warpnerf_kernels.base.tiles import (
 from warpnerf_kernels.base.types import gradient_type
 from workload import MODELS, Workload
 
+from warpnerf.fields.gradients import Gradients
+from warpnerf.fields.storage import Storage
 from warpnerf.rendering.render import TrainingPass, render_rays
 from warpnerf.runtime.parallel import LaunchCache, Workers
 
@@ -73,6 +75,17 @@ def clear_kernel(n_floats: int) -> wp.Kernel:
     return clear
 
 
+def gradients_of(storage: Storage, gradients: Gradients) -> dict[str, np.ndarray]:
+    """Of each array of what a field is stored in, entry by entry; of all workers together."""
+    found = {}
+    for name, values in storage.tensors().items():
+        gradient = gradients.arrays[name].numpy()
+        if storage.kind.rules[name] != "nodes":
+            gradient = gradient.sum(axis=0)[: values.size]
+        found[name] = gradient.reshape(values.shape)
+    return found
+
+
 class WarpStep:
     """A workload's training step in warpnerf."""
 
@@ -122,13 +135,7 @@ class WarpStep:
 
     def gradients(self) -> dict[str, np.ndarray]:
         """Of each array of what a field is stored in, entry by entry; of all workers together."""
-        found = {}
-        for name, values in self._grid.tensors().items():
-            gradient = self._pass.gradients.arrays[name].numpy()
-            if self._grid.kind.rules[name] != "nodes":
-                gradient = gradient.sum(axis=0)[: values.size]
-            found[name] = gradient.reshape(values.shape)
-        return found
+        return gradients_of(self._grid, self._pass.gradients)
 
     def network_gradient(self) -> np.ndarray:
         """[n_parameters], weights and biases in turn; of all workers together."""

@@ -1,7 +1,9 @@
 """A hash trains, grows, resumes, skips free space, and is kept and exported."""
 
+import ctypes
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,9 +21,13 @@ from warpnerf.checks import InputError
 from warpnerf.fields.dense import DenseGrid
 from warpnerf.fields.hashed import Hashed, level_shapes
 from warpnerf.fields.occupancy import FreeCells
+from warpnerf.model.interface import loader
 from warpnerf.model.models import Deferred
 from warpnerf.model.registry import to_json
+from warpnerf.model.sampler_kinds import Resampled
 from warpnerf.model.storage_kinds import DENSE, STORAGE_KINDS, Hash, from_json
+from warpnerf.rendering import adjoint
+from warpnerf.training import plan as planning
 from warpnerf.training.optim import Update, adam_struct
 from warpnerf.training.plan import resolve
 from warpnerf.training.state import TrainingState
@@ -136,6 +142,28 @@ def test_memory_does_not_grow_with_the_lattice() -> None:
     small, large = (kind.training_bytes(model, (n, n, n)) for n in (100, 400))
     assert large - small == 3 * (400**3 - 100**3)
     assert kind.training_bytes(model, (100,) * 3) < 0.05 * DENSE.training_bytes(model, (200,) * 3)
+
+
+def test_gradients_on_their_way_count() -> None:
+    """All samples have some for other threads, where there are several; a dense grid's have few."""
+    for kind in (Hash(), Hash(levels=5, features=8)):
+        record = kind.encoding(loader("float32"), Deferred()).vectors.Record
+        assert kind.sample_bytes == ctypes.sizeof(record.ctype) // 16
+    assert planning.RECORD_BYTES == adjoint.RECORDS
+
+    def memory(**changes: Any) -> int:
+        return planning.resolve(ball(), replace(CONFIG, **changes)).memory
+
+    one, two, gpu = (memory(**c) for c in ({"threads": 1}, {"threads": 2}, {"device": "cuda"}))
+    steps = planning.resolve(ball(), CONFIG).schedule.most_steps_an_update
+    samples = CONFIG.rays_per_step * steps * planning.SAMPLES_IN_FOG
+    assert two - one == samples * CONFIG.field.sample_bytes > 0 and gpu == one
+    many = {"rays_per_step": 1 << 20}
+    assert memory(threads=2, **many) - memory(threads=1, **many) == adjoint.RECORDS
+    drawn = {"sampler": Resampled(samples=32, bins=64), "threads": 2}
+    fewer = memory(**drawn) - memory(**drawn | {"threads": 1})
+    assert fewer == samples // planning.SAMPLES_IN_FOG * 48 * CONFIG.field.sample_bytes
+    assert memory(field=DENSE, threads=2) == memory(field=DENSE, threads=1)
 
 
 def test_a_hidden_layer_counts() -> None:

@@ -104,7 +104,7 @@ MUTANTS = [
     Mutant(
         "density_of: units below 0, too",
         FILE,
-        "(units[u] < 0.0f ? 0.0f : units[u])",
+        "(units[u] < 0 ? 0 : units[u])",
         "units[u]",
         LAYER_NODES,
     ),

@@ -22,6 +22,7 @@ QUARTER = (
 PULLED = "evaluation/test_near_field.py::test_pulled_back_cameras_see_what_their_photographs_show"
 NEAR_DENSITY = "evaluation/test_floater_metrics.py::test_near_density_is_density_times_clearance"
 EVENLY = "evaluation/test_floater_metrics.py::test_directions_are_spread_evenly"
+ON_THEIR_WAY = "fields/test_hashed_training.py::test_gradients_on_their_way_count"
 PHOTOGRAPHS = "inspection/test_inspection.py::test_photographs_take_memory"
 VOXELS = (
     "inspection/test_inspection.py::test_voxels_are_described_where_they_say_how_fine_a_field_is"
@@ -104,6 +105,11 @@ MUTANTS = [
             "seen.opacity.mean()", NEAR_DENSITY),
     of_host("directions: one half", FLOATERS, "z = 1.0 - 2.0 * k / n", "z = 1.0 - k / n", EVENLY),
     # inspection.py
+    of_host("memory without gradients on their way", "training/plan.py", "of_rays + of_samples +", "of_rays +", ON_THEIR_WAY),
+    of_host("memory of gradients on their way on one thread", "training/plan.py", "usable_cores()) == 1", "usable_cores()) == 0",
+            ON_THEIR_WAY),
+    of_host("memory of gradients without their positions", "model/storage_kinds.py", "4 * (3 + -(-self.levels", "4 * (-(-self.levels",
+            ON_THEIR_WAY),
     of_host("memory without photographs", "training/plan.py", "+ images + PROCESS_BYTES", "+ PROCESS_BYTES", PHOTOGRAPHS),
     of_host("memory of four numbers a node", "model/storage_kinds.py", "math.prod(size) * model.n_floats * NUMBER_BYTES",
             "math.prod(size) * 4 * NUMBER_BYTES", OF_MODEL),

@@ -145,6 +145,20 @@ def test_train_save_go_on_and_render(method: Any, dataset: dict[str, Any], tmp_p
         opened.train_iteration(12)
 
 
+@pytest.mark.slow  # compiles for each
+@pytest.mark.parametrize("other", [{"field": "vm"}, {"field": "hash"}, {"sampler": "resampled"}])
+def test_other_fields_and_samplers_go_on(
+    method: Any,
+    dataset: dict[str, Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    other: dict[str, str],
+) -> None:
+    """Saved and continued they are what they are in one go."""
+    monkeypatch.setitem(globals(), "SHORT", SHORT | other)
+    test_train_save_go_on_and_render(method, dataset, tmp_path)
+
+
 def test_masks_are_kept(method: Any, dataset: dict[str, Any]) -> None:
     masks = [np.full(image.shape[:2], 255, np.uint8) for image in dataset["images"]]
     masks[1][:, :3] = 0

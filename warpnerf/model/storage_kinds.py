@@ -70,6 +70,12 @@ class StorageKind(ABC):
     it."""
 
     @property
+    def sample_bytes(self) -> int:
+        """Memory of a sample's gradient on its way from one thread of the CPU to others, where each
+        sample has something for others; 0 where few do."""
+        return 0
+
+    @property
     def has_sparsity(self) -> bool:
         """Whether an L1 loss makes it sparse, added as often as total variation is."""
         return False
@@ -285,6 +291,12 @@ class Hash(StorageKind):
         layer, for each sample."""
         of_layer = self.hidden * (self.levels * self.features + COLUMNS)
         return 0.6 + 0.4 * self.levels + LAYER_TIME * of_layer
+
+    @property
+    def sample_bytes(self) -> int:
+        """Memory of a sample's gradient on its way in bytes: its position, and a number for each of
+        all levels, in whole packs of sixteen. Levels belong to different threads."""
+        return 4 * (3 + -(-self.levels * self.features // 16) * 16)
 
     @property
     def rules(self) -> Mapping[str, str]:

@@ -7,6 +7,7 @@ may round what is estimated of the cameras otherwise, and another version may de
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,7 @@ from warpnerf.model.sampler_kinds import MARCHED, SamplerKind
 from warpnerf.model.spaces import SPACES, SpaceKind
 from warpnerf.optim_config import SceneKind
 from warpnerf.rendering.steps import Steps
+from warpnerf.runtime.memory import usable_cores
 from warpnerf.scenes.extent.points import ObservedExtent, with_extent
 from warpnerf.scenes.extent.sharpness import Sharpness, sharpness
 from warpnerf.scenes.extent.space import Space, grid_size
@@ -32,6 +34,12 @@ STEPS_SHARE = 0.1
 
 RAY_BYTES = 100
 """Memory of a ray of an update: where it comes from and goes, and what it should be and is."""
+
+RECORD_BYTES = 1 << 29
+"""What gradients of samples on their way take at most; ``warpnerf.rendering.adjoint.RECORDS``."""
+
+SAMPLES_IN_FOG = 180
+"""Of a ray that is marched while nothing is known to be free, about."""
 
 PROCESS_BYTES = 250_000_000
 """What a training takes besides grid and photographs: Python, Warp, compiled kernels, pictures."""
@@ -210,7 +218,9 @@ def planned(
         steps = march_steps(config.march, space, size, reach)
         stages.append(Stage(begins=begins, nodes=nodes, size=size, steps=steps))
     of_field = config.field.training_bytes(config.model, stages[-1].size)
-    of_rays = bytes_of_rays(config, schedule, config.sampler_in(space.kind))
+    sampler = config.sampler_in(space.kind)
+    of_rays = bytes_of_rays(config, schedule, sampler)
+    of_samples = bytes_of_samples(config, schedule, sampler)
     return TrainingPlan(
         config=config,
         kind=kind,
@@ -224,7 +234,7 @@ def planned(
         schedule=schedule,
         stages=tuple(stages),
         voxel_pixels=sharpness(scene, space, voxels, config.field.box_is_fixed),
-        memory=of_field + of_rays + images + PROCESS_BYTES,
+        memory=of_field + of_rays + of_samples + images + PROCESS_BYTES,
         looks_first=looks_first,
     )
 
@@ -248,6 +258,24 @@ def bytes_of_rays(config: TrainConfig, schedule: Schedule, sampler: SamplerKind)
             "(optim.accumulate_at); use fewer, together below 2^31."
         )
     return n_rays * RAY_BYTES + sampler.training_bytes(n_rays)
+
+
+def bytes_of_samples(config: TrainConfig, schedule: Schedule, sampler: SamplerKind) -> int:
+    """Memory in bytes of the samples' gradients of an update on their way between threads.
+
+    As much as there is room for, where free space has not been found; on one thread and on CUDA
+    there is no such way.
+
+    Args:
+        config: Of the training.
+        schedule: How many steps an update has.
+        sampler: Where rays are sampled.
+    """
+    if (config.threads or usable_cores()) == 1 or not config.device.startswith("cpu"):
+        return 0
+    n_rays = config.rays_per_step * schedule.most_steps_an_update
+    samples = n_rays * math.ceil(sampler.samples_of(SAMPLES_IN_FOG))
+    return min(RECORD_BYTES, samples * config.field.sample_bytes)
 
 
 def needs_search(scene: Scene, config: TrainConfig, space: SpaceKind) -> bool:

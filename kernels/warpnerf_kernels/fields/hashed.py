@@ -337,14 +337,15 @@ def node_densities_kernel(width: int, n_levels: int, hidden: int) -> wp.Kernel:
 
 
 DENSITY_OF = r"""
-float units[HIDDEN] = {};
+typedef decltype(x.c[0] + x.c[0]) number;  // float, or in float64 double
+number units[HIDDEN] = {};
 for (int i = 0; i < n_inputs; ++i) {
-    const float* row = hidden.data + i * HIDDEN;
+    const number* row = hidden.data + i * HIDDEN;
     for (int u = 0; u < HIDDEN; ++u) units[u] += x.c[i] * row[u];
 }
-float raw = 0.0f;
+number raw = 0;
 for (int u = 0; u < HIDDEN; ++u) {
-    raw += (units[u] < 0.0f ? 0.0f : units[u]) * decoder.data[u * columns];
+    raw += (units[u] < 0 ? 0 : units[u]) * decoder.data[u * columns];
 }
 return raw;
 """
@@ -363,7 +364,7 @@ def hidden_densities_kernel(width: int, n_levels: int, hidden: int) -> wp.Kernel
         hidden: wp.array(dtype=real),
         decoder: wp.array(dtype=real),
         columns: int,  # of the decoder
-    ) -> wp.float32:
+    ) -> real:
         """The raw density, in C++: compilers know the number of units, and compute some at once."""
         ...
 
