@@ -167,6 +167,8 @@ MUTANTS = [
     of_host("depth: along the axis", "scenes/images/depths.py", "np.divide(along, cosine,", "np.divide(along, np.ones_like(cosine),",
             DEPTHS),
     of_host("depth: no unit", "scenes/images/depths.py", ".astype(np.float64) * self.unit", ".astype(np.float64)", DEPTHS),
+    of_host("depth: what cannot be read is not said", "scenes/images/depths.py", "return None, str(error)", "return None, \"\"",
+            "scenes/test_depths.py::test_depth_that_cannot_be_read_is_left_out"),
     of_host("depth: none is none", "scenes/images/depths.py", " & (along > 0.0)", "", UNKNOWN),
     of_host("bounds: any are right", GIVEN, "support >= SUPPORTED:\n        return bounds", "support >= 0.0:\n        return bounds", BOUNDS),
     of_host("bounds: never right", GIVEN, "SUPPORTED = 0.7", "SUPPORTED = 1.5",

@@ -94,7 +94,8 @@ def load_transforms(file: Path, reading: Reading) -> Scene:
     """Load a scene from a transforms.json.
 
     The split is the file's ``{train,val,test}_filenames``, else that of lists beside it, else every
-    8th image is for testing. Box and content distance are those of the points of a COLMAP model in
+    8th image is for testing; none is where the file lists all for training, and for testing all or
+    none. Box and content distance are those of the points of a COLMAP model in
     the folder whose cameras are the same, or that ``ply_file_path`` names, or of the only .ply in
     the folder, where there are such.
 
@@ -132,6 +133,9 @@ def load_transforms(file: Path, reading: Reading) -> Scene:
         members_of, listed_in, lost = read_split_lists(folder, called, called)
         splits = {split: {called[name] for name in of} for split, of in members_of.items()}
         warnings += lost
+    trained = splits.get("train", set())
+    if trained == set(names.values()) and all(of in (set(), trained) for of in splits.values()):
+        reading = replace(reading, withhold=reading.withhold or "all")
     points, why_not = _points(file, data, frames)
     if why_not:
         warnings.append(why_not)
