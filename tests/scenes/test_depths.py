@@ -201,7 +201,8 @@ def test_depth_that_cannot_be_read_is_left_out(tmp_path: Path) -> None:
     save(tmp_path / "transforms.json", content)
     scene = load_scene(tmp_path)
     assert [view.depth is not None for view in scene.views] == [False, False, True, False]
-    (warning,) = scene.warnings
+    assert len(scene.warnings) == 1
+    warning = scene.warnings[0]
     assert "depth of 2 of 4 images cannot be read, and is not used" in warning
     assert f"first: {tmp_path / 'colours.png'}: its pixels are RGB" in warning
 
