@@ -32,6 +32,7 @@ from warpnerf.scenes.images.masks import (
     PackedMask,
     all_of_blocks,
     masks_of_folder,
+    numbers_of_classes,
     read_mask,
 )
 from warpnerf.scenes.images.photographs import Keeping, Photograph, keep, stay_in_memory
@@ -264,20 +265,19 @@ def _without_masked(
         InputError: No training image is left.
     """
     left = {view.name for view in read}
-    gone = [frame.name for frame in frames if frame.name not in left]
+    gone = [frame for frame in frames if frame.name not in left]
     splits = {split: names & left for split, names in splits.items()}
+    classes = numbers_of_classes(frame.mask for frame in gone[:LOOKED_AT] if frame.mask is not None)
     if not splits["train"]:
-        raise InputError(
-            f"{file}: the masks leave no pixel of any training image; white pixels count, black "
-            "ones are ignored, so invert the masks if they are the other way round."
+        way_out = classes or (
+            "white pixels count, black ones are ignored, so invert the masks if they are the other "
+            "way round"
         )
-    warnings = []
-    if gone:
-        warnings.append(
-            f"left out {len(gone)} of {len(frames)} images of which masks leave no pixel (first: "
-            f"{gone[0]})"
-        )
-    return splits, warnings
+        raise InputError(f"{file}: the masks leave no pixel of any training image; {way_out}.")
+    if not gone:
+        return splits, []
+    said = f"left out {len(gone)} of {len(frames)} images of which masks leave no pixel (first: "
+    return splits, [f"{said}{gone[0].name})" + (classes and f": {classes}")]
 
 
 def _transparency_warning(read: Sequence[_Read]) -> list[str]:

@@ -38,7 +38,7 @@ from warpnerf.scenes.formats.frame import Frame
 from warpnerf.scenes.formats.frame_images import elsewhere_warnings, find_images
 from warpnerf.scenes.formats.ply import read_ply
 from warpnerf.scenes.formats.split_lists import read_split_lists
-from warpnerf.scenes.formats.unnamed_photographs import unnamed_photographs
+from warpnerf.scenes.formats.unnamed_photographs import same_names_beside, unnamed_photographs
 from warpnerf.scenes.images.depths import DEFAULT_UNIT, DepthFile
 from warpnerf.scenes.images.masks import Mask
 from warpnerf.scenes.scene import Scene
@@ -166,7 +166,7 @@ def _unnamed(file: Path, frames: Sequence[Frame]) -> tuple[list[str], list[str]]
     if model is not None and n is not None and n > len(frames):
         advice = f"; name {printable(str(model))} to read the COLMAP model, which has {n}"
         few, many = ([said + advice for said in part] for part in (few, many))
-    return few, many
+    return [*few, *same_names_beside(folder, photographs, printable(file.name))], many
 
 
 def _points(file: Path, data: TransformsFile, frames: Sequence[Frame]) -> tuple[Points | None, str]:
