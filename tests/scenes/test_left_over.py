@@ -70,7 +70,7 @@ def test_masks_that_are_named_after_nothing_are_said(tmp_path: Path) -> None:
     )
 
 
-@pytest.mark.parametrize("folder", ["masks", "masks_2", "unmasked", "masks/none"])
+@pytest.mark.parametrize("folder", ["masks", "masks_2", "unmasked"])
 def test_what_is_no_folder_of_masks_is_not_said(tmp_path: Path, folder: str) -> None:
     content = write_transforms(tmp_path)
     gray(tmp_path / folder / "001.png")
