@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -238,3 +239,31 @@ def test_cameras_that_look_away_see_nothing_and_that_is_said(tmp_path: Path) -> 
     away = load_scene(tmp_path / "scene")
     with pytest.raises(InputError, match="keep what is unseen"):
         export(ball_field(), tmp_path / "a.ply", level=LEVEL, scene=away, min_size=2.5)
+
+
+@pytest.mark.parametrize(("faces", "said"), [(100_000, True), (200, False)])
+def test_a_mesh_of_fewer_faces_than_are_wanted_is_said(
+    run_folder: Path, tmp_path: Path, faces: int, said: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level("INFO", logger="warpnerf"):
+        export_command(run_folder, (tmp_path / "a.ply",), level=LEVEL, faces=faces, threads=1)
+    _, triangles = read_ply((tmp_path / "a.ply").read_bytes())
+    assert triangles is not None
+    words = f"the mesh has {len(triangles)} triangles, not {faces}, and stays as it is"
+    assert (words in caplog.text) == said
+
+
+def test_a_scene_that_is_all_trained_on_is_exported_so(run_folder: Path, tmp_path: Path) -> None:
+    """nerfstudio refuses a file that lists photographs for some of its three splits only."""
+    run = Run(tmp_path / "run")
+    source = run_folder.parent / "scene"
+    scene = load_scene(source, split="all")
+    run.create(scene, str(source), 1, scene.content_distance, TrainConfig(), split="all")
+    run.save_field(ball_field())
+    assert export_command(run.folder, (tmp_path / "out",), threads=1) == 0
+    again = load_scene(tmp_path / "out")
+    assert again.splits == {"train": tuple(range(12)), "test": ()} == scene.splits
+    assert "no photograph is withheld for testing: all 12 are trained on" in again.notes
+    content = json.loads((tmp_path / "out" / "transforms.json").read_bytes())
+    lists = [content.get(f"{split}_filenames", []) for split in ("train", "val", "test")]
+    assert [len(each) for each in lists] == [12, 12, 12]

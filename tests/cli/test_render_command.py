@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -14,9 +15,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.rendering.test_composite import composite_of
 from tests.support import cli_process
+from tests.support.solid_fields import ball_field
 from tests.support.tiny_fields import tiny_field
-from tests.support.tiny_scenes import ring, write_transforms
+from tests.support.tiny_scenes import look_at, ring, write_transforms
 from warpnerf.checks import InputError
 from warpnerf.cli import render
 from warpnerf.config import TrainConfig
@@ -134,6 +137,68 @@ def test_outputs_crop_and_photographs_by_name(run_folder: Path, tmp_path: Path) 
     assert render_command(run_folder, crop=(*low, *high), threads=1, **cropped) == 0
     shown = np.asarray(Image.open(tmp_path / "b" / "images_002.png"))[..., 0]
     assert shown.sum() < 255.0 * alpha.sum()
+
+
+def test_a_crop_that_holds_nothing_is_refused(
+    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Run, "load_field", lambda *_: (ball_field(), []))
+    crop = (0.8, -1.0, -1.0, 1.0, -0.7, -0.7)
+    with pytest.raises(InputError, match=r"crop between .* holds nothing") as refused:
+        render_command(run_folder, crop=crop, stills="test", output=tmp_path / "a", threads=1)
+    where = re.findall(r"-?[0-9.]+[0-9]", str(refused.value).rpartition("between")[2])
+    middle = np.array([0.1, -0.05, 0.15])  # of the ball, whose radius is 0.6
+    wanted = np.stack([middle - 0.6, middle + 0.6])
+    np.testing.assert_allclose(np.array(where, float).reshape(2, 3), wanted, atol=0.2)
+    assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.parametrize("blocks", [False, True])
+def test_a_crop_that_no_camera_sees_is_said(
+    run_folder: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    blocks: bool,
+) -> None:
+    if blocks:
+        monkeypatch.setattr(Run, "load_field", lambda *_: (composite_of([tiny_field()] * 4), []))
+    away = look_at((3.0, 0.0, 0.0), (9.0, 0.0, 0.0))
+    keys = [Key(seconds=float(i), fov=40.0, c2w=away[:3].tolist()) for i in range(2)]
+    file = tmp_path / "away.json"
+    file.write_bytes(RecordedPath(width=30, height=20, keys=keys).to_json())
+    options: dict[str, Any] = {"path": str(file), "fps": 2.0, "threads": 1}
+    crop = (-1.0, -1.0, -1.0, 1.0, 1.0, 1.0)
+    assert render_command(run_folder, crop=crop, output=tmp_path / "a", **options) == 0
+    said = (
+        "note: nothing is seen of the crop from there; what the field holds lies between -1 -1 -1"
+    )
+    assert said in capsys.readouterr().out
+    assert render_command(run_folder, output=tmp_path / "b", **options) == 0
+    assert "note: nothing is seen" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("kind", ["file", "link"])
+def test_stills_replace_nothing_but_stills(run_folder: Path, tmp_path: Path, kind: str) -> None:
+    write_transforms(tmp_path / "scene", 6)
+    run = Run(tmp_path / "run")
+    scene = load_scene(tmp_path / "scene")
+    run.create(scene, str(tmp_path / "scene"), 1, scene.content_distance, TrainConfig())
+    run.save_field(tiny_field())
+    options: dict[str, Any] = {"stills": "all", "threads": 1}
+    mine = run.folder / "images_003.png"
+    if kind == "file":
+        mine.write_bytes((tmp_path / "scene" / "images" / "003.png").read_bytes())
+    else:
+        mine.symlink_to(tmp_path / "nowhere.png")
+    before = contents(tmp_path)
+    with pytest.raises(InputError, match=r"images_003\.png is not a picture .* another folder"):
+        render_command(run.folder, output=run.folder, **options)
+    assert contents(tmp_path) == before
+    mine.unlink()
+    for size in ((8, 6), (12, 9)):  # their own are replaced
+        assert render_command(run.folder, output=run.folder, size=size, **options) == 0
+        assert Image.open(mine).width == 2 * size[0] + 4
 
 
 def test_a_path_of_nerfstudio_is_followed(

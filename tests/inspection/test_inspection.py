@@ -84,6 +84,19 @@ def test_photographs_that_show_nothing_or_too_little_are_odd(tmp_path: Path) -> 
     assert "images/000.png is 8 x 6 pixels, but SSIM needs 11 x 11" in found
 
 
+@pytest.mark.parametrize(("gray", "says"), [(3, True), (9, False), (0, False)])
+def test_gray_photographs_among_coloured_ones_are_said(
+    tmp_path: Path, gray: int, says: bool
+) -> None:
+    """As of a thermal camera beside the other."""
+    folder = scene_with(tmp_path, ring(9))
+    for k in range(gray):
+        file = folder / f"images/{k:03d}.png"
+        Image.open(file).convert("L").save(file)
+    found = odd(inspect(folder))
+    assert ("gray among coloured ones: 3 of 9 images (first: images/000.png)" in found) == says
+
+
 def test_the_same_photograph_at_other_poses_is_said(tmp_path: Path) -> None:
     """As of a video that stood still; one that differs in a pixel is another."""
     content = write_transforms(tmp_path, 9, scale=16)

@@ -25,6 +25,7 @@ PIXEL = "exporting/test_pinhole.py::test_a_pixel_shows_what_lies_in_its_directio
 INSIDE = "exporting/test_first_view.py::test_it_is_no_camera_inside_of_something_or_that_looks_away"
 BEFORE = "exporting/test_first_view.py::test_points_are_seen_in_the_picture_and_before_its_depth"
 ANOTHER = "cli/test_export.py::test_of_another_field_the_visibility_is_computed_again"
+STILLS = "cli/test_render_command.py::test_stills_replace_nothing_but_stills"
 OVER = "media/test_panels.py::test_transparent_pictures_over_the_background_are_the_rendering"
 OF_BALL = "media/test_panels.py::test_normals_are_those_of_the_ball_in_the_cameras_axes"
 STUDIO_FRAMES = (
@@ -64,6 +65,12 @@ MUTANTS = [
             "project/test_writing.py::test_what_cannot_be_removed_hides_no_error"),
     of_host("stills: wherever names lead", "media/filming.py", " or Path(name).name != name", "",
             "media/test_filming.py::test_stills_stay_in_their_folder"),
+    of_host("stills: of anything", "media/filming.py", " and mark not in beginning(path, MARKED)", " and False", STILLS),
+    of_host("stills: through links that lead nowhere", "media/filming.py", "os.path.lexists(path)", "path.exists()", STILLS),
+    of_host("crop: of nothing", "rendering/field.py", "if free.occupied_range() is None", "if False",
+            "cli/test_render_command.py::test_a_crop_that_holds_nothing_is_refused"),
+    of_host("cameras: for testing as they are", "exporting/cameras.py", "\"val\": test, \"test\": test}", "\"test\": test}",
+            "cli/test_export.py::test_a_scene_that_is_all_trained_on_is_exported_so"),
     of_host("pinhole: a pixel aside", PINHOLE, "(camera.cx, camera.cy) - 0.5", "(camera.cx, camera.cy) + 1.5", PIXEL),
     of_host("pinhole: masks as they are", PINHOLE, "_interpolated(both.astype(np.float32)[..., None], low, shares)[..., 0]",
             "both.astype(np.float32)", PIXEL),

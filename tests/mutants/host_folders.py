@@ -312,4 +312,25 @@ MUTANTS = [
         "if",
         "scenes/test_contents.py::test_photographs_of_a_scene_lead_to_it",
     ),
+    of_host(
+        "beside: whatever it is called",
+        UNNAMED,
+        "if PHOTOGRAPHS.fullmatch(other.name) or OTHER_IMAGES.fullmatch(other.name):",
+        "if False:",
+        f"{LEFT_TESTS}photographs_of_the_same_names_in_a_folder_beside_are_said",
+    ),
+    of_host(
+        "beside: of other names",
+        UNNAMED,
+        " and p.stem in own",
+        "",
+        f"{LEFT_TESTS}photographs_of_the_same_names_in_a_folder_beside_are_said",
+    ),
+    of_host(
+        "left over: masks in the folder itself alone",
+        LEFT,
+        "for inner in (path, *folders_in(path))",
+        "for inner in (path,)",
+        f"{LEFT_TESTS}masks_in_folders_of_their_folder_or_as_arrays_are_said",
+    ),
 ]

@@ -179,8 +179,8 @@ MUTANTS = [
     of_host(
         "Metashape: the initial calibration",
         METASHAPE,
-        "(adjusted or calibrations)[-1]",
-        "calibrations[0]",
+        "(adjusted or calibrations or [sensor])[-1]",
+        "(calibrations or [sensor])[0]",
         SAME,
     ),
     of_host("Metashape: no scale", METASHAPE, "to.scale * to.rotation", "to.rotation", TRANSFORMS),

@@ -75,6 +75,7 @@ ANY_FOCAL, FOCAL, HARDLY, OTHER_POSES = (
         "photographs_of_other_poses_are_named",
     )
 )
+CLASSES = "scenes/test_class_masks.py::test_masks_of_classes_are_told"
 READ_AS = "scenes/test_conventions.py::test_poses_in_other_axes_are_read_as_the_photographs_show"
 
 MUTANTS = [
@@ -86,6 +87,11 @@ MUTANTS = [
     of_host("doubts: of few references", DOUBTS, "len(gain) < ENOUGH or ", "", HARDLY),
     of_host("doubts: none of poses", DOUBTS, "if gain.mean() < REFUTED and", "if False and", OTHER_POSES),
     of_host("doubts: not asked", "scenes/extent/conventions.py", "        warnings += doubts(photographs)\n", "        pass\n", OTHER_POSES),
+    of_host("positions: as translations", "scenes/extent/conventions.py", "-to_camera @ poses[:, :, 3:]], axis=2)", "poses[:, :, 3:]], axis=2)", READ_AS),
+    of_host("left-handed: the camera alone", "scenes/extent/conventions.py", " * MIRRORED[:3, None]", "", READ_AS),
+    of_host("masks: classes are no reason", "scenes/images/masks.py", "if 1 < values[-1] < 128:", "if False:", CLASSES),
+    of_host("masks: JPEG's black is a class", "scenes/images/masks.py", "in LOSSY:", "in ():", CLASSES),
+    of_host("pointers: of any file", "scenes/files.py", "beginning(path, len(POINTER)) == POINTER", "False", "scenes/test_pointers.py"),
     of_host("w last: w second", "scenes/extent/conventions.py", "np.roll(quaternions(to_camera), 1, axis=1)", "np.roll(quaternions(to_camera), 2, axis=1)", READ_AS),
     of_host("w last: positions as they were", "scenes/extent/conventions.py", "-turned @ moved], axis=2)", "poses[:, :, 3:]], axis=2)", READ_AS),
     of_host("widths: no bend", SPACES, "k = np.where(n > 1.0, (ahead - s) / (n * ahead), 0.0)", "k = 0.0 * n", WIDTHS),
@@ -167,6 +173,8 @@ MUTANTS = [
     of_host("depth: along the axis", "scenes/images/depths.py", "np.divide(along, cosine,", "np.divide(along, np.ones_like(cosine),",
             DEPTHS),
     of_host("depth: no unit", "scenes/images/depths.py", ".astype(np.float64) * self.unit", ".astype(np.float64)", DEPTHS),
+    of_host("depth: what cannot be read is not said", "scenes/images/depths.py", "return None, str(error)", "return None, \"\"",
+            "scenes/test_depths.py::test_depth_that_cannot_be_read_is_left_out"),
     of_host("depth: none is none", "scenes/images/depths.py", " & (along > 0.0)", "", UNKNOWN),
     of_host("bounds: any are right", GIVEN, "support >= SUPPORTED:\n        return bounds", "support >= 0.0:\n        return bounds", BOUNDS),
     of_host("bounds: never right", GIVEN, "SUPPORTED = 0.7", "SUPPORTED = 1.5",

@@ -107,6 +107,11 @@ def two_cameras(folder: Path) -> None:
     photographs(folder / "right", 4)
 
 
+def stray_scanner(folder: Path) -> None:
+    empty_file("rgb.mp4")(folder)
+    (folder / "odometry.csv").write_text("timestamp, frame, x, y, z, qx, qy, qz, qw\n")
+
+
 def few_above(folder: Path) -> None:
     photographs(folder, 3)
     photographs(folder / "images", 4)
@@ -133,6 +138,26 @@ UNREAD = r"holds poses in a form that is not read \({}\); .*, or .* `warpnerf po
             beside_photographs("params/a.txt", "imageName X Y Z Omega Phi Kappa"),
             UNREAD.format("params/a.txt"),
         ),
+        *(
+            (beside_photographs(name, content), UNREAD.format(name.replace(".", r"\.")))
+            for name, content in (
+                ("cams/00000000_cam.txt", "extrinsic"),
+                ("traj.txt", "1 0 0 0"),
+                ("poses.txt", "1 0 0 0"),
+                ("poses.npy", ""),
+                ("frame-000000.pose.txt", "1 0 0 0"),
+                ("groundtruth.txt", "# timestamp tx ty tz qx qy qz qw"),
+                ("frame_00000.json", '{"cameraPoseARFrame": [1, 0, 0, 0]}'),
+                ("meta_data.json", '{"frames": [{"camtoworld": [[1]]}]}'),
+                ("predictions.npz", ""),
+            )
+        ),
+        (
+            beside_photographs("images/frame_0.json", '{"exposure": 1}'),
+            "it holds 4 photographs without",
+        ),
+        (stray_scanner, r"that is not read \(odometry\.csv\); .*, or .* pose .*/rgb\.mp4 --output"),
+        (empty_file("VID_1.insv"), r"holds 1 recording of a 360-degree camera .*VID_1\.insv"),
         (beside_photographs("a.json", '{"frames": []}'), "it holds 4 photographs without"),
         (beside_photographs("images/0.xmp", "<crs:Exposure/>"), "it holds 4 photographs without"),
         (empty_file("camera/0.json"), r"that is not read \(camera/0\.json\); export"),

@@ -104,6 +104,13 @@ def with_w_first(m: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.inv(to_camera) @ FLIP)
 
 
+def with_positions(m: np.ndarray) -> np.ndarray:
+    """World to camera in OpenCV axes, with the camera's position where its translation belongs."""
+    to_camera = np.linalg.inv(m @ FLIP)
+    to_camera[:3, 3] = m[:3, 3]
+    return np.asarray(np.linalg.inv(to_camera) @ FLIP)
+
+
 WRITTEN = {
     "camera to world in OpenCV": lambda m: m @ FLIP,
     "world to camera in OpenCV": lambda m: np.linalg.inv(m @ FLIP),
@@ -114,6 +121,10 @@ WRITTEN = {
     "x up, y left": lambda m: m[:, [1, 0, 2, 3]] * [1.0, -1.0, 1.0, 1.0],
     "in OpenCV axes, in place of LLFF's": lambda m: m[:, [1, 0, 2, 3]] * [-1.0, -1.0, -1.0, 1.0],
     "quaternions that end with w": with_w_first,
+    "left-handed axes as of Unity": lambda m: (
+        np.diag([1.0, 1.0, -1.0, 1.0]) @ m @ np.diag([1.0, 1.0, -1.0, 1.0])
+    ),
+    "positions of cameras in place of translations": with_positions,
 }
 
 

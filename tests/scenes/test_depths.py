@@ -184,6 +184,29 @@ def test_depth_is_read_as_instant_ngp_names_it(tmp_path: Path) -> None:
     assert survey(tmp_path).diagnostics == ()
 
 
+def test_depth_that_cannot_be_read_is_left_out(tmp_path: Path) -> None:
+    """Training does not need it: such as a coloured picture in place of instant-ngp's depths."""
+    content = write_transforms(tmp_path)
+    Image.new("RGB", (8, 6)).save(tmp_path / "colours.png")
+    np.save(tmp_path / "turned.npy", VALUES.T)
+    np.save(tmp_path / "fine.npy", VALUES)
+    for index, (key, name) in enumerate(
+        (
+            ("depth_path", "colours.png"),
+            ("depth_file_path", "turned.npy"),
+            ("depth_path", "fine.npy"),
+        )
+    ):
+        content["frames"][index][key] = name
+    save(tmp_path / "transforms.json", content)
+    scene = load_scene(tmp_path)
+    assert [view.depth is not None for view in scene.views] == [False, False, True, False]
+    assert len(scene.warnings) == 1
+    warning = scene.warnings[0]
+    assert "depth of 2 of 4 images cannot be read, and is not used" in warning
+    assert f"first: {tmp_path / 'colours.png'}: its pixels are RGB" in warning
+
+
 @pytest.mark.parametrize("ending", ["exr", "EXR", "pfm", "npz"])
 def test_depth_in_a_form_that_is_not_read_is_refused(tmp_path: Path, ending: str) -> None:
     (tmp_path / f"d.{ending}").write_bytes(b"v/1\x01")

@@ -418,6 +418,15 @@ def test_a_models_photographs_may_be_in_other_folders(tmp_path: Path, place: str
     assert [view.name for view in scene.views] == four("{}.png")
 
 
+def test_photographs_in_an_archive_are_mentioned(tmp_path: Path) -> None:
+    write_transforms(tmp_path)
+    shutil.rmtree(tmp_path / "images")
+    (tmp_path / "images.zip").write_bytes(b"PK")
+    says = r"first: images/000\.png\), but the archive images\.zip is: unpack it; put the images"
+    with pytest.raises(InputError, match=says):
+        load_scene(tmp_path)
+
+
 def test_a_models_photographs_of_other_names_are_mentioned(tmp_path: Path) -> None:
     scene_with_model(tmp_path)
     shutil.rmtree(tmp_path / "images")

@@ -70,7 +70,7 @@ def test_masks_that_are_named_after_nothing_are_said(tmp_path: Path) -> None:
     )
 
 
-@pytest.mark.parametrize("folder", ["masks", "masks_2", "unmasked", "masks/none"])
+@pytest.mark.parametrize("folder", ["masks", "masks_2", "unmasked"])
 def test_what_is_no_folder_of_masks_is_not_said(tmp_path: Path, folder: str) -> None:
     content = write_transforms(tmp_path)
     gray(tmp_path / folder / "001.png")
@@ -159,7 +159,43 @@ def test_points_that_cannot_be_read_are_said(tmp_path: Path) -> None:
     assert load_scene(tmp_path / "s").observations is None
 
 
+@pytest.mark.parametrize("inner", ["person/001.png", "001.npy"])
+def test_masks_in_folders_of_their_folder_or_as_arrays_are_said(tmp_path: Path, inner: str) -> None:
+    scene_with_model(tmp_path)
+    if inner.endswith(".png"):
+        gray(tmp_path / "masks" / inner)
+    else:
+        (tmp_path / "masks").mkdir()
+        np.save(tmp_path / "masks" / inner, np.ones((6, 8), bool))
+    said = "is not used, as no frame has a mask of it: none of its images is named"
+    assert any(said in warning for warning in load_scene(tmp_path).warnings)
+
+
 # photographs
+
+
+@pytest.mark.parametrize(
+    ("place", "said"),
+    [("right", True), ("images_2", False), ("thumbs", False), ("others", False)],
+)
+def test_photographs_of_the_same_names_in_a_folder_beside_are_said(
+    tmp_path: Path, place: str, said: bool
+) -> None:
+    """As of the other camera of a pair."""
+    content = write_transforms(tmp_path)
+    (tmp_path / "images").rename(tmp_path / "left")
+    for frame in content["frames"]:
+        frame["file_path"] = frame["file_path"].replace("images", "left")
+    save(tmp_path / "transforms.json", content)
+    (tmp_path / place).mkdir()
+    for k in range(4):
+        name = f"other_{k}.png" if place == "others" else f"{k:03d}.png"
+        Image.fromarray(picture(k + 9)).save(tmp_path / place / name)
+    note = (
+        f"also in the folder, and not used: {place}, with 4 photographs of the same names, which "
+        "transforms.json does not name"
+    )
+    assert (note in load_scene(tmp_path).notes) == said
 
 
 def test_photographs_that_transforms_json_does_not_name_are_said(tmp_path: Path) -> None:

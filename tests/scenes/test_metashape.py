@@ -189,6 +189,8 @@ def test_metashape_photographs_that_are_links_out_of_the_folder_are_refused(tmp_
         ("<document", '<!DOCTYPE a [<!ENTITY b "c">]><document', "declares entities or a document"),
         ('label="001"', 'label="000"', "1 cameras are of a photograph that another one is of"),
         ("<calibration", "<other", "is no valid XML"),
+        (SENSOR, '<sensor id="3" type="spherical"/>', "lens 'spherical' is not modelled; export"),
+        ("<camera ", '<camera enabled="0" ', "its 4 cameras that are aligned are switched off"),
     ],
 )
 def test_metashape_damage_is_named(tmp_path: Path, old: str, new: str, says: str) -> None:

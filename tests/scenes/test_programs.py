@@ -271,6 +271,14 @@ def test_reality_decimal_commas(tmp_path: Path, delimiter: str) -> None:
         load_scene(tmp_path)
 
 
+def test_reality_in_utf_16(tmp_path: Path) -> None:
+    """As PowerShell and Excel write text; poses are not estimated in place of those."""
+    file = write_reality(tmp_path)
+    expected = load_scene(tmp_path)
+    file.write_bytes(file.read_text().encode("utf-16"))
+    assert_same(load_scene(tmp_path), expected)
+
+
 def test_reality_columns_of_a_template(tmp_path: Path) -> None:
     file = write_reality(tmp_path)
     rows = [line.split(",")[:8] for line in file.read_text().splitlines()]

@@ -129,9 +129,10 @@ def render_command(
         threads: CPU threads; by default one per usable core.
     """
     from warpnerf.blocks.folder import open_trained
-    from warpnerf.media.filming import depth_range, render_stills, render_video
+    from warpnerf.media.filming import depth_range, render_stills, render_video, sees_anything
     from warpnerf.media.panels import Panels
     from warpnerf.media.video import require_alpha, video_file
+    from warpnerf.rendering.field import between
     from warpnerf.runs.scene import load_run_scene
 
     run = open_trained(folder)
@@ -185,6 +186,9 @@ def render_command(
     if "depth" in options.show:
         shown = options.depths or depth_range(field, cameras)
         said = f", depth from {shown[0]:g} yellow to {shown[1]:g} blue, scene units"
+    if options.crop is not None and not sees_anything(field, cameras):
+        around = between(field.surroundings)
+        print(f"note: nothing is seen of the crop from there; what the field holds lies {around}")
     outputs = " and ".join(options.show)
     each = " each" if len(options.show) > 1 else ""
     print(f"rendering {what}, {outputs} of {width} x {height} pixels{each}{said}", flush=True)

@@ -84,9 +84,10 @@ def transforms_json(scene: Scene, files: dict[str, str]) -> str:
         )
         for name, view in zip(names, scene.views, strict=True)
     ]
-    splits = {
-        split: [posed[index].path for index in indices] for split, indices in scene.splits.items()
-    }
+    given = {split: indices for split, indices in scene.splits.items() if indices}
+    test = given.get("test", given["train"])
+    given = {"train": given["train"], "val": test, "test": test} | given  # nerfstudio wants all
+    splits = {split: [posed[index].path for index in of] for split, of in given.items()}
     return transforms_text(posed, "points.ply", splits)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,6 +20,8 @@ from warpnerf.fields.nodes import nodes_of, points_of, values_at, voxel_edges
 from warpnerf.renamed import renamed_argument
 from warpnerf.rendering.field import Field
 from warpnerf.rendering.normals import normals_at
+
+log = logging.getLogger(__name__)
 
 LEVEL_OPACITY = 0.2
 """Of a voxel edge at the level that is the default; benchmarks/mesh.py tries others."""
@@ -125,7 +128,10 @@ def extract_surface(
     used, faces = np.unique(faces, return_inverse=True)
     points, faces = points[used], faces.reshape(-1, 3)
     points, faces, borders = filled(points, faces, MIN_SIZE * edge if fill is None else fill)
-    if n_faces is not None:
+    if n_faces is not None and n_faces >= len(faces):
+        n = len(faces)
+        log.info(f"the mesh has {n} triangles, not {n_faces}, and stays as it is")
+    elif n_faces is not None:
         points, faces = decimated(points, faces, n_faces)
     normals = normals_at(field, raw, points)
     return Surface(

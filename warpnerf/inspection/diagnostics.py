@@ -123,6 +123,12 @@ def _odd_images(scene: Scene, threads: int | None) -> list[str]:
             f"{empty[0]}), which show nothing that could be trained on"
         )
     shown = {view: look for view, look in looks.items() if not look.is_of_one_colour}
+    gray = [view.name for view, look in shown.items() if look.is_gray]
+    if 0 < len(gray) < len(shown):
+        odd.append(
+            f"gray among coloured ones: {len(gray)} of {len(scene.views)} images (first: "
+            f"{gray[0]}), as of a thermal or infrared camera; leave out the ones or the others"
+        )
     dark = [view.name for view, look in shown.items() if look.brightest <= DARK]
     if len(dark) > 0.5 * len(scene.views):
         odd.append(
@@ -158,6 +164,7 @@ class _Look:
     """What a photograph is like."""
 
     is_of_one_colour: bool
+    is_gray: bool
     brightest: int
     """The largest value of a channel of colour."""
     size: tuple[int, ...]
@@ -180,6 +187,8 @@ def _look(view: View) -> _Look:
         counts &= sample[..., 3] > 0
     return _Look(
         is_of_one_colour=bool((sample == image[0, 0]).all() and (image == image[0, 0]).all()),
+        is_gray=bool((sample[..., :3] == sample[..., :1]).all())
+        and bool((image[..., :3] == image[..., :1]).all()),
         brightest=int(image[..., :3].max()),
         size=image.shape[:2],
         sample=sample.copy(),

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,16 +13,28 @@ from warpnerf.checked import checked_arguments
 from warpnerf.checks import InputError, said
 from warpnerf.media.camera_path import path_lens
 from warpnerf.media.panels import USUAL, Output, Panels
-from warpnerf.media.pictures import write_png
+from warpnerf.media.pictures import png
 from warpnerf.media.video import require_alpha, write_video
 from warpnerf.rendering.composite import AnyField
+from warpnerf.rendering.field import Rendering
 from warpnerf.scenes.cameras.camera import Camera
+from warpnerf.scenes.files import beginning
+from warpnerf.writing import write_atomically
+
+STILL = "warpnerf render"
+"""What made a still, as its file says."""
+
+MARKED = 4096
+"""Bytes at the beginning of a PNG file in which that stands."""
 
 N_LOOKS = 9
 """Cameras of a path that a range of depths is taken from."""
 
 LOOK_SIZE = 96
 """Pixels along the longer side of such a look."""
+
+VISIBLE = 0.02
+"""Opacity of a pixel that is told from the background."""
 
 
 @checked_arguments
@@ -88,15 +101,15 @@ def render_stills(
     Args:
         field: What to look at.
         cameras: By the names of the files, which go into the folder.
-        folder: Made if it does not exist; files of the same names are replaced.
+        folder: Made if it does not exist; stills of the same names that are there are replaced.
         depths: As for ``render_video``.
         show: As for ``render_video``.
         transparent: With an alpha channel and without background.
         on_frame: Called with the number of pictures that are done.
 
     Raises:
-        InputError: No camera, a name that is not that of a file in the folder, or depths in the
-            wrong order.
+        InputError: No camera, a name that is not that of a file in the folder, one of a file there
+            that is no still, or depths in the wrong order.
         OSError: A picture cannot be written; each is there whole or not at all.
     """
     if not cameras:
@@ -106,13 +119,25 @@ def render_stills(
             raise InputError(
                 f"stills go into one folder, by names of files without a path, not {said(name)}."
             )
-    panels = _panels(field, list(cameras.values()), depths, show, transparent)
     folder = Path(folder)
+    _require_stills(folder / name for name in cameras)
+    panels = _panels(field, list(cameras.values()), depths, show, transparent)
     folder.mkdir(exist_ok=True)
     for number, (name, camera) in enumerate(cameras.items()):
-        write_png(folder / name, panels.picture(camera))
+        write_atomically(folder / name, png(panels.picture(camera), STILL))
         if on_frame is not None:
             on_frame(number + 1)
+
+
+def _require_stills(paths: Iterable[Path]) -> None:
+    """Raise InputError where something other than a still is in the place of one."""
+    mark = b"Software\0" + STILL.encode()
+    for path in paths:
+        if os.path.lexists(path) and mark not in beginning(path, MARKED):
+            raise InputError(
+                f"{path} is not a picture that was rendered so, and is not replaced; name another "
+                "folder, or move the file."
+            )
 
 
 def _panels(
@@ -136,14 +161,24 @@ def depth_range(field: AnyField, cameras: Sequence[Camera]) -> tuple[float, floa
     whole set of pictures.
     """
     seen = []
+    for look in _looks(field, cameras):
+        solid = look.opacity > 0.5
+        seen.append(look.depth[solid] / look.opacity[solid])
+    return range_of(np.concatenate(seen))
+
+
+def sees_anything(field: AnyField, cameras: Sequence[Camera]) -> bool:
+    """Whether some of the cameras see anything but the background."""
+    return any((look.opacity > VISIBLE).any() for look in _looks(field, cameras))
+
+
+def _looks(field: AnyField, cameras: Sequence[Camera]) -> Iterator[Rendering]:
+    """What some of the cameras see, in small pictures."""
     picks = np.unique(np.linspace(0, len(cameras) - 1, N_LOOKS).astype(int))
     for camera in (cameras[pick] for pick in picks):
         share = min(1.0, LOOK_SIZE / max(camera.width, camera.height))
         size = (max(1, round(share * camera.width)), max(1, round(share * camera.height)))
-        look = field.render(path_lens([camera], size))
-        solid = look.opacity > 0.5
-        seen.append(look.depth[solid] / look.opacity[solid])
-    return range_of(np.concatenate(seen))
+        yield field.render(path_lens([camera], size))
 
 
 def range_of(depths: np.ndarray) -> tuple[float, float]:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
+from PIL.PngImagePlugin import PngInfo
 
 from warpnerf.rendering.field import Rendering
 from warpnerf.writing import write_atomically
@@ -265,10 +266,12 @@ def write_png(path: str | Path, rgb: np.ndarray) -> None:
     write_atomically(path, png(rgb))
 
 
-def png(rgb: np.ndarray) -> bytes:
-    """The PNG file of an image [H, W, 3] uint8, or in [0, 1]."""
-    buffer = BytesIO()
-    Image.fromarray(to_bytes(rgb)).save(buffer, "PNG")
+def png(rgb: np.ndarray, software: str = "") -> bytes:
+    """The PNG file of an image [H, W, 3] uint8, or in [0, 1], that names what made it."""
+    buffer, told = BytesIO(), PngInfo()
+    if software:
+        told.add_text("Software", software)
+    Image.fromarray(to_bytes(rgb)).save(buffer, "PNG", pnginfo=told)
     return buffer.getvalue()
 
 

@@ -13,7 +13,7 @@ from warpnerf_kernels.launch import assembly
 from warpnerf.checked import checked_arguments
 from warpnerf.checks import InputError, is_finite, require_rays, said
 from warpnerf.fields.lattice import Lattice
-from warpnerf.fields.nodes import cells_within
+from warpnerf.fields.nodes import cells_within, points_of
 from warpnerf.fields.occupancy import FreeCells
 from warpnerf.fields.storage import Storage
 from warpnerf.model.interface import Model
@@ -57,6 +57,12 @@ def checked_crop(low: Sequence[float], high: Sequence[float]) -> np.ndarray:
             f"not {said(corners)}."
         )
     return np.array([low, high], np.float64)
+
+
+def between(corners: Sequence[np.ndarray] | np.ndarray) -> str:
+    """Where a box with two corners lies, in words."""
+    low, high = (" ".join(f"{x:.4g}" for x in corner) for corner in corners)
+    return f"between {low} and {high}"
 
 
 def require_distance(distance: float) -> None:
@@ -131,7 +137,7 @@ class Field:
             A field with the same storage, cut to cells of two voxels.
 
         Raises:
-            InputError: It is no box.
+            InputError: It is no box, or holds nothing that could be seen.
         """
         box = checked_crop(low, high)
         inside = cells_within(self.lattice, *box)
@@ -139,7 +145,22 @@ class Field:
             raise InputError(
                 "crop holds no cell of the field, of two voxels along each side; enlarge the box."
             )
-        return replace(self, free=self.free.cropped(self.lattice, inside, self.workers))
+        free = self.free.cropped(self.lattice, inside, self.workers)
+        if free.occupied_range() is None:
+            raise InputError(
+                f"crop {between(box)} holds nothing that could be seen; choose a box that meets "
+                f"what the field holds, which lies {between(self._held())}."
+            )
+        return replace(self, free=free)
+
+    def _held(self) -> tuple[np.ndarray, np.ndarray]:
+        """Corners, [3] scene units, of a box around what it holds, without free space."""
+        around, occupied = self.surroundings, self.free.occupied_range()
+        if occupied is None or self.lattice.frustum is not None:
+            return around
+        corners = np.stack(np.meshgrid(*np.stack(occupied).T), axis=-1).reshape(-1, 3)
+        points = points_of(self.lattice, corners * (np.array(self.lattice.size) - 1))
+        return np.clip(points.min(axis=0), *around), np.clip(points.max(axis=0), *around)
 
     @checked_arguments
     def render(self, camera: Camera) -> Rendering:

@@ -25,6 +25,13 @@ MAX_JSON_BYTES = 256 * 2**20
 MAX_DIGITS = 300
 """Of an integer: no float holds more."""
 
+ARCHIVES = (".zip", ".r3d", ".tar", ".gz", ".tgz", ".7z", ".rar")
+"""As which captures are shared: Record3D's .r3d, and what the others export."""
+
+POINTER = b"version https://git-lfs"
+MAX_POINTER_BYTES = 1024
+"""How files begin that stand for those of Git LFS, and how large they are at most."""
+
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 """Tried in this order where a scene file leaves the extension out."""
 
@@ -173,19 +180,23 @@ def plain_name(name: str) -> str:
 
 
 def require_regular_file(path: Path) -> None:
-    """Refuse what is missing, folders, and pipes and devices, which would block or never end.
+    """Refuse what is missing, folders, pipes and devices, which would block or never end, and what
+    stands for a file that Git LFS has not fetched.
 
     Raises:
-        InputError: The path leads to no regular file.
+        InputError: The path leads to no regular file, or to such a pointer.
     """
     try:
-        mode = path.stat().st_mode
+        found = path.stat()
+        mode = found.st_mode
     except (OSError, ValueError) as error:
         why = "does not exist" if isinstance(error, FileNotFoundError) else f"{error}"
         raise InputError(f"{path}: cannot be read: {why}; name a file.") from None
     if not stat.S_ISREG(mode):
         kind = "a folder" if stat.S_ISDIR(mode) else "a pipe or a device"
         raise InputError(f"{path}: is {kind}, not a file; name a file.")
+    if found.st_size <= MAX_POINTER_BYTES and beginning(path, len(POINTER)) == POINTER:
+        raise InputError(f"{path}: is a Git LFS pointer, not the file itself; run `git lfs pull`.")
 
 
 def exists(path: Path) -> bool:

@@ -49,6 +49,9 @@ SCALES = (1.0, 1e-3, 1e3, 1e-2, 1e2)
 FLIP = np.array([1.0, -1.0, -1.0, 1.0])
 """From OpenCV's axes to OpenGL's, of the columns of a pose."""
 
+MIRRORED = np.array([1.0, 1.0, -1.0, 1.0])
+"""From left-handed axes to OpenGL's, of the rows and columns of a pose."""
+
 Poses = Callable[[np.ndarray], np.ndarray]
 """From poses as they stand to camera to world in OpenGL axes, [n, 3, 4] both."""
 
@@ -72,6 +75,12 @@ def _w_last(poses: np.ndarray) -> np.ndarray:
     return np.concatenate([turned * FLIP[:3], -turned @ moved], axis=2)
 
 
+def _with_positions(poses: np.ndarray) -> np.ndarray:
+    """Of world to camera in OpenCV axes with the camera's position in place of the translation."""
+    to_camera = (poses[:, :, :3] * FLIP[:3]).transpose(0, 2, 1)
+    return np.concatenate([poses[:, :, :3], -to_camera @ poses[:, :, 3:]], axis=2)
+
+
 OPENCV = "camera to world in OpenCV axes (x right, y down, looking along +z)"
 READINGS: dict[str, Poses] = {
     OPENCV: lambda poses: poses * FLIP,
@@ -83,6 +92,12 @@ READINGS: dict[str, Poses] = {
     "camera to world in axes x up, y left, looking along -z": _columns(-2, 1, 3),
     "camera to world in OpenCV axes, in place of LLFF's": _columns(-2, -1, -3),
     "world to camera in OpenCV axes, with quaternions that end with w": _w_last,
+    "world to camera in OpenCV axes, with positions of cameras in place of translations": (
+        _with_positions
+    ),
+    "camera to world in left-handed axes as of Unity (x right, y up, looking along +z)": (
+        lambda poses: poses * MIRRORED * MIRRORED[:3, None]
+    ),
 }
 """Other ways to read poses, by their names; OpenCV's is by far the commonest."""
 

@@ -26,12 +26,13 @@ from warpnerf.scenes.formats.frame import Frame, lens_warnings, photograph_notes
 from warpnerf.scenes.formats.georeference import centred, in_words
 from warpnerf.scenes.formats.left_over import unused_depths, unused_masks, unused_points
 from warpnerf.scenes.formats.reduced import with_reduced
-from warpnerf.scenes.images.depths import Depth, read_depth
+from warpnerf.scenes.images.depths import Depth, readable_depth, unread_depths
 from warpnerf.scenes.images.images import exif_orientation, image_shape, read_image
 from warpnerf.scenes.images.masks import (
     PackedMask,
     all_of_blocks,
     masks_of_folder,
+    numbers_of_classes,
     read_mask,
 )
 from warpnerf.scenes.images.photographs import Keeping, Photograph, keep, stay_in_memory
@@ -135,7 +136,7 @@ def assemble(
         [(entry.frame, entry.whole, entry.photograph.resampling) for entry in left]
     )
     warnings = [*warnings, *lens_warnings([(entry.frame, entry.whole) for entry in left])]
-    warnings += _transparency_warning(left)
+    warnings += _transparency_warning(left) + unread_depths([entry.why_no_depth for entry in left])
     kept = keep([entry.photograph for entry in left], keeping, file=file, downscale=downscale)
     views = [
         View(
@@ -264,20 +265,19 @@ def _without_masked(
         InputError: No training image is left.
     """
     left = {view.name for view in read}
-    gone = [frame.name for frame in frames if frame.name not in left]
+    gone = [frame for frame in frames if frame.name not in left]
     splits = {split: names & left for split, names in splits.items()}
+    classes = numbers_of_classes(frame.mask for frame in gone[:LOOKED_AT] if frame.mask is not None)
     if not splits["train"]:
-        raise InputError(
-            f"{file}: the masks leave no pixel of any training image; white pixels count, black "
-            "ones are ignored, so invert the masks if they are the other way round."
+        way_out = classes or (
+            "white pixels count, black ones are ignored, so invert the masks if they are the other "
+            "way round"
         )
-    warnings = []
-    if gone:
-        warnings.append(
-            f"left out {len(gone)} of {len(frames)} images of which masks leave no pixel (first: "
-            f"{gone[0]})"
-        )
-    return splits, warnings
+        raise InputError(f"{file}: the masks leave no pixel of any training image; {way_out}.")
+    if not gone:
+        return splits, []
+    said = f"left out {len(gone)} of {len(frames)} images of which masks leave no pixel (first: "
+    return splits, [f"{said}{gone[0].name})" + (classes and f": {classes}")]
 
 
 def _transparency_warning(read: Sequence[_Read]) -> list[str]:
@@ -372,6 +372,8 @@ class _Read:
     mask: PackedMask | None
     ignored: float = 0.0
     """Share of its pixels that are ignored as transparent."""
+    why_no_depth: str = ""
+    """Of a depth map that cannot be read."""
 
 
 def _read_frame(frame: Frame, downscale: int, is_object: bool, holds: bool) -> _Read | None:
@@ -424,7 +426,7 @@ def _read_frame(frame: Frame, downscale: int, is_object: bool, holds: bool) -> _
     )
     if holds and pixels is not None and frame.reduced is None:
         photograph = replace(photograph, made=photograph.made_of(pixels))
-    depth = None if frame.depth is None else read_depth(frame.depth, whole, downscale)
+    depth, why_no_depth = readable_depth(frame.depth, whole, downscale)
     return _Read(
         name=frame.name,
         frame=frame,
@@ -434,4 +436,5 @@ def _read_frame(frame: Frame, downscale: int, is_object: bool, holds: bool) -> _
         depth=depth,
         mask=None if mask is None else PackedMask.of(mask),
         ignored=ignored,
+        why_no_depth=why_no_depth,
     )

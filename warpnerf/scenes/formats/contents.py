@@ -29,26 +29,31 @@ from warpnerf.scenes.images.masks import without_masks
 
 VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
 
+SPHERES = (".insv", ".insp", ".360")
+"""Of Insta360 and GoPro Max."""
+
 BESIDE_PHOTOGRAPHS = ("sparse/0", "sparse")
 """Where a model is looked for of which a file is missing."""
 
 UNREAD_POSES = (
     *("*.nvm", "bundle*.out", "sfm_data.json", "*.sfm", "cameras.json", "*.psx", "*.rcproj"),
     *("*.rsproj", "reconstruction.json", "opensfm/reconstruction.json", "pose/*.txt"),
-    "camera/*.json",
+    *("camera/*.json", "cams/*_cam.txt", "traj.txt", "poses.txt", "poses.npy", "*.pose.txt"),
+    "predictions.npz",
 )
 """Files of poses that are not read: of VisualSFM, Bundler, OpenMVG, Meshroom, 3DGS, Metashape,
-RealityCapture, RealityScan, OpenSfM, NSVF and Nerfies."""
+RealityCapture, RealityScan, OpenSfM, NSVF, Nerfies, MVSNet, Replica, KITTI, 7-Scenes and VGGT."""
 
-TEXTS = (".csv", ".txt", ".xmp", ".xml")
+TEXTS = (".csv", ".txt", ".xmp", ".xml", ".json")
 PLACES_OF_TEXTS = (".", "images", "params", "1_initial/params")
 POSES_IN_TEXT = re.compile(
     rb"omega\W+phi\W+kappa|heading\W+pitch\W+roll|yaw\W+pitch\W+roll|xcr:(rotation|position)|"
-    rb"<BlocksExchange",
+    rb"<BlocksExchange|qx\W+qy\W+qz\W+qw|cameraPoseARFrame|\"camtoworld\"",
     re.IGNORECASE,
 )
 """Texts in which poses are recognised by what they begin with, of Metashape, RealityCapture, Pix4D,
-and, for exchange between programs, of ContextCapture."""
+for exchange between programs of ContextCapture, and of TUM, Stray Scanner, 3D Scanner App and
+SDFStudio."""
 LOOKED_AT = 4096
 """Bytes at the beginning of a text."""
 MOST_TEXTS = 4096
@@ -154,9 +159,19 @@ def _what_is_there(folder: Path) -> str:
     videos = _with_endings(folder, VIDEOS)
     if videos:
         first = shlex.quote(str(videos[0]))
+        poses = _unread_poses(folder)
+        if poses:
+            return f"{poses}, or estimate others by {pose_command(first)}"
         return f"it holds the video {videos[0].name}; make a scene of it by {pose_command(first)}"
     if unread:
         return f"it holds {len(unread)} photographs as {_kind(unread[0])}; convert them to JPEG"
+    spheres = _with_endings(folder, SPHERES)
+    if spheres:
+        n = len(spheres)
+        return (
+            f"it holds {n} recording{'s' * (n > 1)} of a 360-degree camera (first: "
+            f"{printable(spheres[0].name)}); export flat photographs or videos with its program"
+        )
     counts = {path: len(photographs_in(path)) for path in inner if not is_written(path)}
     deeper = {path: n for path, n in counts.items() if n}
     if deeper:

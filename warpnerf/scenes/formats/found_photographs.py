@@ -18,6 +18,7 @@ import numpy as np
 from warpnerf.checks import InputError
 from warpnerf.scenes.cameras.lens import Lens
 from warpnerf.scenes.files import (
+    ARCHIVES,
     ENDINGS,
     OTHER_IMAGES,
     REDUCED,
@@ -29,7 +30,7 @@ from warpnerf.scenes.files import (
 )
 from warpnerf.scenes.formats.assemble import POSED, Reading, assemble
 from warpnerf.scenes.formats.frame import Frame
-from warpnerf.scenes.formats.left_over import only_ply, tried_points
+from warpnerf.scenes.formats.left_over import files_in, only_ply, tried_points
 from warpnerf.scenes.formats.unnamed_photographs import photographs_left
 from warpnerf.scenes.images.depths import DepthFile
 from warpnerf.scenes.images.masks import without_masks
@@ -131,6 +132,9 @@ class Photographs:
         """Half a sentence on photographs that are there under other names, or are not read."""
         unread = [] if self.paths else _photographs_below(self.root, True, UNREAD_ENDINGS)
         paths = self.paths or unread
+        archive = next((p for p in files_in(self.folder) if p.suffix.lower() in ARCHIVES), None)
+        if not paths and archive is not None:
+            return f", but the archive {printable(archive.name)} is: unpack it"
         if not paths:
             return ""
         kind = paths[0].suffix.lstrip(".").upper()

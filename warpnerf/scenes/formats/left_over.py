@@ -38,7 +38,7 @@ def unused_masks(folder: Path, frames: Sequence[Frame]) -> list[str]:
     masks = [frame.mask.path for frame in frames if frame.mask is not None]
     names = [frame.name for frame in frames]
     warnings = []
-    for place in _unused(folder, frames, MASKS, masks, SUFFIXES):
+    for place in _unused(folder, frames, MASKS, masks, (*SUFFIXES, ".npy")):
         shown = printable(shlex.quote(str(place)))
         if has_mask_of(place, names):
             way_out = f"--masks {shown} ignores what is black there"
@@ -139,13 +139,22 @@ def _unused(
         if named.fullmatch(path.name)
         and path not in inside
         and path.is_dir()
-        and any(entry.name.lower().endswith(endings) for entry in _files(path))
+        and any(
+            entry.name.lower().endswith(endings)
+            for inner in (path, *folders_in(path))
+            for entry in _files(inner)
+        )
     ]
 
 
 def files_in(folder: Path) -> list[Path]:
     """The files of a folder, by name, but hidden ones; none where it cannot be read."""
     return [folder / name for name in sorted(entry.name for entry in _files(folder))]
+
+
+def folders_in(folder: Path) -> list[Path]:
+    """The folders of a folder, by name, but hidden ones; none where it cannot be read."""
+    return [path for path in _entries(folder) if path.is_dir()]
 
 
 def _files(folder: Path) -> Iterator[os.DirEntry[str]]:

@@ -12,7 +12,7 @@ from typing import get_args
 from warpnerf.checked import checked_arguments
 from warpnerf.checks import InputError, require_one_of
 from warpnerf.runtime.memory import require_threads
-from warpnerf.scenes.files import exists, printable
+from warpnerf.scenes.files import ARCHIVES, exists, printable
 from warpnerf.scenes.formats import llff
 from warpnerf.scenes.formats.assemble import Reading
 from warpnerf.scenes.formats.blender import is_frames, is_split, load_blender, split_file
@@ -29,9 +29,6 @@ from warpnerf.scenes.scene import Scene
 from warpnerf.scenes.split import Split, checked_split, withheld
 
 __all__ = ["load_scene"]
-
-ARCHIVES = (".zip", ".r3d", ".tar", ".gz", ".tgz", ".7z", ".rar")
-"""As which captures are shared: Record3D's .r3d, and what the others export."""
 
 BUILTIN = "builtin:"
 BUILTIN_NAMES = ("room", "room-sparse")

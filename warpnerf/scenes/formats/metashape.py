@@ -146,6 +146,12 @@ def _aligned(file: Path, chunk: ElementTree.Element) -> tuple[list[ElementTree.E
     cameras = _cameras(chunk)
     on = [camera for camera in cameras if camera.get("enabled", "1") not in ("0", "false")]
     aligned = [camera for camera in on if camera.find("transform") is not None]
+    if not aligned and any(camera.find("transform") is not None for camera in cameras):
+        n = sum(camera.find("transform") is not None for camera in cameras)
+        raise InputError(
+            f"{file}: its {n} cameras that are aligned are switched off; enable them, and export "
+            "again."
+        )
     if not aligned:
         raise InputError(
             f"{file}: none of its {len(cameras)} cameras is aligned; align them, and export again."
@@ -247,11 +253,11 @@ def _lens(file: Path, sensor: ElementTree.Element) -> Lens:
     place = f"sensor {printable(sensor.get('id', '')[:20])}"
     calibrations = sensor.findall("calibration")
     adjusted = [c for c in calibrations if c.get("class") == "adjusted"]
-    if not calibrations:
+    if not calibrations and sensor.get("type", "frame") in KINDS:
         raise InputError(
             f"{file}: {place}: has no calibration; align the cameras, and export again."
         )
-    calibration = (adjusted or calibrations)[-1]
+    calibration = (adjusted or calibrations or [sensor])[-1]
     kind = calibration.get("type") or sensor.get("type", "frame")
     if kind not in KINDS:
         raise InputError(

@@ -18,7 +18,7 @@ from warpnerf.checks import InputError
 from warpnerf.scenes.cameras.brown import brown_lens
 from warpnerf.scenes.cameras.lens import Lens
 from warpnerf.scenes.cameras.poses import check_pose
-from warpnerf.scenes.files import MAX_JSON_BYTES, printable, require_regular_file
+from warpnerf.scenes.files import MAX_JSON_BYTES, beginning, printable, require_regular_file
 from warpnerf.scenes.formats.assemble import Reading
 from warpnerf.scenes.formats.found_photographs import (
     Entry,
@@ -55,10 +55,15 @@ def is_reality(file: Path) -> bool:
         if not file.is_file():
             return False
         with file.open("rb") as stream:
-            head = stream.read(LOOKED_AT).decode("utf-8-sig", "replace")
+            head = stream.read(LOOKED_AT)
     except OSError:
         return False
-    return _header(head.splitlines()) is not None
+    return _header(head.decode(_encoding(head), "replace").splitlines()) is not None
+
+
+def _encoding(head: bytes) -> str:
+    """UTF-8, but UTF-16 where the byte-order mark says so."""
+    return "utf-16" if head.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-8-sig"
 
 
 def _header(lines: list[str]) -> tuple[int, str, list[str]] | None:
@@ -102,7 +107,7 @@ def _rows(file: Path) -> list[tuple[str, str, dict[str, float]]]:
     if file.stat().st_size > MAX_JSON_BYTES:
         raise InputError(f"{file}: is larger than {MAX_JSON_BYTES >> 20} MiB, so no cameras.")
     try:
-        lines = file.read_text(encoding="utf-8-sig").splitlines()
+        lines = file.read_text(encoding=_encoding(beginning(file, 2))).splitlines()
     except UnicodeDecodeError:
         raise InputError(f"{file}: is not text in UTF-8; export it again.") from None
     header = _header(lines)

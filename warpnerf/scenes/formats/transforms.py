@@ -38,7 +38,7 @@ from warpnerf.scenes.formats.frame import Frame
 from warpnerf.scenes.formats.frame_images import elsewhere_warnings, find_images
 from warpnerf.scenes.formats.ply import read_ply
 from warpnerf.scenes.formats.split_lists import read_split_lists
-from warpnerf.scenes.formats.unnamed_photographs import unnamed_photographs
+from warpnerf.scenes.formats.unnamed_photographs import same_names_beside, unnamed_photographs
 from warpnerf.scenes.images.depths import DEFAULT_UNIT, DepthFile
 from warpnerf.scenes.images.masks import Mask
 from warpnerf.scenes.scene import Scene
@@ -94,7 +94,8 @@ def load_transforms(file: Path, reading: Reading) -> Scene:
     """Load a scene from a transforms.json.
 
     The split is the file's ``{train,val,test}_filenames``, else that of lists beside it, else every
-    8th image is for testing. Box and content distance are those of the points of a COLMAP model in
+    8th image is for testing; none is where the file lists all for training, and for testing all or
+    none. Box and content distance are those of the points of a COLMAP model in
     the folder whose cameras are the same, or that ``ply_file_path`` names, or of the only .ply in
     the folder, where there are such.
 
@@ -132,6 +133,9 @@ def load_transforms(file: Path, reading: Reading) -> Scene:
         members_of, listed_in, lost = read_split_lists(folder, called, called)
         splits = {split: {called[name] for name in of} for split, of in members_of.items()}
         warnings += lost
+    trained = splits.get("train", set())
+    if trained == set(names.values()) and all(of in (set(), trained) for of in splits.values()):
+        reading = replace(reading, withhold=reading.withhold or "all")
     points, why_not = _points(file, data, frames)
     if why_not:
         warnings.append(why_not)
@@ -162,7 +166,7 @@ def _unnamed(file: Path, frames: Sequence[Frame]) -> tuple[list[str], list[str]]
     if model is not None and n is not None and n > len(frames):
         advice = f"; name {printable(str(model))} to read the COLMAP model, which has {n}"
         few, many = ([said + advice for said in part] for part in (few, many))
-    return few, many
+    return [*few, *same_names_beside(folder, photographs, printable(file.name))], many
 
 
 def _points(file: Path, data: TransformsFile, frames: Sequence[Frame]) -> tuple[Points | None, str]:

@@ -6,12 +6,14 @@ import re
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
-from warpnerf.scenes.files import is_photograph, printable
-from warpnerf.scenes.formats.left_over import files_in
+from warpnerf.scenes.files import OTHER_IMAGES, PHOTOGRAPHS, is_photograph, printable
+from warpnerf.scenes.formats.left_over import files_in, folders_in
 from warpnerf.scenes.images.masks import without_masks
 
 UNPOSED = 0.1
 """Share of the photographs that is left, above which that is a warning."""
+SAME = 0.5
+"""Share of the names of photographs, above which a folder beside is of another camera."""
 
 
 def unnamed_photographs(
@@ -29,6 +31,36 @@ def unnamed_photographs(
         there += without_masks([path for path in files_in(place) if is_photograph(path.name)])
     what = f"in {printable(root.absolute().name)} are not in {named_by}"
     return photographs_left(there, used, root, what)
+
+
+def same_names_beside(folder: Path, used: Collection[Path], named_by: str) -> list[str]:
+    """Notes of folders beside that of a scene's photographs which hold others of the same names, as
+    the second camera of a pair writes them.
+
+    Args:
+        folder: The scene's.
+        used: Its photographs.
+        named_by: What names them.
+    """
+    stems: dict[Path, set[str]] = {}
+    for path in used:
+        stems.setdefault(path.parent, set()).add(path.stem)
+    notes = []
+    for place in sorted({p.parent for p in stems if p != folder}):
+        own = set().union(*(names for path, names in stems.items() if path.parent == place))
+        for other in folders_in(place):
+            if other in stems or any(other in path.parents for path in used):
+                continue
+            if PHOTOGRAPHS.fullmatch(other.name) or OTHER_IMAGES.fullmatch(other.name):
+                continue
+            same = [p for p in files_in(other) if is_photograph(p.name) and p.stem in own]
+            if len(same) > SAME * len(own):
+                notes.append(
+                    f"also in the folder, and not used: "
+                    f"{printable(other.relative_to(folder).as_posix()[:80])}, with {len(same)} "
+                    f"photographs of the same names, which {named_by} does not name"
+                )
+    return notes
 
 
 def photographs_left(

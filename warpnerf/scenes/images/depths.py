@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -71,6 +72,32 @@ def _nearest(values: np.ndarray, shape: tuple[int, int], share: tuple[float, flo
         for size, given, seen in zip(shape, values.shape, share, strict=True)
     )
     return np.asarray(values[row[:, None], column])
+
+
+def readable_depth(
+    file: DepthFile | None, camera: Camera, downscale: int
+) -> tuple[Depth | None, str]:
+    """What ``read_depth`` reads, where there is a file; or None and why it cannot be read: training
+    does without."""
+    try:
+        return None if file is None else read_depth(file, camera, downscale), ""
+    except InputError as error:
+        return None, str(error)
+
+
+def unread_depths(reasons: Sequence[str]) -> list[str]:
+    """A warning of depth maps that cannot be read.
+
+    Args:
+        reasons: Of each image: why; "" where its depth was read, or none is named.
+    """
+    found = [reason for reason in reasons if reason]
+    if not found:
+        return []
+    return [
+        f"depth of {len(found)} of {len(reasons)} images cannot be read, and is not used (first: "
+        f"{found[0].removesuffix('.')})"
+    ]
 
 
 def read_depth(file: DepthFile, camera: Camera, downscale: int = 1) -> Depth:

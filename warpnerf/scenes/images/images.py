@@ -228,18 +228,16 @@ def _read(path: Path, look: Callable[[ImageFile.ImageFile], T]) -> T:
 
 
 def _refuse_pointer(path: Path) -> None:
-    """Name the two files that most often stand where an image should."""
+    """Name the file that most often stands where an image should."""
     try:
         with path.open("rb") as file:
-            start = file.read(24)
+            start = file.read(1)
     except OSError as error:
         raise InputError(
             f"{path}: cannot be read: {error.strerror or error}; change that, or name another file."
         ) from None
     if not start:
         raise InputError(f"{path}: is empty (0 bytes); copy it again.")
-    if start.startswith(b"version https://git-lfs"):
-        raise InputError(f"{path}: is a Git LFS pointer, not an image; run `git lfs pull`.")
 
 
 def _other_kind(path: Path) -> str:

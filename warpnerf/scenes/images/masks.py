@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
@@ -14,6 +14,8 @@ from warpnerf.scenes.images.images import image_size, read_image
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 """Of masks, which are named after a photograph or its stem."""
+LOSSY = (".jpg", ".jpeg")
+"""Of those in which black is not quite black."""
 
 DYNAMIC = "dynamic_mask_"
 """What the names of instant-ngp's masks begin with."""
@@ -212,6 +214,22 @@ def read_mask(mask: Mask, *, width: int, height: int, downscale: int) -> np.ndar
             "the mask as large as the photograph."
         )
     return all_of_blocks(counts, times * downscale, small)
+
+
+def numbers_of_classes(masks: Iterable[Mask]) -> str:
+    """Half a sentence on the first of some masks, if one is, that holds numbers of classes, or
+    colours for them, in place of white: other values than 0, none of which is white."""
+    for mask in masks:
+        if mask.path.suffix.lower() in LOSSY:
+            continue
+        values = np.unique(read_image(mask.path)[..., :3].max(axis=2)).tolist()
+        if 1 < values[-1] < 128:
+            shown = ", ".join(map(str, values[:6])) + ", ..." * (len(values) > 6)
+            return (
+                f"{mask.path} holds {shown}, as numbers of classes; write 255 where pixels count "
+                "and 0 where not"
+            )
+    return ""
 
 
 def all_of_blocks(counts: np.ndarray, edge: int, size: tuple[int, int]) -> np.ndarray:
