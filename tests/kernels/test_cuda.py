@@ -9,6 +9,7 @@ from warpnerf_kernels.base import precision
 
 from tests.support import cuda_kernels
 from tests.support.cuda_kernels import LONG, ON_CPU, QUICK
+from warpnerf.model.interface import Model
 from warpnerf.model.models import Deferred
 from warpnerf.rendering.structs import variant_of
 
