@@ -15,6 +15,17 @@ from functools import cached_property
 import numpy as np
 
 from warpnerf.scenes.cameras.camera import Camera
+from warpnerf.scenes.extent.patches import (
+    LEAST_SIDE,
+    PATCH,
+    RIM,
+    Picture,
+    bilinear,
+    correlation,
+    project,
+    reduced,
+    spread_middles,
+)
 from warpnerf.scenes.scene import View
 
 VIEWS = 64
@@ -25,11 +36,6 @@ NEIGHBOURS = 3
 """In which they are looked for."""
 FEWEST = NEIGHBOURS + 2
 """Views, at least: a reference, its neighbours, and one that is none."""
-
-SIDE = 96
-"""Pixels of a photograph's longer side, about."""
-LEAST_SIDE = 24
-"""Pixels of the shorter one; smaller photographs tell nothing."""
 
 DEPTHS = 24
 """From NEAREST baselines to infinity, evenly spaced in 1 / depth."""
@@ -43,12 +49,6 @@ pose is."""
 FAR_APART = 0.5
 """The same, where points are looked for: their depths must show."""
 
-PATCH = np.stack(np.meshgrid(*2 * [np.linspace(-3.0, 3.0, 5)]), axis=-1).reshape(-1, 2)
-"""Where a patch is sampled, [25, 2] pixels from its middle."""
-RIM = 4.0
-"""Pixels that a patch's middle keeps from the edges."""
-PATCHES = 9, 7
-"""Along a photograph's width and height."""
 TEXTURE = 3.0
 """Standard deviation of a patch's gray values, of 255, from which on it can be recognised."""
 
@@ -102,18 +102,6 @@ class Agreement:
         return bool(better and np.mean(found > 0.0) >= ALMOST_ALL)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Picture:
-    """A photograph as of a pinhole camera."""
-
-    gray: np.ndarray
-    """[H, W] float32 in [0, 255]; NaN where the lens sees nothing."""
-    focal: np.ndarray
-    """[2] pixels."""
-    centre: np.ndarray
-    """[2] principal point, pixels."""
-
-
 Given = Callable[[View, np.ndarray, float], np.ndarray]
 """From a view, the middles of its patches [m, 2] in [0, 1] of width and height, and the largest
 1 / distance of the sweep to those that are tried: [k, m] 1 / distance, NaN where not known."""
@@ -132,7 +120,7 @@ class PhotoConsistency:
     """[n, 3, 4] of these, camera to world in OpenGL axes, scene units."""
     zoom: float = 1.0
     """How many times their focal length the lenses have."""
-    _pictures: dict[int, _Picture] = field(default_factory=dict)
+    _pictures: dict[int, Picture] = field(default_factory=dict)
 
     @classmethod
     def of(cls, views: Sequence[View]) -> PhotoConsistency:
@@ -178,7 +166,7 @@ class PhotoConsistency:
         found: list[float] = []
         by_chance: list[float] = []
         for i in self.references:
-            middles = self._textured(i, _grid(self._picture(i).gray.shape))
+            middles = self._textured(i, spread_middles(self._picture(i).gray.shape))
             if not len(middles):
                 continue
             near = neighbours(self.poses, i)
@@ -206,7 +194,7 @@ class PhotoConsistency:
         own, best = [], []
         for i in self.references:
             height, width = self._picture(i).gray.shape
-            middles = self._textured(i, _grid((height, width)))
+            middles = self._textured(i, spread_middles((height, width)))
             near = neighbours(self.poses, i, FAR_APART)
             inverse = _inverse_depths(self.poses, i, near)
             tried = given(self.views[i], middles / [width, height], float(inverse[-1]))
@@ -254,7 +242,7 @@ class PhotoConsistency:
         """Where a reference sees points with texture that others do not hide, and how far away."""
         picture, pose = self._picture(i), self.poses[i]
         local = (points - pose[:, 3]) @ pose[:, :3]
-        pixels, front = _project(picture, local)
+        pixels, front = project(picture, local)
         height, width = picture.gray.shape
         inside = (pixels > RIM) & (pixels < np.array([width, height]) - RIM)
         there = front & inside.all(axis=1)
@@ -289,7 +277,7 @@ class PhotoConsistency:
         """
         picture, poses = self._picture(i), self.poses
         pixels = middles[:, None] + PATCH
-        patch = _bilinear(picture.gray, pixels)
+        patch = bilinear(picture.gray, pixels)
         rays = np.ones((*pixels.shape[:2], 3))
         rays[..., :2] = (pixels - picture.centre) / picture.focal
         rays *= np.array([1.0, -1.0, -1.0]) / np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -297,12 +285,12 @@ class PhotoConsistency:
         for j, *others in zip(near, *shown, strict=True):
             turn = poses[i][:, :3].T @ poses[j][:, :3]
             shift = (poses[i][:, 3] - poses[j][:, 3]) @ poses[j][:, :3]
-            there, front = _project(
+            there, front = project(
                 self._picture(j), rays @ turn + inverse[:, :, None, None] * shift
             )
             before = front.all(axis=-1)
             for n, other in enumerate(others):
-                match = _correlation(patch, _bilinear(self._picture(other).gray, there))
+                match = correlation(patch, bilinear(self._picture(other).gray, there))
                 known = before & np.isfinite(match)
                 total[n] += np.where(known, match, 0.0)
                 seen[n] += known
@@ -317,12 +305,12 @@ class PhotoConsistency:
         return middles[self._has_texture(i, middles)]
 
     def _has_texture(self, i: int, middles: np.ndarray) -> np.ndarray:
-        patch = _bilinear(self._picture(i).gray, middles[:, None] + PATCH)
+        patch = bilinear(self._picture(i).gray, middles[:, None] + PATCH)
         return np.asarray(patch.std(axis=1) > TEXTURE)  # not where it is NaN
 
-    def _picture(self, i: int) -> _Picture:
+    def _picture(self, i: int) -> Picture:
         if i not in self._pictures:
-            self._pictures[i] = _reduced(self.views[i])
+            self._pictures[i] = reduced(self.views[i])
         picture = self._pictures[i]
         return picture if self.zoom == 1.0 else replace(picture, focal=self.zoom * picture.focal)
 
@@ -359,74 +347,3 @@ def _inverse_depths(poses: np.ndarray, i: int, near: Sequence[int]) -> np.ndarra
     """1 / distance from a reference, [DEPTHS], from 0 to that of NEAREST baselines."""
     baselines = np.linalg.norm(poses[list(near), :, 3] - poses[i][:, 3], axis=1)
     return np.linspace(0.0, 1.0 / (NEAREST * max(float(np.median(baselines)), 1e-12)), DEPTHS)
-
-
-def _reduced(view: View) -> _Picture:
-    """A photograph, reduced by averaging, in gray, and as of a pinhole camera."""
-    whole = view.camera
-    factor = max(1, min(round(max(whole.width, whole.height) / SIDE), *_most(whole)))
-    camera = whole.downscaled(factor)
-    image = view.image[: camera.height * factor, : camera.width * factor]
-    # By rows, so that no copy of a large photograph in floats is made.
-    rows = image.reshape(camera.height, factor, -1)
-    gray = np.stack([_gray(row, camera.width, factor, image.shape[2]) for row in rows])
-    focal, centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
-    bent = (camera.k1, camera.k2, camera.k3, camera.p1, camera.p2, camera.rational, camera.fisheye)
-    if any(bent):
-        u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-        straight = (np.stack([u.ravel(), v.ravel()], axis=1) - centre) / focal
-        pixels = camera.distort(straight)[0] * focal + centre
-        gray = _bilinear(gray, pixels).reshape(gray.shape)
-    return _Picture(gray=gray, focal=focal, centre=centre)
-
-
-def _most(camera: Camera) -> tuple[int, int]:
-    """By how much a photograph may be reduced."""
-    return camera.width // LEAST_SIDE, camera.height // LEAST_SIDE
-
-
-def _gray(rows: np.ndarray, width: int, factor: int, channels: int) -> np.ndarray:
-    """One reduced row [width] of rows [factor, width * factor * channels]."""
-    mean = rows.reshape(factor, width, factor, channels).mean(axis=(0, 2), dtype=np.float32)
-    gray = mean[:, :3].mean(axis=1)
-    return gray * mean[:, 3] / np.float32(255.0) if channels == 4 else gray
-
-
-def _grid(shape: tuple[int, ...]) -> np.ndarray:
-    """Middles of patches, spread over a photograph [H, W], [n, 2]."""
-    across, along = PATCHES
-    u, v = np.meshgrid(
-        np.linspace(RIM, shape[1] - RIM, across), np.linspace(RIM, shape[0] - RIM, along)
-    )
-    return np.stack([u.ravel(), v.ravel()], axis=1)
-
-
-def _project(picture: _Picture, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels [..., 2] of places [..., 3] in a camera's OpenGL axes, and which lie before it."""
-    depth = -places[..., 2]
-    front = depth > 0.0
-    depth = np.where(front, np.maximum(depth, 1e-300), 1.0)
-    straight = np.stack([places[..., 0], -places[..., 1]], axis=-1) / depth[..., None]
-    return straight * picture.focal + picture.centre, front
-
-
-def _bilinear(gray: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Gray values at pixels [..., 2], float32; NaN outside."""
-    height, width = gray.shape
-    x, y = pixels[..., 0] - 0.5, pixels[..., 1] - 0.5
-    inside = (x >= 0.0) & (y >= 0.0) & (x <= width - 1) & (y <= height - 1)
-    x, y = np.where(inside, x, 0.0).astype(np.float32), np.where(inside, y, 0.0).astype(np.float32)
-    column = np.minimum(x.astype(np.int32), width - 2)
-    row = np.minimum(y.astype(np.int32), height - 2)
-    x, y, at, flat = x - column, y - row, row * width + column, gray.ravel()
-    above = flat[at] + x * (flat[at + 1] - flat[at])
-    below = flat[at + width] + x * (flat[at + width + 1] - flat[at + width])
-    return np.where(inside, above + y * (below - above), np.float32(np.nan))
-
-
-def _correlation(patch: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Normalised cross-correlation along the last axis; NaN where a value is."""
-    a = patch - patch.mean(axis=-1, keepdims=True)
-    b = other - other.mean(axis=-1, keepdims=True)
-    norm = np.sqrt((a * a).sum(axis=-1) * (b * b).sum(axis=-1) + np.float32(1e-3))
-    return np.asarray((a * b).sum(axis=-1) / norm)
