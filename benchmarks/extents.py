@@ -1,14 +1,15 @@
-"""What it brings that box and content distance come from points, or from a short training.
+"""What it brings that box and content distance come from points, photographs, or a short training.
 
     python benchmarks/extents.py room-scan path/to/scene --steps 1200 --seeds 0 1
 
 Scenes are folders that bring points or not, and room-scan, room-inward and room-mixed: the built-in
 room seen outward, inward and both, written as photographs and a COLMAP model by room_scan.py. Each
-is trained with the extent that the cameras give alone, with the one that short trainings find,
-whose steps count to neither, and with that of the points where there are some; of the last two also
-with a content distance for each camera; for as many steps, whatever the time. Prints PSNR and SSIM
-of the test views, optical depth within a tenth of the content distance of the training cameras, and
-seconds; writes benchmarks/results/extents_<device>.json.
+is trained with the extent that the cameras give alone, with the one that comparing the photographs
+finds and the one of short trainings, whose steps count to neither, and with that of the points
+where there are some; of all but the first also with a content distance for each camera; for as many
+steps, whatever the time. Prints PSNR and SSIM of the test views, optical depth within a tenth of
+the content distance of the training cameras, and seconds; writes
+benchmarks/results/extents_<device>.json.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 from measuring import machine, options, plain_training, write_record
 from room_scan import SCANS, write_scan
@@ -26,7 +28,10 @@ import warpnerf as wn
 from warpnerf.model.models import MODELS
 from warpnerf.runtime.parallel import Workers
 from warpnerf.scenes.cameras.focus import estimate_extent
+from warpnerf.training import coarse
 from warpnerf.training.coarse import prepare_trainer
+
+COARSE = "coarse"
 
 
 def main() -> None:
@@ -57,7 +62,8 @@ def main() -> None:
             scene, truth = load(name, Path(temporary) / name, arguments.views)
             for seed in arguments.seeds:
                 for extent, (scene_of, chosen) in variants(scene).items():
-                    found = measure(scene, scene_of, replace(config, seed=seed, **chosen))
+                    how = replace(config, seed=seed, **chosen)
+                    found = measure(scene, scene_of, how, extent.startswith(COARSE))
                     row = {
                         "scene": name,
                         "seed": seed,
@@ -105,17 +111,32 @@ def variants(scene: wn.Scene) -> dict[str, tuple[wn.Scene, dict[str, Any]]]:
     each = {"content_distance": "per-camera"}
     found: dict[str, tuple[wn.Scene, dict[str, Any]]] = {
         "cameras": (without, {"coarse_steps": 0}),
-        "coarse": (without, {}),
-        "coarse, per camera": (without, each),
+        "photographs": (without, {}),
+        "photographs, per camera": (without, each),
+        COARSE: (without, {}),
+        f"{COARSE}, per camera": (without, each),
     }
     if scene.content_distances is not None:
         found |= {"points": (scene, {}), "points, per camera": (scene, each)}
     return found
 
 
-def measure(scene: wn.Scene, trained: wn.Scene, config: wn.TrainConfig) -> dict[str, float]:
-    """Train, and look at the test views and at the space before the training cameras."""
-    trainer = prepare_trainer(trained, config)
+def measure(
+    scene: wn.Scene, trained: wn.Scene, config: wn.TrainConfig, by_training: bool
+) -> dict[str, float]:
+    """Train, and look at the test views and at the space before the training cameras.
+
+    Args:
+        scene: Whose views are looked at.
+        trained: With the extent that the training begins with.
+        config: Of the training.
+        by_training: Whether a short training finds the extent even where photographs tell it.
+    """
+    if by_training:
+        with mock.patch.object(coarse, "extent_by_sweep", lambda scene: None):
+            trainer = prepare_trainer(trained, config)
+    else:
+        trainer = prepare_trainer(trained, config)
     progress = trainer.run()
     found = wn.evaluate(trainer.field(), scene)
     return {

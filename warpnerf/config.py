@@ -112,14 +112,14 @@ class TrainConfig:
     (t / D)^2, or clamped min(1, (t / D)^2), the method of "Floaters No More"."""
     content_distance: float | Literal["auto", "per-camera"] = "auto"
     """D: where gradients reach full strength, scene units; per-camera: for each camera's rays the
-    distance of what it sees, as points or short trainings tell; auto: where that is known, the
-    geometric mean of it and of the scene's estimate, or less where many cameras see the same
-    (``training.extent.content_distances``), else the scene's."""
+    distance of what it sees, as points, photographs or short trainings tell; auto: where that is
+    known, the geometric mean of it and of the scene's estimate, or less where many cameras see the
+    same (``training.extent.content_distances``), else the scene's."""
     coarse_steps: int = 200
     """Steps, at most, of a short training on a small grid, with clamped scaling, that finds the
-    content distance of captures without points, but for objects with alpha; two of them find the
-    box as well where cameras look at no common point. 0: none, and the extent stays what the
-    scene says."""
+    content distance of captures without points whose photographs do not tell it, but for objects
+    with alpha; two of them find the box as well where cameras look at no common point. 0: neither
+    is asked, and the extent stays what the scene says."""
     jacobian: Jacobian = "none"
     """Whether the scaling accounts for how contraction changes volumes; contracted space only."""
     rays_per_step: int = 4096

@@ -104,7 +104,7 @@ def test_extents(tmp_path):
     options = ("room-scan", "--views", "9", "--steps", "500", "--voxels", "8000", "--threads", "1")
     record, printed = run("extents.py", tmp_path / "record.json", *options)
     rows = {row["extent"]: row for row in record["rows"]}
-    found = ["coarse", "coarse, per camera"]
+    found = [f"{by}{each}" for by in ("photographs", "coarse") for each in ("", ", per camera")]
     assert list(rows) == ["cameras", *found, "points", "points, per camera"]
     assert rows["cameras"]["longest_edge"] < 1.5  # a guess
     for extent in ("points", "points, per camera"):

@@ -20,7 +20,7 @@ Keep = Literal["field", "checkpoint"]
 
 
 class FoundExtent(msgspec.Struct, frozen=True):
-    """What the short trainings found, in scene units; see ``training.coarse``."""
+    """What was found before the training, in scene units; see ``training.coarse``."""
 
     content_distance: float
     box_min: tuple[float, float, float]
@@ -99,7 +99,7 @@ def describe(
         content_distance: See ``RunConfig``.
         config: What was requested.
         masks: See ``RunConfig``.
-        found: Whether short trainings found the scene's extent.
+        found: Whether the scene's extent was found before the training.
         keep: See ``RunConfig``.
         split: See ``RunConfig``.
     """

@@ -177,8 +177,8 @@ class Scene:
     unbounded: bool
     """Whether content continues outside the box (photographs), or not (objects, rooms)."""
     content_distance: float
-    """Median distance from a camera to what it sees, or to what all look at, scene units. What a
-    short training finds takes its place, see ``TrainConfig.coarse_steps``."""
+    """Median distance from a camera to what it sees, or to what all look at, scene units. What is
+    found before a training takes its place, see ``TrainConfig.coarse_steps``."""
     content_distances: np.ndarray | None = None
     """[n_views] float64, median distance of the points that each camera sees, scene units; None
     where the capture brings no points."""

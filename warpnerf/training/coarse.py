@@ -1,10 +1,11 @@
-"""Estimation of a scene's extent by a short training on a small grid.
+"""Estimation of a scene's extent before its training, by a short one if need be.
 
 Not every capture brings points, and cameras tell little: what they look at is nearer than most of
-what they see, and where they look outward, or in parallel directions, there is no such thing. So
-photographs without points are trained on for a moment, in a box that may be several times too
-small, with all space around it contracted. What half of the light of a ray has met is a point of
-the scene; what points tell, these tell (``warpnerf.scenes.extent.points.observed_extent``).
+what they see, and where they look outward, or in parallel directions, there is no such thing. Most
+photographs tell it by a plane sweep (``warpnerf.scenes.extent.swept``). Those that do not, for want
+of texture, say, are trained on for a moment, in a box that may be several times too small, with all
+space around it contracted. What half of the light of a ray has met is a point of the scene; what
+points tell, these tell (``warpnerf.scenes.extent.points.observed_extent``).
 
 Where cameras look at a common point, the box stays around that: what lies behind it is seen, too,
 but is not what the box is for. Elsewhere the box is found as well, and a second round begins with
@@ -13,6 +14,7 @@ the box and the distance of the first.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -29,6 +31,7 @@ from warpnerf.rendering.rays import camera_rays
 from warpnerf.runtime.parallel import Workers
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.extent.points import ObservedExtent, observed_extent
+from warpnerf.scenes.extent.swept import extent_by_sweep
 from warpnerf.scenes.scene import Scene, View
 from warpnerf.training.growth import require_room
 from warpnerf.training.peers import ALONE, Peers
@@ -90,7 +93,10 @@ def prepare_trainer(
         return Trainer(scene, plan, peers=peers)
     config = plan.config
     require_room(plan, Workers(config.device, config.threads).device)
-    observed, seconds = extent_by_training(scene, plan, on_progress, peers)
+    began = time.perf_counter()
+    observed, seconds = extent_by_sweep(scene), time.perf_counter() - began
+    if observed is None:
+        observed, seconds = extent_by_training(scene, plan, on_progress, peers)
     if observed is None:
         scene = replace(scene, notes=(*scene.notes, NOTHING_SEEN))
     return Trainer(scene, config, observed=observed, seconds=seconds, peers=peers)
@@ -166,7 +172,7 @@ def extent_by_training(
         if found is None:
             blind = n_steps == config.coarse_steps and not any(map(len, points))
             break
-        observed = found
+        observed = replace(found, found_by="a short training")
         if isinstance(given, str):
             # cameras' own distances are too rough yet for the next round to follow
             small = replace(small, content_distance=found.content_distance)

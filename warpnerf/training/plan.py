@@ -92,7 +92,7 @@ class TrainingPlan:
     memory: int
     """Bytes that it takes on the CPU: grid, optimiser, gradients, photographs, the process."""
     looks_first: bool
-    """Whether a short training looks for the extent first. Space and distances are then what the
+    """Whether the extent is looked for first. Space and distances are then what the
     cameras suggest, and those of the plan that follows may be other ones."""
 
     def __post_init__(self) -> None:
@@ -159,9 +159,9 @@ def resolve(
     Args:
         scene: What is trained on.
         config: How.
-        observed: What a short training has found: content distances in place of the scene's, and
+        observed: What was found before: content distances in place of the scene's, and
             its box where the scene's is a guess.
-        looked: Whether there will be no short training, or has been one, in vain.
+        looked: Whether the extent will not be looked for, or has been, in vain.
 
     Raises:
         InputError: The scene has no frustum, or no content distances that are requested; or an

@@ -90,7 +90,7 @@ class Trainer:
         self._given = scene
         self._scene_digest = None if resume is None else resume.scene_digest
         self.observed = observed
-        """What a short training has found; None: the scene's own extent is used."""
+        """What was found before; None: the scene's own extent is used."""
         if observed is not None:
             scene = with_extent(scene, observed)
         self.scene = scene

@@ -59,6 +59,11 @@ MOST_POINTS = 60
 FEWEST_POINTS = 4
 """That tell something of a reference."""
 
+SURE = 0.6
+"""Correlation of a patch at its best depth, from which on it is sure to be found."""
+AHEAD = 0.1
+"""By how much that is more than at any depth that is not next to it."""
+
 TELLING = 0.1
 """Mean gain of photographs that fit their poses, at least; captures have 0.15 to 0.4."""
 MOST = 0.7
@@ -237,6 +242,33 @@ class PhotoConsistency:
         if len(own) < max(2, len(chosen) // 3) or np.mean(best) <= 0.0:
             return None
         return max(0.0, float(np.mean(own) / np.mean(best)))
+
+    def surfaces(self, i: int) -> np.ndarray:
+        """Where patches of a reference are found beyond doubt, [n, 3] scene units.
+
+        At one depth much better than at all others but those next to it, and not infinitely far;
+        pixels that a mask leaves out do not count.
+        """
+        picture, pose, mask = self._picture(i), self.poses[i], self.views[i].mask
+        height, width = picture.gray.shape
+        middles = self._textured(i, spread_middles((height, width)))
+        if mask is not None:
+            u, v = (middles * [mask.shape[1] / width, mask.shape[0] / height]).astype(np.int64).T
+            middles = middles[mask[v.clip(max=len(mask) - 1), u.clip(max=mask.shape[1] - 1)]]
+        if not len(middles):
+            return np.empty((0, 3))
+        near = neighbours(self.poses, i, FAR_APART)
+        inverse = _inverse_depths(self.poses, i, near)
+        tried = np.tile(inverse[:, None], len(middles))
+        (match,) = self._correlations(i, near, [near], middles, tried)
+        best, highest = match.argmax(axis=0), match.max(axis=0)
+        beside = np.abs(np.arange(DEPTHS)[:, None] - best) <= 1
+        others = np.where(beside, -1.0, match).max(axis=0)
+        sure = (highest >= SURE) & (highest >= others + AHEAD) & (best > 0)
+        rays = np.ones((int(sure.sum()), 3))
+        rays[:, :2] = (middles[sure] - picture.centre) / picture.focal
+        rays *= np.array([1.0, -1.0, -1.0]) / np.linalg.norm(rays, axis=1, keepdims=True)
+        return np.asarray(pose[:, 3] + rays / inverse[best[sure]][:, None] @ pose[:, :3].T)
 
     def _foremost(self, i: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where a reference sees points with texture that others do not hide, and how far away."""

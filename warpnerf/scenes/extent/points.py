@@ -100,6 +100,8 @@ class ObservedExtent:
     """[3] upper corner."""
     observations: Observations
     """Some of the points, as training cameras see them."""
+    found_by: str = "points"
+    """What tells it, in words."""
 
 
 def observed_extent(
@@ -201,7 +203,7 @@ def extent_by_points(
 
 
 def with_extent(scene: Scene, observed: ObservedExtent) -> Scene:
-    """The scene with what its cameras see, found by training; its box only where it was a guess."""
+    """The scene with what its cameras see, without points; its box only where it was a guess."""
     note = f"content distance {observed.content_distance:.3g}"
     if scene.guessed:
         edges = " x ".join(f"{edge:.3g}" for edge in observed.box_max - observed.box_min)
@@ -215,7 +217,7 @@ def with_extent(scene: Scene, observed: ObservedExtent) -> Scene:
         near_content=observed.near_content,
         observations=observed.observations,
         guessed=False,
-        notes=(*scene.notes, f"{note} instead: what the cameras see, found by a short training"),
+        notes=(*scene.notes, f"{note} instead: what the cameras see, found by {observed.found_by}"),
     )
 
 

@@ -1,0 +1,107 @@
+"""The extent of scenes without points, by comparing their photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import warpnerf as wn
+from tests.training.test_coarse import inward, mixed, of_room, outward
+from warpnerf.scenes.extent import swept
+from warpnerf.scenes.extent.swept import extent_by_sweep
+from warpnerf.scenes.scene import Scene
+from warpnerf.training import coarse
+from warpnerf.training.coarse import prepare_trainer
+
+
+@pytest.fixture(scope="module")
+def room() -> tuple[Scene, float]:
+    return of_room(outward(24))
+
+
+@pytest.mark.parametrize("poses", [outward, inward, mixed])
+def test_the_content_distance_of_a_room(poses: Callable[[int], Sequence[np.ndarray]]) -> None:
+    scene, true = of_room(poses(32))
+    found = extent_by_sweep(scene)
+    assert found is not None
+    assert 0.8 * true < found.content_distance < 1.25 * true
+
+
+def test_the_box_of_a_room_seen_outward(room: tuple[Scene, float]) -> None:
+    found = extent_by_sweep(room[0])
+    assert found is not None
+    edges = np.sort(found.box_max - found.box_min)
+    assert (np.abs(edges - [2.7, 4.1, 5.1]) < [1.0, 0.8, 0.8]).all()
+    assert np.abs(found.middle[:2]).max() < 0.6
+
+
+def test_each_camera_has_a_distance_of_its_own(room: tuple[Scene, float]) -> None:
+    scene, _ = room
+    found = extent_by_sweep(scene)
+    assert found is not None and len(found.distances) == len(scene.views)
+    assert np.ptp(found.distances) > 0.2
+
+
+def test_of_many_photographs_some_are_looked_at(
+    room: tuple[Scene, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene, _ = room
+    monkeypatch.setattr(swept, "MOST", len(scene.views) // 2)
+    found = extent_by_sweep(scene)
+    assert found is not None
+    assert (found.distances[1::2] == found.content_distance).all()
+    assert (found.distances[::2] != found.content_distance).any()
+
+
+def test_what_a_mask_leaves_out_does_not_count(room: tuple[Scene, float]) -> None:
+    """Else the same content would be found."""
+    scene, _ = room
+    left = np.arange(64) < 32
+    masked = [replace(view, mask=np.tile(left, (48, 1))) for view in scene.views]
+    whole, half = (extent_by_sweep(replace(scene, views=v)) for v in (scene.views, masked))
+    assert whole is not None and half is not None
+    n_whole, n_half = (len(found.observations) for found in (whole, half))
+    assert 0.3 * n_whole < n_half < 0.7 * n_whole
+
+
+def test_photographs_that_do_not_tell(room: tuple[Scene, float]) -> None:
+    scene, _ = room
+    few = replace(scene, splits={"train": (0, 1, 2), "test": ()})
+    plain = [replace(v, image=np.full_like(v.image, 90)) for v in scene.views]
+    order = np.roll(np.arange(len(scene.views)), 7)
+    others = [
+        replace(view, image=scene.views[int(k)].image)
+        for view, k in zip(scene.views, order, strict=True)
+    ]
+    for unsure in (few, replace(scene, views=plain), replace(scene, views=others)):
+        assert extent_by_sweep(unsure) is None
+
+
+def test_where_they_tell_nothing_is_trained_before(
+    room: tuple[Scene, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*args: object) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr(coarse, "extent_by_training", fail)
+    scene, _ = room
+    config = wn.TrainConfig(model="rgb", steps=2000, threads=1, grid=wn.GridConfig(voxels=12**3))
+    trainer = prepare_trainer(scene, config)
+    found = extent_by_sweep(scene)
+    assert found is not None and trainer.observed is not None
+    assert trainer.scene.content_distance == found.content_distance
+    assert trainer.scene.notes[-1].endswith("found by comparing the photographs")
+
+
+def test_where_they_do_not_tell_a_short_training_does(
+    room: tuple[Scene, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene, _ = room
+    told = extent_by_sweep(scene)
+    monkeypatch.setattr(coarse, "extent_by_sweep", lambda scene: None)
+    monkeypatch.setattr(coarse, "extent_by_training", lambda *args: (told, 3.0))
+    config = wn.TrainConfig(model="rgb", steps=2000, threads=1, grid=wn.GridConfig(voxels=12**3))
+    assert prepare_trainer(scene, config).observed is told
