@@ -59,6 +59,8 @@ POINTS, FOCUS, OVERLAP, FISHEYE = (
 LENS, FRAME = "scenes/cameras/lens.py", "scenes/formats/frame.py"
 DIAGNOSTICS = "inspection/diagnostics.py"
 GIVEN, CONSISTENCY = "scenes/extent/given_depths.py", "scenes/extent/photo_consistency.py"
+SWEPT = "scenes/test_swept.py::test_the_content_distance_of_a_room"
+SURFACES = "scenes/test_swept.py::test_places_lie_on_surfaces"
 MASKED = "scenes/extent/masked.py"
 SPACES = "model/spaces.py"
 SPACE, SPACE_PLAN, OBSERVATIONS = (
@@ -186,6 +188,21 @@ MUTANTS = [
             "scenes/test_given_depths.py::test_inverse_depths_and_depths_of_others_are_told"),
     of_host("depth maps: of a pinhole", GIVEN, "camera.distort((middles * size - centre) / focal)[0]", "((middles * size - centre) / focal)",
             "scenes/test_given_depths.py::test_a_map_is_read_where_the_lens_shows_what_a_pinhole_does"),
+    of_host("sweep: any depth is sure", CONSISTENCY, "(highest >= SURE) & (highest >= others + AHEAD) & ", "", SURFACES),
+    of_host("sweep: what is infinitely far is a place", CONSISTENCY, " & (best > 0)", "",
+            "scenes/test_swept.py::test_what_is_infinitely_far_is_no_place"),
+    of_host("sweep: the best depth is beside itself", CONSISTENCY, "- best) <= 1", "- best) <= -1", SWEPT),
+    of_host("sweep: masks are not minded", CONSISTENCY, "        if mask is not None:\n            u, v", "        if False:\n            u, v",
+            "scenes/test_swept.py::test_what_a_mask_leaves_out_does_not_count"),
+    of_host("sweep: along the axis", CONSISTENCY, "rays[:, :2] = (middles[sure] - picture.centre) / picture.focal", "rays[:, :2] = 0.0", SURFACES),
+    of_host("sweep: upside down", CONSISTENCY, "rays *= np.array([1.0, -1.0, -1.0]) / np.linalg.norm(rays, axis=1",
+            "rays *= np.array([1.0, 1.0, -1.0]) / np.linalg.norm(rays, axis=1", SURFACES),
+    of_host("sweep: photographs that do not fit", "scenes/extent/swept.py", "not photographs.tell_depths", "not photographs.can_tell",
+            "scenes/test_swept.py::test_photographs_that_do_not_fit_are_not_believed"),
+    of_host("sweep: whose places they are", "scenes/extent/swept.py", "seen[index] =", "seen[number] =",
+            "scenes/test_swept.py::test_of_many_photographs_some_are_looked_at"),
+    of_host("sweep: never asked", "training/coarse.py", "extent_by_sweep(scene), time", "None, time",
+            "scenes/test_swept.py::test_where_they_tell_nothing_is_trained_before"),
     of_host("sweep: the far end is tried alone", CONSISTENCY, "found[DEPTHS:].max(axis=0)", "found[DEPTHS]",
             "scenes/test_given_depths.py::test_bounds_that_hold_what_photographs_show_are_used"),
     of_host("photographs: alike is the same", DIAGNOSTICS, "if moved and np.array_equal(other.image, view.image):", "if moved:", FROZEN),

@@ -10,7 +10,9 @@ import pytest
 
 import warpnerf as wn
 from tests.training.test_coarse import inward, mixed, of_room, outward
+from warpnerf.scenes.builtin.room import first_hit, photograph
 from warpnerf.scenes.extent import swept
+from warpnerf.scenes.extent.photo_consistency import Agreement, PhotoConsistency
 from warpnerf.scenes.extent.swept import extent_by_sweep
 from warpnerf.scenes.scene import Scene
 from warpnerf.training import coarse
@@ -36,6 +38,22 @@ def test_the_box_of_a_room_seen_outward(room: tuple[Scene, float]) -> None:
     edges = np.sort(found.box_max - found.box_min)
     assert (np.abs(edges - [2.7, 4.1, 5.1]) < [1.0, 0.8, 0.8]).all()
     assert np.abs(found.middle[:2]).max() < 0.6
+
+
+@pytest.mark.parametrize("poses", [outward, inward])
+def test_places_lie_on_surfaces(poses: Callable[[int], Sequence[np.ndarray]]) -> None:
+    """Depths of the sweep are a fifth apart where they are far; few places are wrong."""
+    scene, _ = of_room(poses(24))
+    photographs = PhotoConsistency.of(scene.views)
+    apart = []
+    for number, view in enumerate(scene.views):
+        away = photographs.surfaces(number) - view.camera.position
+        distance = np.linalg.norm(away, axis=1)
+        true = first_hit(np.tile(view.camera.position, (len(away), 1)), away / distance[:, None])
+        apart.append(np.abs(distance / true - 1.0))
+    wrong = np.concatenate(apart)
+    assert len(wrong) > 10 * len(scene.views)
+    assert np.median(wrong) < 0.06 and np.mean(wrong < 0.25) > 0.85
 
 
 def test_each_camera_has_a_distance_of_its_own(room: tuple[Scene, float]) -> None:
@@ -67,6 +85,23 @@ def test_what_a_mask_leaves_out_does_not_count(room: tuple[Scene, float]) -> Non
     assert 0.3 * n_whole < n_half < 0.7 * n_whole
 
 
+def test_what_is_infinitely_far_is_no_place(room: tuple[Scene, float]) -> None:
+    """Cameras that only turn see all of it there, and no baseline says how far it is."""
+    scene, _ = room
+    eye = scene.views[0].camera.position
+    turned = []
+    for view in scene.views:
+        c2w = view.camera.c2w.copy()
+        c2w[:, 3] = eye
+        camera = replace(view.camera, c2w=c2w)
+        turned.append(replace(view, camera=camera, image=photograph(camera)[0]))
+    poses = np.array([view.camera.c2w for view in turned])
+    poses[:, :, 3] += 1e-3 * np.random.default_rng(0).normal(size=(len(poses), 3))
+    photographs = PhotoConsistency(views=turned, poses=poses)
+    places = np.concatenate([photographs.surfaces(i) for i in range(len(turned))])
+    assert len(places) < 5 * len(turned) and np.isfinite(places).all()  # of 63 each
+
+
 def test_photographs_that_do_not_tell(room: tuple[Scene, float]) -> None:
     scene, _ = room
     few = replace(scene, splits={"train": (0, 1, 2), "test": ()})
@@ -78,6 +113,13 @@ def test_photographs_that_do_not_tell(room: tuple[Scene, float]) -> None:
     ]
     for unsure in (few, replace(scene, views=plain), replace(scene, views=others)):
         assert extent_by_sweep(unsure) is None
+
+
+def test_photographs_that_do_not_fit_are_not_believed(
+    room: tuple[Scene, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Agreement, "fits", False)
+    assert extent_by_sweep(room[0]) is None
 
 
 def test_where_they_tell_nothing_is_trained_before(
