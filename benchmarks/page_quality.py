@@ -116,7 +116,7 @@ def extents(records: Records) -> str:
         f"`{row['candidate']}` {row['psnr']:.2f} dB, {row['middle_psnr']:.2f} in the middle"
         for row in presets["rows"]
     )
-    columns = ["cameras", "found", "points", "true"]
+    columns = ["cameras", "photographs", "found", "points", "true"]
     rows = [
         [place(row["scene"]), *(f"{row[key]:.3g}" if row[key] else "" for key in columns)]
         for row in distances["rows"]
@@ -131,12 +131,12 @@ def extents(records: Records) -> str:
             f"""After {boxes["steps"]} steps the scene's own box reaches {own["psnr"]:.2f} dB, the
             one planned by pixels {planned["psnr"]:.2f} dB, others, from the best to the worst by
             the plan, {compared} dB. After {presets["time_limit"]:.0f} s in turns: {raced}.
-            PSNR in dB after {extent["steps"]} steps of `rgb` with the extent from cameras, a
-            short training, points: {reached}. The table has content distances of these, in
-            scene units, and where it is known the median over all pixels.""",
+            PSNR in dB after {extent["steps"]} steps of `rgb` with the extent from cameras,
+            photographs, a short training, points: {reached}. The table has content distances of
+            these, in scene units, and where it is known the median over all pixels.""",
             *(records.source(name) for name in ("boxes", "presets", "extents", "distances")),
         ),
-        table(["scene", "cameras", "short training", "points", "true"], rows),
+        table(["scene", "cameras", "photographs", "short training", "points", "true"], rows),
     )
 
 

@@ -127,7 +127,7 @@ def _odd_images(scene: Scene, threads: int | None) -> list[str]:
     if 0 < len(gray) < len(shown):
         odd.append(
             f"gray among coloured ones: {len(gray)} of {len(scene.views)} images (first: "
-            f"{gray[0]}), as of a thermal or infrared camera; leave out the ones or the others"
+            f"{gray[0]}), as of a thermal camera, or black-and-white; leave the gray ones out"
         )
     dark = [view.name for view, look in shown.items() if look.brightest <= DARK]
     if len(dark) > 0.5 * len(scene.views):

@@ -14,7 +14,6 @@ the box and the distance of the first.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -93,8 +92,7 @@ def prepare_trainer(
         return Trainer(scene, plan, peers=peers)
     config = plan.config
     require_room(plan, Workers(config.device, config.threads).device)
-    began = time.perf_counter()
-    observed, seconds = extent_by_sweep(scene), time.perf_counter() - began
+    observed, seconds = peers.from_first(lambda: extent_by_sweep(scene)), 0.0
     if observed is None:
         observed, seconds = extent_by_training(scene, plan, on_progress, peers)
     if observed is None:

@@ -1,8 +1,9 @@
 """Additions to nodes and entries that many samples share.
 
 On CUDA they are atomic. From compute capability 9.0 on, four numbers are added by one instruction
-(PTX ISA 8.1, red.global.add.v4.f32): fewer transactions, and a quarter of the code. On the CPU only
-one thread may call this for an array at a time.
+(PTX ISA 8.1, red.global.add.v4.f32): fewer transactions, and a quarter of the code. Arrays begin at
+multiples of 16 bytes, as allocators give them. On the CPU only one thread may call this for an
+array at a time.
 """
 
 from typing import Any
@@ -17,13 +18,13 @@ BY_FOUR = r"""
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
 constexpr int N_FOURS = sizeof(value) / 16;
 if constexpr (sizeof(value) % 16 == 0) {
-    const float* numbers = (const float*)&value;
+    const float* numbers = (const float*)&value;  // a vector is its numbers, one after the other
     #pragma unroll
     for (int n = 0; n < N_FOURS; ++n) {
         asm volatile(
             "{ .reg .u64 at; cvta.to.global.u64 at, %0;"
             " red.global.add.v4.f32 [at], {%1, %2, %3, %4}; }"
-            ::"l"((const float*)&to.data[i] + 4 * n), "f"(numbers[4 * n]),
+            ::"l"((const float*)&wp::index(to, i) + 4 * n), "f"(numbers[4 * n]),
             "f"(numbers[4 * n + 1]), "f"(numbers[4 * n + 2]), "f"(numbers[4 * n + 3])
             : "memory");
     }

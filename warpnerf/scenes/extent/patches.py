@@ -11,6 +11,8 @@ from warpnerf.scenes.scene import View
 
 SIDE = 96
 """Pixels of a photograph's longer side, about."""
+ENOUGH = 8
+"""Pixels in each direction whose mean is a reduced one, at least, where there are more."""
 LEAST_SIDE = 24
 """Pixels of the shorter one; smaller photographs tell nothing."""
 
@@ -41,8 +43,9 @@ def reduced(view: View) -> Picture:
     camera = whole.downscaled(factor)
     image = view.image[: camera.height * factor, : camera.width * factor]
     # By rows, so that no copy of a large photograph in floats is made.
-    rows = image.reshape(camera.height, factor, -1)
-    gray = np.stack([_gray(row, camera.width, factor, image.shape[2]) for row in rows])
+    rows, every = image.reshape(camera.height, factor, -1), max(1, factor // ENOUGH)
+    shape = (-1, camera.width, factor, image.shape[2])
+    gray = np.stack([_gray(row[::every].reshape(shape)[:, :, ::every]) for row in rows])
     focal, centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
     bent = (camera.k1, camera.k2, camera.k3, camera.p1, camera.p2, camera.rational, camera.fisheye)
     if any(bent):
@@ -58,11 +61,11 @@ def _most(camera: Camera) -> tuple[int, int]:
     return camera.width // LEAST_SIDE, camera.height // LEAST_SIDE
 
 
-def _gray(rows: np.ndarray, width: int, factor: int, channels: int) -> np.ndarray:
-    """One reduced row [width] of rows [factor, width * factor * channels]."""
-    mean = rows.reshape(factor, width, factor, channels).mean(axis=(0, 2), dtype=np.float32)
+def _gray(pixels: np.ndarray) -> np.ndarray:
+    """One reduced row [width] of pixels [n, width, n, channels]."""
+    mean = pixels.mean(axis=(0, 2), dtype=np.float32)
     gray = mean[:, :3].mean(axis=1)
-    return gray * mean[:, 3] / np.float32(255.0) if channels == 4 else gray
+    return gray * mean[:, 3] / np.float32(255.0) if mean.shape[1] == 4 else gray
 
 
 def spread_middles(shape: tuple[int, ...]) -> np.ndarray:

@@ -40,6 +40,8 @@ FEWEST = NEIGHBOURS + 2
 DEPTHS = 24
 """From NEAREST baselines to infinity, evenly spaced in 1 / depth."""
 NEAREST = 1.5
+FINE_DEPTHS = 2 * DEPTHS
+"""Where it is depths that are looked for."""
 
 ANGLE = np.radians(30.0)
 """Of rotation, which sets a neighbour as far off as a spread of all cameras does."""
@@ -61,6 +63,8 @@ FEWEST_POINTS = 4
 
 SURE = 0.6
 """Correlation of a patch at its best depth, from which on it is sure to be found."""
+ALONE = 0.15
+"""What a correlation with a single neighbour counts less: occlusion and repetition deceive one."""
 AHEAD = 0.1
 """By how much that is more than at any depth that is not next to it."""
 
@@ -246,8 +250,8 @@ class PhotoConsistency:
     def surfaces(self, i: int) -> np.ndarray:
         """Where patches of a reference are found beyond doubt, [n, 3] scene units.
 
-        At one depth much better than at all others but those next to it, and not infinitely far;
-        pixels that a mask leaves out do not count.
+        At one depth much better than at all others but those about it, and neither infinitely far
+        nor at the near end of the sweep; pixels that a mask leaves out do not count.
         """
         picture, pose, mask = self._picture(i), self.poses[i], self.views[i].mask
         height, width = picture.gray.shape
@@ -258,17 +262,25 @@ class PhotoConsistency:
         if not len(middles):
             return np.empty((0, 3))
         near = neighbours(self.poses, i, FAR_APART)
-        inverse = _inverse_depths(self.poses, i, near)
+        inverse = _inverse_depths(self.poses, i, near, FINE_DEPTHS)
         tried = np.tile(inverse[:, None], len(middles))
-        (match,) = self._correlations(i, near, [near], middles, tried)
+        matches = self._matches(i, near, [near], middles, tried)[:, 0]
+        match = _mean(matches) - ALONE * (np.isfinite(matches).sum(axis=0) == 1)
         best, highest = match.argmax(axis=0), match.max(axis=0)
-        beside = np.abs(np.arange(DEPTHS)[:, None] - best) <= 1
-        others = np.where(beside, -1.0, match).max(axis=0)
-        sure = (highest >= SURE) & (highest >= others + AHEAD) & (best > 0)
-        rays = np.ones((int(sure.sum()), 3))
-        rays[:, :2] = (middles[sure] - picture.centre) / picture.focal
+        about = np.abs(np.arange(FINE_DEPTHS)[:, None] - best) <= FINE_DEPTHS // DEPTHS
+        others = np.where(about, -1.0, match).max(axis=0)
+        sure = (highest >= SURE) & (highest >= others + AHEAD)
+        sure &= (best > 0) & (best < FINE_DEPTHS - 1)
+        middles, best, columns = middles[sure], best[sure], np.flatnonzero(sure)
+        before, at, after = (match[best + step, columns] for step in (-1, 0, 1))
+        # The highest point of the parabola through the best and those beside it.
+        bend = np.maximum(2.0 * at - before - after, 1e-6)
+        step = np.clip(0.5 * (after - before) / bend, -0.5, 0.5)
+        rays = np.ones((len(middles), 3))
+        rays[:, :2] = (middles - picture.centre) / picture.focal
         rays *= np.array([1.0, -1.0, -1.0]) / np.linalg.norm(rays, axis=1, keepdims=True)
-        return np.asarray(pose[:, 3] + rays / inverse[best[sure]][:, None] @ pose[:, :3].T)
+        away = 1.0 / ((best + step) * inverse[1])
+        return np.asarray(pose[:, 3] + away[:, None] * rays @ pose[:, :3].T)
 
     def _foremost(self, i: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where a reference sees points with texture that others do not hide, and how far away."""
@@ -294,6 +306,17 @@ class PhotoConsistency:
         middles: np.ndarray,
         inverse: np.ndarray,
     ) -> np.ndarray:
+        """Mean of ``_matches``, whose arguments these are, over the neighbours: [len(shown), k, m]."""
+        return _mean(self._matches(i, near, shown, middles, inverse))
+
+    def _matches(
+        self,
+        i: int,
+        near: Sequence[int],
+        shown: Sequence[Sequence[int]],
+        middles: np.ndarray,
+        inverse: np.ndarray,
+    ) -> np.ndarray:
         """Correlations of patches of a reference with what its neighbours show at depths.
 
         Args:
@@ -304,8 +327,7 @@ class PhotoConsistency:
             inverse: [k, m] of 1 / distance from its centre.
 
         Returns:
-            [len(shown), k, m] mean over the neighbours that see the patch there, -1 where none
-            does.
+            [len(near), len(shown), k, m], NaN where a neighbour does not see the patch there.
         """
         picture, poses = self._picture(i), self.poses
         pixels = middles[:, None] + PATCH
@@ -313,8 +335,8 @@ class PhotoConsistency:
         rays = np.ones((*pixels.shape[:2], 3))
         rays[..., :2] = (pixels - picture.centre) / picture.focal
         rays *= np.array([1.0, -1.0, -1.0]) / np.linalg.norm(rays, axis=-1, keepdims=True)
-        total, seen = np.zeros((2, len(shown), *inverse.shape))
-        for j, *others in zip(near, *shown, strict=True):
+        matches = np.zeros((len(near), len(shown), *inverse.shape))
+        for number, (j, *others) in enumerate(zip(near, *shown, strict=True)):
             turn = poses[i][:, :3].T @ poses[j][:, :3]
             shift = (poses[i][:, 3] - poses[j][:, 3]) @ poses[j][:, :3]
             there, front = project(
@@ -323,10 +345,8 @@ class PhotoConsistency:
             before = front.all(axis=-1)
             for n, other in enumerate(others):
                 match = correlation(patch, bilinear(self._picture(other).gray, there))
-                known = before & np.isfinite(match)
-                total[n] += np.where(known, match, 0.0)
-                seen[n] += known
-        return np.where(seen > 0, total / np.maximum(seen, 1), -1.0)
+                matches[number, n] = np.where(before, match, np.nan)
+        return matches
 
     def _strangers(self, i: int, near: Sequence[int]) -> list[int]:
         """As many views as a reference has neighbours, spread evenly over those that are none."""
@@ -345,6 +365,13 @@ class PhotoConsistency:
             self._pictures[i] = reduced(self.views[i])
         picture = self._pictures[i]
         return picture if self.zoom == 1.0 else replace(picture, focal=self.zoom * picture.focal)
+
+
+def _mean(matches: np.ndarray) -> np.ndarray:
+    """Mean correlation over the neighbours, axis 0, that see a patch; -1 where none does."""
+    known = np.isfinite(matches)
+    seen, total = known.sum(axis=0), np.where(known, matches, 0.0).sum(axis=0)
+    return np.where(seen > 0, total / np.maximum(seen, 1), -1.0)
 
 
 def neighbours(poses: np.ndarray, i: int, least: float = APART) -> list[int]:
@@ -375,7 +402,7 @@ def _apart(poses: np.ndarray, i: int) -> np.ndarray:
     )
 
 
-def _inverse_depths(poses: np.ndarray, i: int, near: Sequence[int]) -> np.ndarray:
-    """1 / distance from a reference, [DEPTHS], from 0 to that of NEAREST baselines."""
+def _inverse_depths(poses: np.ndarray, i: int, near: Sequence[int], n: int = DEPTHS) -> np.ndarray:
+    """1 / distance from a reference, [n], from 0 to that of NEAREST baselines."""
     baselines = np.linalg.norm(poses[list(near), :, 3] - poses[i][:, 3], axis=1)
-    return np.linspace(0.0, 1.0 / (NEAREST * max(float(np.median(baselines)), 1e-12)), DEPTHS)
+    return np.linspace(0.0, 1.0 / (NEAREST * max(float(np.median(baselines)), 1e-12)), n)

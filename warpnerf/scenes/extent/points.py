@@ -39,7 +39,7 @@ MARGIN = 0.05
 MIN_EDGE = 0.2
 """Least edge of the box, in longest edges."""
 
-NEAREST = 0.01
+NEARER = 0.01
 """Share of the points seen that are nearer than the near content: floaters of the matching."""
 
 
@@ -109,6 +109,7 @@ def observed_extent(
     seen: Sequence[np.ndarray],
     training: Sequence[int],
     outside: float = OUTSIDE,
+    nearer: float = NEARER,
 ) -> ObservedExtent | None:
     """The observed extent: how far from the cameras content is, and where.
 
@@ -120,6 +121,7 @@ def observed_extent(
         seen: For each, the points that it sees, [n, 3] scene units.
         training: Indices of the training cameras, which alone decide but for distances of others.
         outside: Share of what cameras see that may lie outside the box at each of its faces.
+        nearer: Share of it that is nearer than the near content.
 
     Returns:
         What they see; None where points do not tell it to enough of the training cameras.
@@ -151,7 +153,7 @@ def observed_extent(
     return ObservedExtent(
         distances=distances,
         content_distance=content_distance,
-        near_content=float(quantiles(distance, weight, (NEAREST,))[0]),
+        near_content=float(quantiles(distance, weight, (nearer,))[0]),
         middle=middle,
         box_min=low - margin,
         box_max=high + margin,

@@ -11,15 +11,19 @@ from dataclasses import replace
 
 import numpy as np
 
+from warpnerf.scenes.extent.patches import LEAST_SIDE
 from warpnerf.scenes.extent.photo_consistency import PhotoConsistency
 from warpnerf.scenes.extent.points import ObservedExtent, observed_extent
 from warpnerf.scenes.scene import Scene
 
-MOST = 256
-"""Photographs whose patches are looked for; of more every n-th."""
+MOST_PHOTOGRAPHS = 256
+"""Whose patches are looked for; of more every n-th."""
 OUTSIDE = 0.05
 """Share of what cameras see that may lie outside the box at each face: a wrong depth is rarer than
 that, but not as rare as a wrong point."""
+
+NEARER = 0.03
+"""Share of it that is nearer than the near content, likewise."""
 
 
 def extent_by_sweep(scene: Scene) -> ObservedExtent | None:
@@ -32,8 +36,13 @@ def extent_by_sweep(scene: Scene) -> ObservedExtent | None:
         Distances, box and some of the places; None where photographs are too few, too small or
         without texture, do not fit their poses, or tell it to too few cameras.
     """
-    train = scene.splits["train"]
-    chosen = train[:: max(1, -(-len(train) // MOST))]
+    cameras = scene.cameras
+    large = [
+        index
+        for index in scene.splits["train"]
+        if min(cameras[index].width, cameras[index].height) >= LEAST_SIDE
+    ]
+    chosen = large[:: max(1, -(-len(large) // MOST_PHOTOGRAPHS))]
     views = [scene.views[index] for index in chosen]
     poses = np.array([view.camera.c2w for view in views])
     photographs = PhotoConsistency(views=views, poses=poses)
@@ -42,5 +51,5 @@ def extent_by_sweep(scene: Scene) -> ObservedExtent | None:
     seen = [np.empty((0, 3))] * len(scene.views)
     for number, index in enumerate(chosen):
         seen[index] = photographs.surfaces(number)
-    observed = observed_extent(scene.cameras, seen, chosen, OUTSIDE)
+    observed = observed_extent(cameras, seen, chosen, OUTSIDE, NEARER)
     return None if observed is None else replace(observed, found_by="comparing the photographs")

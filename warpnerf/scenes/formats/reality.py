@@ -109,7 +109,9 @@ def _rows(file: Path) -> list[tuple[str, str, dict[str, float]]]:
     try:
         lines = file.read_text(encoding=_encoding(beginning(file, 2))).splitlines()
     except UnicodeDecodeError:
-        raise InputError(f"{file}: is not text in UTF-8; export it again.") from None
+        raise InputError(
+            f"{file}: cannot be decoded as text in UTF-8 or UTF-16; export it again."
+        ) from None
     header = _header(lines)
     if header is None:
         raise InputError(
