@@ -306,7 +306,7 @@ class PhotoConsistency:
         middles: np.ndarray,
         inverse: np.ndarray,
     ) -> np.ndarray:
-        """Mean of ``_matches``, which has the same arguments, over neighbours: [len(shown), k, m]."""
+        """Mean of ``_matches``, with the same arguments, over neighbours: [len(shown), k, m]."""
         return _mean(self._matches(i, near, shown, middles, inverse))
 
     def _matches(
