@@ -132,7 +132,7 @@ def extents(records: Records) -> str:
             one planned by pixels {planned["psnr"]:.2f} dB, others, from the best to the worst by
             the plan, {compared} dB. After {presets["time_limit"]:.0f} s in turns: {raced}.
             PSNR in dB after {extent["steps"]} steps of `rgb` with the extent from cameras,
-            photographs, a short training, points: {reached}. The table has content distances of
+            a short training, points: {reached}. The table has content distances of
             these, in scene units, and where it is known the median over all pixels.""",
             *(records.source(name) for name in ("boxes", "presets", "extents", "distances")),
         ),
