@@ -30,7 +30,7 @@ from warpnerf.rendering.rays import camera_rays
 from warpnerf.runtime.parallel import Workers
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.extent.points import ObservedExtent, observed_extent
-from warpnerf.scenes.extent.swept import extent_by_sweep
+from warpnerf.scenes.extent.swept import OUTSIDE, extent_by_sweep
 from warpnerf.scenes.scene import Scene, View
 from warpnerf.training.growth import require_room
 from warpnerf.training.peers import ALONE, Peers
@@ -53,10 +53,6 @@ DISTANCES = 32
 """At which opacity is looked at, from NEAREST to FARTHEST."""
 NEAREST, FARTHEST = 0.005, 64.0
 """In longest edges of the box."""
-OUTSIDE = 0.05
-"""Share of what cameras see that may lie outside the box at each face: depths of so short a
-training are rougher than matched points are."""
-
 EMPTY = -200.0
 """Raw density so low that a few hundred updates do not raise it to anything visible."""
 

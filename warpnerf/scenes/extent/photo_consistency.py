@@ -181,7 +181,7 @@ class PhotoConsistency:
             near = neighbours(self.poses, i)
             inverse = np.tile(_inverse_depths(self.poses, i, near)[:, None], len(middles))
             shown = near, self._strangers(i, near)
-            matches = self._correlations(i, near, shown, middles, inverse)
+            matches = _mean(self._matches(i, near, shown, middles, inverse))
             for match, means in zip(matches, (found, by_chance), strict=True):
                 means.append(float(np.maximum(match.max(axis=0), 0.0).mean()))
         return Agreement(found=np.array(found), by_chance=np.array(by_chance))
@@ -212,7 +212,7 @@ class PhotoConsistency:
                 continue
             sweep = np.tile(inverse[:, None], int(known.sum()))
             both = np.concatenate([sweep, tried[:, known]])
-            (match,) = self._correlations(i, near, [near], middles[known], both)
+            (match,) = _mean(self._matches(i, near, [near], middles[known], both))
             found = np.maximum(match, 0.0)
             own.append(float(found[DEPTHS:].max(axis=0).mean()))
             best.append(float(found[:DEPTHS].max(axis=0).mean()))
@@ -238,7 +238,7 @@ class PhotoConsistency:
             near = neighbours(self.poses, i, FAR_APART)
             sweep = np.tile(_inverse_depths(self.poses, i, near)[:, None], len(middles))
             inverse = np.concatenate([sweep, 1.0 / away[None]])
-            (match,) = self._correlations(i, near, [near], middles, inverse)
+            (match,) = _mean(self._matches(i, near, [near], middles, inverse))
             seen = match[-1] > -1.0
             if seen.sum() >= FEWEST_POINTS:
                 own.append(float(match[-1, seen].mean()))
@@ -297,17 +297,6 @@ class PhotoConsistency:
         first = first[:: max(1, -(-len(first) // MOST_POINTS))]
         kept = first[self._has_texture(i, pixels[first])]
         return pixels[kept], away[kept]
-
-    def _correlations(
-        self,
-        i: int,
-        near: Sequence[int],
-        shown: Sequence[Sequence[int]],
-        middles: np.ndarray,
-        inverse: np.ndarray,
-    ) -> np.ndarray:
-        """Mean of ``_matches``, with the same arguments, over neighbours: [len(shown), k, m]."""
-        return _mean(self._matches(i, near, shown, middles, inverse))
 
     def _matches(
         self,

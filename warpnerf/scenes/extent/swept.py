@@ -19,8 +19,8 @@ from warpnerf.scenes.scene import Scene
 MOST_PHOTOGRAPHS = 256
 """Whose patches are looked for; of more every n-th."""
 OUTSIDE = 0.05
-"""Share of what cameras see that may lie outside the box at each face: a wrong depth is rarer than
-that, but not as rare as a wrong point."""
+"""Share of what cameras see that may lie outside the box at each face: depths are rougher than
+matched points, whether photographs or a short training tell them."""
 
 NEARER = 0.03
 """Share of it that is nearer than the near content, likewise."""
