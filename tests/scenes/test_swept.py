@@ -180,6 +180,15 @@ def test_where_they_tell_nothing_is_trained_before(
     assert trainer.scene.notes[-1].endswith("found by comparing the photographs")
 
 
+def test_in_a_box_that_is_known_a_short_training_tells_it(
+    room: tuple[Scene, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(coarse, "extent_by_training", lambda *args: (None, 3.0))
+    scene = replace(room[0], unbounded=False, guessed=False)
+    config = wn.TrainConfig(model="rgb", steps=2000, threads=1, grid=wn.GridConfig(voxels=12**3))
+    assert prepare_trainer(scene, config).observed is None
+
+
 def test_where_they_do_not_tell_a_short_training_does(
     room: tuple[Scene, float], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -88,7 +88,9 @@ def prepare_trainer(
         return Trainer(scene, plan, peers=peers)
     config = plan.config
     require_room(plan, Workers(config.device, config.threads).device)
-    observed, seconds = peers.from_first(lambda: extent_by_sweep(scene)), 0.0
+    observed, seconds = None, 0.0
+    if scene.unbounded:  # in a box that is known a short training is nearer to the truth
+        observed = peers.from_first(lambda: extent_by_sweep(scene))
     if observed is None:
         observed, seconds = extent_by_training(scene, plan, on_progress, peers)
     if observed is None:
