@@ -184,7 +184,7 @@ def test_in_a_box_that_is_known_a_short_training_tells_it(
     room: tuple[Scene, float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(coarse, "extent_by_training", lambda *args: (None, 3.0))
-    scene = replace(room[0], unbounded=False, guessed=False)
+    scene = replace(room[0], guessed=False)
     config = wn.TrainConfig(model="rgb", steps=2000, threads=1, grid=wn.GridConfig(voxels=12**3))
     assert prepare_trainer(scene, config).observed is None
 

@@ -1,11 +1,11 @@
 """Estimation of a scene's extent before its training, by a short one if need be.
 
 Not every capture brings points, and cameras tell little: what they look at is nearer than most of
-what they see, and where they look outward, or in parallel directions, there is no such thing. Most
-photographs tell it by a plane sweep (``warpnerf.scenes.extent.swept``). Those that do not, for want
-of texture, say, are trained on for a moment, in a box that may be several times too small, with all
-space around it contracted. What half of the light of a ray has met is a point of the scene; what
-points tell, these tell (``warpnerf.scenes.extent.points.observed_extent``).
+what they see, and where they look outward, or in parallel directions, there is no such thing. There
+most photographs tell it by a plane sweep (``warpnerf.scenes.extent.swept``). Others are trained on
+for a moment, in a box that may be several times too small, with all space around it contracted.
+What half of the light of a ray has met is a point of the scene; what points tell, these tell
+(``warpnerf.scenes.extent.points.observed_extent``).
 
 Where cameras look at a common point, the box stays around that: what lies behind it is seen, too,
 but is not what the box is for. Elsewhere the box is found as well, and a second round begins with
@@ -89,7 +89,7 @@ def prepare_trainer(
     config = plan.config
     require_room(plan, Workers(config.device, config.threads).device)
     observed, seconds = None, 0.0
-    if scene.unbounded:  # in a box that is known a short training is nearer to the truth
+    if scene.unbounded and scene.guessed:  # in a box that is about right a training tells it better
         observed = peers.from_first(lambda: extent_by_sweep(scene))
     if observed is None:
         observed, seconds = extent_by_training(scene, plan, on_progress, peers)
