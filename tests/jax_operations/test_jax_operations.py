@@ -87,16 +87,19 @@ def test_scale_gradient_under_vmap() -> None:
 # --- Rendering ----------------------------------------------------------------------------------
 
 
-def call(p: Problem, raw: Any, scaling: Any = "none", **changes: Any) -> wj.RenderedRays:
-    """render_rays on a problem, in raw's type."""
+def call(
+    p: Problem, raw: Any, scaling: Any = "none", like: Any = None, **changes: Any
+) -> wj.RenderedRays:
+    """render_rays on a problem, in the type of raw, or of another array."""
+    dtype = (raw if like is None else like).dtype
     options: dict[str, Any] = {
         "density_shift": p.density_shift,
-        "background": jnp.asarray(p.background, raw.dtype),
+        "background": jnp.asarray(p.background, dtype),
         "scaling": scaling,
-        "content_distance": jnp.asarray(p.content_distance, raw.dtype),
+        "content_distance": jnp.asarray(p.content_distance, dtype),
     }
-    rays = jnp.asarray(p.origins, raw.dtype), jnp.asarray(p.directions, raw.dtype)
-    box = p.box_min.astype(raw.dtype), p.box_max.astype(raw.dtype)
+    rays = jnp.asarray(p.origins, dtype), jnp.asarray(p.directions, dtype)
+    box = p.box_min.astype(dtype), p.box_max.astype(dtype)
     march = wj.March(p.steps.step, p.steps.near, p.steps.far)
     return wj.render_rays(raw, *rays, box, march, **options | changes)
 

@@ -32,6 +32,7 @@ import host_exports
 import host_folders
 import host_formats
 import host_measures
+import host_operations
 import host_output
 import host_runs
 import host_scenes
@@ -70,6 +71,7 @@ MUTANTS = (
     *host_formats.MUTANTS,
     *host_output.MUTANTS,
     *host_measures.MUTANTS,
+    *host_operations.MUTANTS,
     *host_runs.MUTANTS,
     *host_command.MUTANTS,
     *host_exports.MUTANTS,

@@ -7,7 +7,7 @@ hold of it.
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import warp as wp
@@ -199,19 +199,25 @@ class ColumnStorage(Storage):
         return cls.from_tensors(kind, model, lattice, tensors, device)
 
     @classmethod
-    def from_tensors(
+    def shapes(
+        cls, kind: storage_kinds.StorageKind, model: Model, lattice: Lattice
+    ) -> dict[str, tuple[int, ...]]:
+        return {
+            "values": (*lattice.size, WIDTH),
+            "row": (lattice.size[2], WIDTH),
+            "matrix": (9,),
+        }
+
+    @classmethod
+    def over(
         cls,
         kind: storage_kinds.StorageKind,
         model: Model,
         lattice: Lattice,
-        tensors: dict[str, np.ndarray],
-        device: wp.Device,
-    ) -> "ColumnStorage":
-        if tensors["row"].shape != (lattice.size[2], WIDTH) or tensors["matrix"].shape != (9,):
-            raise ValueError("row or matrix have another shape")
-        grid = DenseGrid.from_tensors(storage_kinds.DENSE, model, lattice, tensors, device)
-        row = wp.array(tensors["row"], dtype=wp.types.vector(WIDTH, wp.float32), device=device)
-        matrix = wp.array(tensors["matrix"], dtype=wp.float32, device=device)
+        arrays: Mapping[str, wp.array],
+    ) -> Self:
+        grid = DenseGrid.over(storage_kinds.DENSE, model, lattice, arrays)
+        row, matrix = arrays["row"], arrays["matrix"]
         return cls(kind=kind, lattice=lattice, grid=grid, row=row, matrix=matrix)
 
     def tensors(self) -> dict[str, np.ndarray]:
@@ -231,8 +237,12 @@ class ColumnStorage(Storage):
 
     @cached_property
     def struct(self) -> Any:
-        struct = self.encoding.Params()
-        struct.grid, struct.row, struct.matrix = self.grid.struct, self.row, self.matrix
+        return self.struct_in(loader("float32"), Workers("cpu", 1))
+
+    def struct_in(self, load: Load, workers: Workers) -> Any:
+        struct = encoding(load).Params()
+        struct.grid = self.grid.struct_in(load, workers)
+        struct.row, struct.matrix = self.row, self.matrix
         return struct
 
     def parameters(self, model: Model, optim: OptimConfig) -> tuple[Parameter, ...]:

@@ -16,11 +16,14 @@ def problem(seed: int, **changes: Any) -> Problem:
     return make_problem(seed, steps=steps, **changes)
 
 
-def call(p: Problem, raw: Tensor, scaling: Any = "none", **changes: Any) -> RenderedRays:
-    """render_rays on a problem, in raw's type and on its device."""
+def call(
+    p: Problem, raw: Any, scaling: Any = "none", like: Tensor | None = None, **changes: Any
+) -> RenderedRays:
+    """render_rays on a problem, in the type of raw, or of another tensor, and on its device."""
+    given: Tensor = raw if like is None else like
 
     def like_raw(values: Any) -> Tensor:
-        return torch.tensor(values, dtype=raw.dtype, device=raw.device)
+        return torch.tensor(values, dtype=given.dtype, device=given.device)
 
     march = {name: changes.pop(name) for name in ("step", "near", "far") if name in changes}
     options: dict[str, Any] = {

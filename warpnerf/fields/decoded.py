@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -44,22 +43,20 @@ class Decoded(ReadAtNodes):
     @cached_property
     def struct(self) -> Any:
         """Its arrays as kernels take them."""
-        return self._struct(wp.zeros((0, 0), dtype=real, device=self.decoder.device))
+        struct = self.own_struct(loader("float32"))
+        struct.transposed = wp.zeros((0, 0), dtype=real, device=self.decoder.device)
+        return struct
 
-    def struct_for(self, workers: Workers) -> Any:
+    def struct_in(self, load: Load, workers: Workers) -> Any:
         """The same, and a transposed decoder of each worker."""
-        return self._struct(zero_weights(self.n_transposed, workers))
-
-    def _struct(self, transposed: wp.array) -> Any:
-        arrays = {name: getattr(self, name) for name in self.kind.rules}
-        return self.struct_with(loader("float32"), arrays, transposed)
+        struct = self.own_struct(load)
+        struct.transposed = zero_weights(self.n_transposed, workers, load("base.types").real)
+        return struct
 
     @abstractmethod
-    def struct_with(self, load: Load, arrays: Mapping[str, wp.array], transposed: wp.array) -> Any:
-        """Arrays like its own as kernels take them.
+    def own_struct(self, load: Load) -> Any:
+        """Its arrays as kernels take them, without the transposed decoder.
 
         Args:
             load: The kernels' modules, in the precision of the arrays.
-            arrays: As long as its own, by the names of the kind's ``rules``.
-            transposed: [n_workers, n_transposed or more] scratch of the vector form.
         """

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from types import ModuleType
+from typing import Any, Self
 
 import numpy as np
 import warp as wp
@@ -23,10 +25,9 @@ from warpnerf.fields.storage import (
     Storage,
     TrainedOn,
     allocate_nodes,
-    require_shapes,
 )
 from warpnerf.fields.total_variation import TotalVariation, tv_weights
-from warpnerf.model.interface import Model
+from warpnerf.model.interface import Load, Model
 from warpnerf.model.storage_kinds import DENSE, StorageKind
 from warpnerf.optim_config import OptimConfig
 from warpnerf.runtime.parallel import Workers
@@ -50,19 +51,18 @@ class DenseGrid(Storage):
         return cls(lattice=lattice, values=values)
 
     @classmethod
-    def from_tensors(
-        cls,
-        kind: StorageKind,
-        model: Model,
-        lattice: Lattice,
-        tensors: dict[str, np.ndarray],
-        device: wp.Device,
-    ) -> DenseGrid:
-        """From [X, Y, Z, n_floats] values."""
-        require_shapes(tensors, {"values": (*lattice.size, model.n_floats)})
-        nodes = allocate_nodes(math.prod(lattice.size), vector(model.n_floats), device)
-        nodes.assign(tensors["values"].reshape(-1, model.n_floats))
-        return cls(lattice=lattice, values=nodes)
+    def shapes(
+        cls, kind: StorageKind, model: Model, lattice: Lattice
+    ) -> dict[str, tuple[int, ...]]:
+        """[X, Y, Z, n_floats] values."""
+        return {"values": (*lattice.size, model.n_floats)}
+
+    @classmethod
+    def over(
+        cls, kind: StorageKind, model: Model, lattice: Lattice, arrays: Mapping[str, wp.array]
+    ) -> Self:
+        """Of values."""
+        return cls(lattice=lattice, values=arrays["values"])
 
     def tensors(self) -> dict[str, np.ndarray]:
         """Its values, [X, Y, Z, n_floats]."""
@@ -87,7 +87,14 @@ class DenseGrid(Storage):
     @cached_property
     def struct(self) -> Any:
         """The grid as kernels take it."""
-        return grid_struct(dense, self.values, self.lattice.size, self.lattice.border)
+        return self._struct(dense)
+
+    def struct_in(self, load: Load, workers: Workers) -> Any:
+        """The same: workers lay nothing out."""
+        return self._struct(load("fields.dense"))
+
+    def _struct(self, module: ModuleType) -> Any:
+        return grid_struct(module, self.values, self.lattice.size, self.lattice.border)
 
     def node_densities(self, workers: Workers) -> wp.array:
         """Its values."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import warp as wp
@@ -20,7 +20,7 @@ from warpnerf.fields.factor_terms import FactorTerms
 from warpnerf.fields.gradients import Gradients, zero_entries, zero_head_weights, zero_weights
 from warpnerf.fields.lattice import Lattice
 from warpnerf.fields.parameters import Parameter
-from warpnerf.fields.storage import Regulariser, Storage, TrainedOn, allocate_nodes, require_shapes
+from warpnerf.fields.storage import Regulariser, Storage, TrainedOn, allocate_nodes
 from warpnerf.model.interface import Load, Model
 from warpnerf.model.storage_kinds import StorageKind, Vm
 from warpnerf.optim_config import OptimConfig
@@ -65,37 +65,30 @@ class Factors(Decoded):
         return cls.from_tensors(kind, model, lattice, tensors, device)
 
     @classmethod
-    def from_tensors(
-        cls,
-        kind: StorageKind,
-        model: Model,
-        lattice: Lattice,
-        tensors: dict[str, np.ndarray],
-        device: wp.Device,
-    ) -> Factors:
-        """From [X Y + X Z + Y Z, width] planes, [Z + Y + X, width] lines, and the decoder."""
+    def shapes(
+        cls, kind: StorageKind, model: Model, lattice: Lattice
+    ) -> dict[str, tuple[int, ...]]:
+        """[X Y + X Z + Y Z, width] planes, [Z + Y + X, width] lines, and the decoder."""
         assert isinstance(kind, Vm)
-        shapes = {
+        return {
             "planes": (_n_entries(lattice), kind.width),
             "lines": (sum(lattice.size), kind.width),
             "decoder": (3 * kind.width, factors.columns_of(model.n_floats)),
         }
-        require_shapes(tensors, shapes)
-        planes = allocate_nodes(shapes["planes"][0], vector(kind.width), device)
-        planes.assign(tensors["planes"])
-        lines, decoder = (
-            wp.array(tensors[name].ravel(), dtype=real, device=device)
-            for name in ("lines", "decoder")
-        )
+
+    @classmethod
+    def over(
+        cls, kind: StorageKind, model: Model, lattice: Lattice, arrays: Mapping[str, wp.array]
+    ) -> Self:
+        """Of planes, lines and decoder."""
+        assert isinstance(kind, Vm)
         return cls(
             kind=kind,
             lattice=lattice,
             n_floats=model.n_floats,
             n_decoded=1 + model.n_features,
             by_sample=model.by_sample,
-            planes=planes,
-            lines=lines,
-            decoder=decoder,
+            **arrays,
         )
 
     def tensors(self) -> dict[str, np.ndarray]:
@@ -119,13 +112,12 @@ class Factors(Decoded):
         """Products of planes and lines, decoded."""
         return factors.factors(self.kind.width, self.n_floats, self.n_decoded, self.by_sample)
 
-    def struct_with(self, load: Load, arrays: Mapping[str, wp.array], transposed: wp.array) -> Any:
+    def own_struct(self, load: Load) -> Any:
         """Planes, lines and decoder as kernels take them."""
         lattice, middle = self.lattice, 0.5 * (np.array(self.lattice.size) - 1)
         struct = load("fields.factors").factors_type(self.kind.width)()
-        for name, array in arrays.items():
-            setattr(struct, name, array)
-        struct.transposed, vec3 = transposed, load("base.types").vec3
+        struct.planes, struct.lines, struct.decoder = self.planes, self.lines, self.decoder
+        vec3 = load("base.types").vec3
         struct.size = wp.vec3i(*lattice.size)
         struct.to_nodes = vec3(*(middle / (1.0 + lattice.border)))
         struct.middle = vec3(*middle)

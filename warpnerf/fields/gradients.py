@@ -97,10 +97,10 @@ def zero_entries(
     return {"values": values, "touched": touched}
 
 
-def zero_weights(n: int, workers: Workers) -> wp.array:
+def zero_weights(n: int, workers: Workers, dtype: Any = real) -> wp.array:
     """No gradient yet of shared weights: a row for each worker, of whole cache lines."""
     row = -(-n // LANES) * LANES
-    return wp.zeros((workers.count, row), dtype=real, device=workers.device)
+    return wp.zeros((workers.count, row), dtype=dtype, device=workers.device)
 
 
 def zero_head_weights(model: Model, workers: Workers) -> dict[str, wp.array]:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import warp as wp
 from warpnerf_kernels.base.parts import Encoding
-from warpnerf_kernels.base.types import real, vector
+from warpnerf_kernels.base.types import vector
 from warpnerf_kernels.fields import hashed
 from warpnerf_kernels.fields.decoder import columns_of, padded
 from warpnerf_kernels.optim import adam
@@ -19,7 +19,7 @@ from warpnerf.fields.decoded import Decoded
 from warpnerf.fields.gradients import Gradients, zero_entries, zero_head_weights, zero_weights
 from warpnerf.fields.lattice import Lattice
 from warpnerf.fields.parameters import Parameter
-from warpnerf.fields.storage import Storage, allocate_nodes, require_shapes
+from warpnerf.fields.storage import Storage, allocate_nodes
 from warpnerf.model.interface import Load, Model
 from warpnerf.model.storage_kinds import Hash, StorageKind
 from warpnerf.optim_config import OptimConfig
@@ -101,36 +101,37 @@ class Hashed(Decoded):
         return cls.from_tensors(kind, model, lattice, tensors, device)
 
     @classmethod
-    def from_tensors(
-        cls,
-        kind: StorageKind,
-        model: Model,
-        lattice: Lattice,
-        tensors: dict[str, np.ndarray],
-        device: wp.Device,
-    ) -> Hashed:
-        """From [n_entries, features] values, the hidden layer if there is one, and the decoder."""
+    def shapes(
+        cls, kind: StorageKind, model: Model, lattice: Lattice
+    ) -> dict[str, tuple[int, ...]]:
+        """[n_entries, features] values, the hidden layer if there is one, and the decoder."""
         assert isinstance(kind, Hash)
         n_inputs = kind.levels * kind.features
-        shapes = {
+        shapes: dict[str, tuple[int, ...]] = {
             "values": (level_shapes(kind, lattice)[-1].end, kind.features),
             "decoder": (kind.hidden or n_inputs, columns_of(model.n_floats)),
         }
         if kind.hidden:
             shapes["hidden"] = (n_inputs, kind.hidden)
-        require_shapes(tensors, shapes)
-        values = allocate_nodes(shapes["values"][0], vector(kind.features), device)
-        values.assign(tensors["values"])
-        hidden = tensors.get("hidden", np.zeros(0, np.float32))
+        return shapes
+
+    @classmethod
+    def over(
+        cls, kind: StorageKind, model: Model, lattice: Lattice, arrays: Mapping[str, wp.array]
+    ) -> Self:
+        """Of entries, the hidden layer if there is one, and the decoder."""
+        assert isinstance(kind, Hash)
+        decoder = arrays["decoder"]
+        none = wp.empty(0, dtype=decoder.dtype, device=decoder.device)
         return cls(
             kind=kind,
             lattice=lattice,
             n_floats=model.n_floats,
             n_decoded=1 + model.n_features,
             by_sample=model.by_sample,
-            values=values,
-            hidden=wp.array(hidden.ravel(), dtype=real, device=device),
-            decoder=wp.array(tensors["decoder"].ravel(), dtype=real, device=device),
+            values=arrays["values"],
+            hidden=arrays.get("hidden", none),
+            decoder=decoder,
         )
 
     def tensors(self) -> dict[str, np.ndarray]:
@@ -170,13 +171,12 @@ class Hashed(Decoded):
         finest = 1.01 * self.kind.finest / max(1.0, wider)
         return max(1, sum(n <= finest for n in self.kind.resolutions))
 
-    def struct_with(self, load: Load, arrays: Mapping[str, wp.array], transposed: wp.array) -> Any:
+    def own_struct(self, load: Load) -> Any:
         """Entries and decoder as kernels take them, and levels."""
         module = load("fields.hashed")
         struct = module.hash_type(self.kind.features)()
-        for name, array in arrays.items():
-            setattr(struct, name, array)
-        struct.transposed = transposed
+        struct.values, struct.decoder = self.values, self.decoder
+        struct.hidden = self.hidden
         levels = [self._level(load, shape) for shape in level_shapes(self.kind, self.lattice)]
         struct.levels = wp.array(levels, dtype=module.Level, device=self.decoder.device)
         struct.n_active, struct.width = self.n_active, self.kind.features

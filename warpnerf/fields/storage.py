@@ -11,10 +11,10 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from types import ModuleType
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 import numpy as np
 import warp as wp
@@ -30,7 +30,7 @@ from warpnerf.fields.gradients import Gradients
 from warpnerf.fields.lattice import Lattice, grid_struct
 from warpnerf.fields.parameters import Parameter
 from warpnerf.grid_config import MAX_VOXELS
-from warpnerf.model.interface import Model, loader
+from warpnerf.model.interface import Load, Model, loader
 from warpnerf.model.storage_kinds import StorageKind
 from warpnerf.optim_config import OptimConfig
 from warpnerf.runtime.memory import prefer_large_pages, processes_here, usable_memory
@@ -104,6 +104,28 @@ class Storage(ABC):
 
     @classmethod
     @abstractmethod
+    def shapes(
+        cls, kind: StorageKind, model: Model, lattice: Lattice
+    ) -> dict[str, tuple[int, ...]]:
+        """Shapes of ``tensors``; see ``first``."""
+
+    @classmethod
+    @abstractmethod
+    def over(
+        cls, kind: StorageKind, model: Model, lattice: Lattice, arrays: Mapping[str, wp.array]
+    ) -> Self:
+        """A storage of arrays that are there already, without density_shift and density_scale.
+
+        Args:
+            kind: How it is configured.
+            model: What they hold.
+            lattice: Of the field.
+            arrays: By name, in the shapes of ``shapes`` but flat: vectors as long as the last
+                dimension where the kind's rule is nodes, else numbers. In float32, but for
+                ``struct_in``, which takes any precision.
+        """
+
+    @classmethod
     def from_tensors(
         cls,
         kind: StorageKind,
@@ -111,12 +133,22 @@ class Storage(ABC):
         lattice: Lattice,
         tensors: dict[str, np.ndarray],
         device: wp.Device,
-    ) -> Storage:
+    ) -> Self:
         """What ``tensors`` gave, without density_shift and density_scale.
 
         Raises:
             ValueError: Shapes or types do not fit.
         """
+        require_shapes(tensors, shapes := cls.shapes(kind, model, lattice))
+        arrays = {}
+        for name, shape in shapes.items():
+            tensor, width = tensors[name], shape[-1]
+            if kind.rules.get(name) == "nodes":
+                arrays[name] = allocate_nodes(tensor.size // width, vector(width), device)
+                arrays[name].assign(tensor.reshape(-1, width))
+            else:
+                arrays[name] = wp.array(tensor.ravel(), dtype=real, device=device)
+        return cls.over(kind, model, lattice, arrays)
 
     @abstractmethod
     def tensors(self) -> dict[str, np.ndarray]:
@@ -130,6 +162,10 @@ class Storage(ABC):
             device: Where they lie.
         """
 
+    def as_final(self) -> Storage:
+        """The same as if its lattice were the last one of a training: all of it is read."""
+        return replace(self, density_scale=1.0 / float(self.lattice.voxel_size.min()))
+
     # --- How it is read -----------------------------------------------------------------------
 
     @property
@@ -142,13 +178,15 @@ class Storage(ABC):
     def struct(self) -> Any:
         """Its arrays as kernels take them: the encoding's ``Params``."""
 
-    def struct_for(self, workers: Workers) -> Any:
-        """The same with what each worker lays out again in a launch, by ``EncodingVectors.begin``.
+    @abstractmethod
+    def struct_in(self, load: Load, workers: Workers) -> Any:
+        """The same in the precision of its arrays, with what each worker lays out again in a
+        launch, by ``EncodingVectors.begin``.
 
         Args:
+            load: The kernels' modules, in that precision.
             workers: Those that will be launched.
         """
-        return self.struct
 
     @cached_property
     def density(self) -> Density:

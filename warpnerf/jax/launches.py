@@ -5,158 +5,138 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable
 from functools import cache, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
 import warp as wp
 
-from warpnerf.checks import require_rays
-from warpnerf.config import Scaling
-from warpnerf.model.interface import Model
+from warpnerf.checks import InputError, require_rays
 from warpnerf.rendering.arguments import require_reach
 from warpnerf.rendering.operation import Inputs, Operation, Outputs
-from warpnerf.rendering.steps import Steps
 
 
-class Call(NamedTuple):
-    """What a rendering depends on besides arrays; known while functions are traced."""
-
-    corners: tuple[tuple[float, ...], tuple[float, ...]]
-    steps: Steps
-    density_shift: float
-    scaling: Scaling
-    model: Model
-    precision: str
-    size: tuple[int, int, int]
-
-    def operation(self, device: str) -> Operation:
-        """The launches on a device."""
-        lower, upper = (np.array(corner, np.float64) for corner in self.corners)
-        return Operation(
-            model=self.model,
-            precision=self.precision,
-            device=device,
-            size=self.size,
-            corners=(lower, upper),
-            steps=self.steps,
-            density_shift=self.density_shift,
-            scaling=self.scaling,
-        )
-
-
-def require_visible(call: Call, origins: np.ndarray, directions: np.ndarray) -> None:
+def require_visible(operation: Operation, origins: np.ndarray, directions: np.ndarray) -> None:
     """Raise InputError unless rays are of finite numbers, of unit length, and near enough."""
     require_rays(origins, directions)
-    lower, upper = (np.array(corner) for corner in call.corners)
-    distances = np.linalg.norm(origins - (lower + upper) / 2, axis=1)
-    reach = distances.max(initial=0.0) + np.linalg.norm(upper - lower)
-    require_reach(float(reach), call.steps.step, call.precision)
+    if operation.n_intervals:
+        return
+    lattice = operation.layout.lattice
+    distances = np.linalg.norm(origins - (lattice.box_min + lattice.box_max) / 2, axis=1)
+    reach = float(distances.max(initial=0.0)) + lattice.diagonal
+    require_reach(reach, operation.steps.step, operation.precision)
+
+
+def require_rising(edges: np.ndarray) -> None:
+    """Raise InputError unless edges of intervals are distances in rising order."""
+    rising = (edges[:, 1:] >= edges[:, :-1]).all() and (edges[:, 0] >= 0.0).all()
+    if not (np.isfinite(edges).all() and rising):
+        raise InputError("edges must be finite distances of 0 or above, in rising order.")
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
-def render(call: Call, *arrays: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Rgb, opacity and depth of the rays; gradients are those of raw and weights.
+def render(operation: Operation, *arrays: jax.Array) -> tuple[jax.Array, ...]:
+    """Rgb, opacity and depth of the rays, and what samples in intervals weigh; gradients are those
+    of what is stored and of weights.
 
     Args:
-        call: What is no array.
-        arrays: As the fields of ``Inputs``: raw [X, Y, Z, n_floats], weights [n_weights], origins
-            and directions [n_rays, 3], background [n_rays or 1, 3], content distances
-            [n_rays or 1], in the call's precision.
+        operation: What is no array.
+        arrays: What is stored, in the order of the layout, flat: [n, width] or [n]. Then as the
+            other fields of ``Inputs``: weights [n_weights], origins and directions [n_rays, 3],
+            background [n_rays or 1, 3], content distances [n_rays or 1] and edges
+            [n_rays, n_intervals + 1], in the operation's precision.
     """
-    return _seen(_forward(call, arrays))
+    return _seen(_forward(operation, arrays))
 
 
-def _render_forward(call: Call, *arrays: jax.Array) -> tuple[Any, Any]:
-    outputs = _forward(call, arrays)
-    return _seen(outputs), (arrays, outputs)
+def _render_forward(operation: Operation, *arrays: jax.Array) -> tuple[Any, Any]:
+    outputs = _forward(operation, arrays)
+    return _seen(outputs), (arrays, outputs[:-1])
 
 
-def _render_backward(call: Call, kept: Any, gradients: Any) -> tuple[Any, ...]:
+def _render_backward(operation: Operation, kept: Any, gradients: Any) -> tuple[Any, ...]:
     arrays, outputs = kept
-    shapes = {"raw_gradient": arrays[0].shape[:3], "weights_gradient": arrays[1].shape}
-    of_raw, of_weights = _calls(call)[1](*arrays, *outputs, *gradients, output_dims=shapes)
-    return of_raw, of_weights, None, None, None, None
+    n_learned = len(operation.layout.arrays) + 1
+    names = [f"gradient_{n}" for n in range(n_learned)]
+    dims = {name: array.shape[:1] for name, array in zip(names, arrays, strict=False)}
+    found = _calls(operation)[1](*arrays, *outputs, *gradients[:3], output_dims=dims)
+    return *found, *[None] * (len(arrays) - n_learned)
 
 
 render.defvjp(_render_forward, _render_backward)
 
 
-def _forward(call: Call, arrays: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-    return tuple(_calls(call)[0](*arrays, output_dims=(arrays[2].shape[0],)))
+def _forward(operation: Operation, arrays: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+    n = arrays[-1].shape[0]
+    dims: dict[str, tuple[int, ...]] = dict.fromkeys(Outputs._fields, (n,))
+    dims["interval_weights"] = n, operation.n_intervals
+    return tuple(_calls(operation)[0](*arrays, output_dims=dims))
 
 
-def _seen(outputs: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array, jax.Array]:
-    rgb, transmittance, depth, *_ = outputs
-    return rgb, 1.0 - transmittance, depth
+def _seen(outputs: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+    rgb, transmittance, depth, *_, interval_weights = outputs
+    return rgb, 1.0 - transmittance, depth, interval_weights
 
 
 @cache
-def _calls(call: Call) -> tuple[Any, Any]:
+def _calls(operation: Operation) -> tuple[Any, Any]:
     """Both passes of a rendering, as Warp registers them with XLA."""
-    operation = call.operation("cpu")
-    types = operation.types
-    node, channels = types.vector(call.model.n_floats), types.vector(operation.n_channels)
-    of_inputs = {
-        "raw": wp.array3d(dtype=node),
-        "weights": wp.array(dtype=types.real),
-        "origins": wp.array(dtype=types.vec3),
-        "directions": wp.array(dtype=types.vec3),
-        "background": wp.array(dtype=types.vec3),
-        "content_distance": wp.array(dtype=types.real),
+    types, arrays = operation.types, operation.layout.arrays
+    number, vec3 = wp.array(dtype=types.real), wp.array(dtype=types.vec3)
+    of_stored = {
+        f"stored_{name}": number
+        if array.width is None
+        else wp.array(dtype=types.vector(array.width))
+        for name, array in arrays.items()
+    }
+    of_inputs = of_stored | {
+        "weights": number,
+        "origins": vec3,
+        "directions": vec3,
+        "background": vec3,
+        "content_distance": number,
+        "edges": wp.array2d(dtype=types.real),
     }
     of_outputs = {
-        "rgb": wp.array(dtype=types.vec3),
-        "transmittance": wp.array(dtype=types.real),
-        "depth": wp.array(dtype=types.real),
+        "rgb": vec3,
+        "transmittance": number,
+        "depth": number,
         "n_samples": wp.array(dtype=wp.int32),
-        "channels": wp.array(dtype=channels),
+        "channels": wp.array(dtype=types.vector(operation.n_channels)),
     }
-    of_gradients = {
-        "rgb_gradient": of_outputs["rgb"],
-        "opacity_gradient": of_outputs["transmittance"],
-        "depth_gradient": of_outputs["depth"],
-        "raw_gradient": of_inputs["raw"],
-        "weights_gradient": of_inputs["weights"],
-    }
+    of_pulled = {"pulled_rgb": vec3, "pulled_opacity": number, "pulled_depth": number}
+    of_gradients = {f"gradient_{n}": kind for n, kind in enumerate((*of_stored.values(), number))}
     n_in, n_out = len(of_inputs), len(of_outputs)
 
     def forward(*given: wp.array) -> None:
-        inputs = _inputs(call, given[:n_in])
-        _operation(call, given[0]).forward(inputs, Outputs(*given[n_in:]))
+        *seen, interval_weights = given[n_in:]
+        interval_weights.zero_()
+        operation.forward(_inputs(operation, given[:n_in]), Outputs(*seen), interval_weights)
 
     def backward(*given: wp.array) -> None:
-        inputs, outputs = _inputs(call, given[:n_in]), Outputs(*given[n_in : n_in + n_out])
-        *gradients, of_raw, of_weights = given[n_in + n_out :]
-        operation = _operation(call, of_raw)
-        launch = operation.adjoint(inputs.origins.shape[0])
-        rows = launch.workers.count, of_weights.shape[0]
-        of_workers = wp.zeros(rows, dtype=types.real, device=of_raw.device)
-        touched = wp.zeros(operation.n_tiles, dtype=wp.uint8, device=of_raw.device)
-        of_raw.zero_()
-        nodes = of_raw.flatten()
-        operation.backward(launch, inputs, outputs, tuple(gradients), nodes, touched, of_workers)
-        if launch.workers.count == 1:
-            wp.copy(of_weights, of_workers.flatten())
-        else:  # on the CPU
-            of_workers.numpy().sum(axis=0, out=of_weights.numpy())
+        inputs, outputs = _inputs(operation, given[:n_in]), Outputs(*given[n_in : n_in + n_out])
+        rgb, opacity, depth, *stored, weights = given[n_in + n_out :]
+        for gradient in stored:
+            gradient.zero_()
+        named = dict(zip(arrays, stored, strict=True))
+        operation.backward(inputs, outputs, (rgb, opacity, depth), named, weights)
 
+    of_interval_weights = {"interval_weights": wp.array2d(dtype=types.real)}
     return (
-        _registered(forward, of_inputs | of_outputs, n_out),
-        _registered(backward, of_inputs | of_outputs | of_gradients, 2),
+        _registered(forward, of_inputs | of_outputs | of_interval_weights, n_out + 1),
+        _registered(backward, of_inputs | of_outputs | of_pulled | of_gradients, len(of_gradients)),
     )
 
 
-def _operation(call: Call, raw: wp.array) -> Operation:
-    return call.operation(str(raw.device))
-
-
-def _inputs(call: Call, given: tuple[wp.array, ...]) -> Inputs:
+def _inputs(operation: Operation, given: tuple[wp.array, ...]) -> Inputs:
     """Arrays as kernels take them; on the CPU, rays are looked at, whose values JAX did not know
     when a function was traced."""
-    inputs = Inputs(given[0].flatten(), *given[1:])
-    if not inputs.raw.device.is_cuda:
-        require_visible(call, inputs.origins.numpy(), inputs.directions.numpy())
+    names = operation.layout.arrays
+    inputs = Inputs(dict(zip(names, given, strict=False)), *given[len(names) :])
+    if not inputs.origins.device.is_cuda:
+        require_visible(operation, inputs.origins.numpy(), inputs.directions.numpy())
+        if operation.n_intervals:
+            require_rising(inputs.edges.numpy())
     return inputs
 
 

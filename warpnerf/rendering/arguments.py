@@ -9,9 +9,9 @@ import numpy as np
 
 from warpnerf.checked import fits
 from warpnerf.checks import InputError, is_finite, require_at_least, require_positive, said
-from warpnerf.grid_config import MAX_VOXELS
 from warpnerf.model.interface import Model, loader
 from warpnerf.model.models import model_of
+from warpnerf.model.sampler_kinds import MOST
 from warpnerf.rendering.steps import MOST_LINEAR, Steps
 
 MAX_STEPS = {"float32": MOST_LINEAR, "float64": 10**9}
@@ -117,18 +117,18 @@ def require_ascending(corners: tuple[np.ndarray, np.ndarray]) -> None:
         )
 
 
-def require_nodes(shape: Sequence[int], model: Model) -> None:
-    """Raise InputError unless an array of that shape is a grid of the model's nodes."""
-    numbers = 1 + model.n_features
-    if len(shape) != 4 or shape[3] != numbers or min(shape[:3]) < 2:
+def require_intervals(shape: Sequence[int], n_rays: int) -> None:
+    """Raise InputError unless an array of that shape has the edges of intervals of rays."""
+    if len(shape) != 2 or shape[0] != n_rays or not 2 <= shape[1] - 1 <= MOST:
         raise InputError(
-            f"raw must be [X, Y, Z, {numbers}] with at least two nodes along each axis, "
-            f"not {list(shape)}."
+            f"edges must be [n_rays, n + 1] of n intervals each, from 2 to {MOST}, of {n_rays} "
+            f"rays, not {list(shape)}."
         )
-    if math.prod(shape[:3]) >= MAX_VOXELS:
-        raise InputError(
-            f"raw must have fewer than {MAX_VOXELS} nodes, not {math.prod(shape[:3])}."
-        )
+
+
+def steps_of_intervals() -> Steps:
+    """How intervals are walked through: all of them, in steps of their own."""
+    return Steps(near=0.0, far=1e30, step=1.0)
 
 
 def require_reach(reach: float, step: float, precision: str) -> None:

@@ -6,37 +6,45 @@ CUDA launches go to Warp's current stream: who works on another one sets it.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from types import ModuleType
 from typing import Any, NamedTuple
 
-import numpy as np
 import warp as wp
 
 from warpnerf.config import Scaling
-from warpnerf.fields.gradients import gradient_struct, n_tiles
-from warpnerf.fields.lattice import box_struct, grid_struct
+from warpnerf.fields.gradients import n_tiles, zero_weights
+from warpnerf.fields.lattice import box_struct
 from warpnerf.fields.occupancy import free_struct
-from warpnerf.fields.storage import density_struct
-from warpnerf.model.interface import Load, Model, loader
+from warpnerf.fields.storage import Storage, density_struct
+from warpnerf.fields.storages import class_of
+from warpnerf.model.interface import Load, loader
+from warpnerf.model.sampler_kinds import MARCHED, Resampled
+from warpnerf.optim_config import OptimConfig
 from warpnerf.rendering.adjoint import AdjointLaunch
+from warpnerf.rendering.proposal import Intervals
 from warpnerf.rendering.rays import rays_struct
 from warpnerf.rendering.steps import Steps
+from warpnerf.rendering.stored import Layout
 from warpnerf.rendering.structs import (
+    AnySteps,
     FieldStructs,
+    most_samples,
     render_params_struct,
     scratch_struct,
     variant_of,
 )
+from warpnerf.runtime import kernel_cache
 from warpnerf.runtime.parallel import Workers
 
 
 class Inputs(NamedTuple):
     """What is rendered, in the operation's precision and on its device."""
 
-    raw: wp.array
-    """[n_nodes] vectors: raw density, raw features."""
+    stored: Mapping[str, wp.array]
+    """What the field stores, by name, as ``Layout.arrays`` says."""
     weights: wp.array
     """[n_weights] of the model's head."""
     origins: wp.array
@@ -47,6 +55,8 @@ class Inputs(NamedTuple):
     """[n_rays] or [1] vec3, rgb."""
     content_distance: wp.array
     """[n_rays] or [1], scene units."""
+    edges: wp.array
+    """[n_rays, n_intervals + 1] in rising order, scene units; anything where rays are marched."""
 
 
 class Outputs(NamedTuple):
@@ -64,22 +74,21 @@ class Outputs(NamedTuple):
     """[n_rays] vectors of ``Operation.n_channels``, what was accumulated along the ray."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True)
 class Operation:
-    """What a rendering depends on besides arrays: rays through a dense grid in a box."""
+    """What a rendering depends on besides arrays: rays through a field in a box.
 
-    model: Model
-    """What the grid holds, and how that becomes colour."""
+    Where the arrays of a call are, on the CPU or on a CUDA device, its launches are.
+    """
+
+    layout: Layout
+    """How the field is stored."""
     precision: str
     """float32 or float64."""
-    device: str
-    """Where the arrays are: cpu, cuda:0, ..."""
-    size: tuple[int, int, int]
-    """Nodes of the grid along each axis."""
-    corners: tuple[np.ndarray, np.ndarray]
-    """[3] each of the box, scene units."""
     steps: Steps
-    """How rays are marched."""
+    """How rays are marched; of this, near and far alone count for intervals."""
+    n_intervals: int
+    """Of each ray, with a sample in the middle of each; 0: rays are marched."""
     density_shift: float
     """Added to raw densities before their activation."""
     scaling: Scaling
@@ -87,7 +96,7 @@ class Operation:
 
     def __post_init__(self) -> None:
         """Start Warp, without which no memory can be passed."""
-        workers_of(self.device)
+        kernel_cache.start()
 
     @property
     def types(self) -> ModuleType:
@@ -99,75 +108,81 @@ class Operation:
         """Numbers of a ray that are accumulated along it."""
         return int(self._variant("none").parts.head.n_channels)
 
-    @property
-    def n_tiles(self) -> int:
-        """Flags that ``backward`` sets, one for some nodes."""
-        return n_tiles(self.size[0] * self.size[1] * self.size[2])
-
-    def forward(self, inputs: Inputs, out: Outputs) -> None:
+    def forward(self, inputs: Inputs, out: Outputs, interval_weights: wp.array) -> None:
         """Render rays.
 
         Args:
             inputs: What is rendered.
             out: Written.
+            interval_weights: [n_rays, n_intervals] zeros, written where a sample is visited.
         """
-        assembly, workers, n = self._assembly, workers_of(self.device), inputs.origins.shape[0]
-        variant = self._variant("none")
+        assembly, workers, n = self._assembly, _workers(inputs), inputs.origins.shape[0]
+        variant = self._variant("none", workers)
         workers.launch_owned(
             assembly.render_forward_kernel(variant),
             -(-n // variant.batch),
             n,
-            self._scene(inputs, workers),
+            self._scene(inputs, self._steps(inputs, interval_weights), workers),
             self._rays(inputs),
             scratch_struct(variant, 0, workers, assembly),
             self._seen(out),
             rays=variant.batch,
         )
 
-    def adjoint(self, n_rays: int) -> AdjointLaunch:
-        """What ``backward`` launches; its workers' number is that of rows of weights' gradients.
-
-        Args:
-            n_rays: How many there are.
-        """
-        variant = self._variant(self.scaling)
-        diagonal = float(np.linalg.norm(self.corners[1] - self.corners[0]))
-        # Directions may be a little too short.
-        most_steps = self.model.most_steps(self.steps, 1.01 * diagonal)
-        kernel = self._assembly.render_backward_kernel(variant)
-        return AdjointLaunch(kernel, variant, most_steps, n_rays, workers_of(self.device))
-
     def backward(
         self,
-        launch: AdjointLaunch,
         inputs: Inputs,
         outputs: Outputs,
         output_gradients: tuple[wp.array, wp.array, wp.array],
-        raw_gradient: wp.array,
-        touched: wp.array,
+        stored_gradient: Mapping[str, wp.array],
         weights_gradient: wp.array,
     ) -> None:
-        """Add the scaled gradients of raw values and weights; rays are rendered once more.
+        """Compute the scaled gradients of what is stored and of weights; rays are rendered once
+        more.
 
         Args:
-            launch: From ``adjoint``.
             inputs: As ``forward`` had them.
             outputs: As ``forward`` wrote them.
             output_gradients: Gradients of rgb, of opacity and of depth.
-            raw_gradient: [n_nodes] vectors, added to.
-            touched: [n_tiles] uint8, set where something was added.
-            weights_gradient: [n_workers, n_weights] added to; the gradient is their sum.
+            stored_gradient: Zeros like what is stored, written.
+            weights_gradient: [n_weights] written.
         """
-        variant, workers = self._variant(self.scaling), launch.workers
+        n_rays, model, workers = inputs.origins.shape[0], self.layout.model, _workers(inputs)
+        variant = self._variant(self.scaling, workers)
+        nobody_asks = wp.empty((0, 0), dtype=self.types.real, device=inputs.origins.device)
+        steps = self._steps(inputs, nobody_asks)
+        launch = AdjointLaunch(
+            self._assembly.render_backward_kernel(variant),
+            variant,
+            # Directions may be a little too short.
+            most_samples(model, steps, 1.01 * self.layout.lattice.diagonal),
+            n_rays,
+            workers,
+        )
+        gradient = self.layout.kind.encoding(self._load, model).Gradient()
+        shared = {"weights": weights_gradient}
+        for parameter in self._storage(inputs).parameters(model, OptimConfig()):
+            array, (name, *flags) = stored_gradient[parameter.name], parameter.gradient
+            if flags:
+                tiles = wp.zeros(n_tiles(array.shape[0]), dtype=wp.uint8, device=array.device)
+                setattr(gradient, name, array)
+                setattr(gradient, flags[0], tiles)
+            else:
+                shared[name] = array
+        real = self.types.real
+        for name, array in shared.items():  # a row for each worker
+            setattr(gradient, name, zero_weights(array.shape[0], launch.workers, real))
         launch.run(
-            inputs.origins.shape[0],
-            gradient_struct(self.types, raw_gradient, touched, weights_gradient),
-            self._scene(inputs, workers),
+            n_rays,
+            gradient,
+            self._scene(inputs, steps, launch.workers),
             self._rays(inputs),
             self._seen(outputs),
             *output_gradients,
-            scratch_struct(variant, 0, workers, self._assembly),
+            scratch_struct(variant, 0, launch.workers, self._assembly),
         )
+        for name, array in shared.items():
+            _sum_rows(getattr(gradient, name), array)
 
     @property
     def _load(self) -> Load:
@@ -177,9 +192,18 @@ class Operation:
     def _assembly(self) -> ModuleType:
         return self._load("launch.assembly")
 
-    def _variant(self, scaling: Scaling) -> Any:
-        packed = self.precision == "float32" and not workers_of(self.device).device.is_cuda
-        return variant_of(self.model, self.precision, "none", scaling, "none", packed)
+    def _variant(self, scaling: Scaling, workers: Workers | None = None) -> Any:
+        on_cpu = workers is not None and not workers.device.is_cuda
+        return variant_of(
+            self.layout.model,
+            self.precision,
+            "none",
+            scaling,
+            "none",
+            packed=self.precision == "float32" and on_cpu,
+            stored=self.layout.kind,
+            sampler=Resampled(samples=self.n_intervals) if self.n_intervals else MARCHED,
+        )
 
     def _seen(self, outputs: Outputs) -> Any:
         rendered = self._assembly.render_outputs_type(self.n_channels)()
@@ -187,22 +211,38 @@ class Operation:
             setattr(rendered, name, array)
         return rendered
 
-    def _scene(self, inputs: Inputs, workers: Workers) -> Any:
+    def _storage(self, inputs: Inputs) -> Storage:
+        kind, model, lattice = self.layout.kind, self.layout.model, self.layout.lattice
+        return class_of(kind).over(kind, model, lattice, inputs.stored).as_final()
+
+    def _steps(self, inputs: Inputs, interval_weights: wp.array) -> AnySteps:
+        """How rays are marched, or their intervals."""
+        if not self.n_intervals:
+            return self.steps
+        return Intervals(
+            kind=Resampled(samples=self.n_intervals),
+            steps=self.steps,
+            edges=inputs.edges,
+            weights=interval_weights,
+        )
+
+    def _scene(self, inputs: Inputs, steps: AnySteps, workers: Workers) -> Any:
         """What rays are marched through, as kernels take it."""
-        types = self.types
-        occupied = wp.zeros(1, dtype=wp.uint8, device=inputs.raw.device)
+        types, lattice = self.types, self.layout.lattice
+        occupied = wp.zeros(1, dtype=wp.uint8, device=inputs.origins.device)
         return render_params_struct(
-            self.model,
+            self.layout.model,
             self.precision,
             FieldStructs(
-                box=box_struct(types, *self.corners, 0.0),
+                box=box_struct(types, lattice.box_min, lattice.box_max, 0.0),
                 free=free_struct(types, occupied, (1, 1, 1), 0.0),
-                values=grid_struct(self._load("fields.dense"), inputs.raw, self.size, 0.0),
+                values=self._storage(inputs).struct_in(self._load, workers),
                 density=density_struct(types, self.density_shift, 1.0),
                 weights=inputs.weights,
             ),
-            self.steps,
+            steps,
             workers,
+            stored=self.layout.kind,
         )
 
     def _rays(self, inputs: Inputs) -> Any:
@@ -211,10 +251,23 @@ class Operation:
             self._assembly,
             inputs.origins,
             inputs.directions,
-            wp.full(1, 0.5, dtype=self.types.real, device=inputs.raw.device),
+            wp.full(1, 0.5, dtype=self.types.real, device=inputs.origins.device),
             inputs.background,
             inputs.content_distance,
         )
+
+
+def _sum_rows(rows: wp.array, out: wp.array) -> None:
+    """Write the sum of rows, [n_workers, n or more], to [n]; on CUDA there is one."""
+    n = out.shape[0]
+    if rows.device.is_cuda:
+        wp.copy(out, rows.flatten(), count=n)
+    else:
+        rows.numpy()[:, :n].sum(axis=0, out=out.numpy())
+
+
+def _workers(inputs: Inputs) -> Workers:
+    return workers_of(str(inputs.origins.device))
 
 
 @cache

@@ -72,7 +72,7 @@ class FieldStructs:
         return FieldStructs(
             box=storage.lattice.box_between(steps.near, steps.far),
             free=free.struct,
-            values=storage.struct_for(workers),
+            values=storage.struct_in(loader("float32"), workers),
             density=storage.density,
             weights=weights,
         )

@@ -5,109 +5,79 @@ from __future__ import annotations
 import contextlib
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 import warp as wp
 
-from warpnerf.config import Scaling
-from warpnerf.model.interface import Model
 from warpnerf.rendering.operation import Inputs, Operation, Outputs
-from warpnerf.rendering.steps import Steps
-from warpnerf.torch.tensors import PRECISIONS
 
 
 class Call(NamedTuple):
-    """What a rendering depends on besides tensors with gradients and rays."""
+    """What a rendering depends on besides tensors with gradients."""
 
-    corners: tuple[np.ndarray, np.ndarray]
-    steps: Steps
-    density_shift: float
+    operation: Operation
+    origins: torch.Tensor
+    directions: torch.Tensor
     background: torch.Tensor
-    scaling: Scaling
     content_distance: torch.Tensor
-    model: Model
+    edges: torch.Tensor
 
 
 class Render(torch.autograd.Function):
-    """render_rays, forward and backward, each one launch."""
+    """Rendering of rays, forward and backward, each one launch."""
 
     @staticmethod
     def forward(
-        ctx: Any,
-        raw: torch.Tensor,
-        weights: torch.Tensor,
-        origins: torch.Tensor,
-        directions: torch.Tensor,
-        call: Call,
+        ctx: Any, call: Call, weights: torch.Tensor, *stored: torch.Tensor
     ) -> tuple[torch.Tensor, ...]:
-        """Rgb, opacity and depth of the rays."""
-        n, operation = len(origins), _operation(raw, call)
-        channels = raw.new_empty(n, operation.n_channels)
-        rgb, transmittance, depth = raw.new_empty(n, 3), raw.new_empty(n), raw.new_empty(n)
-        n_samples = torch.empty(n, dtype=torch.int32, device=raw.device)
+        """Rgb, opacity and depth of the rays, and what samples in intervals weigh."""
+        n, operation = len(call.origins), call.operation
+        channels = weights.new_empty(n, operation.n_channels)
+        rgb, transmittance, depth = (weights.new_empty(n, *of) for of in ((3,), (), ()))
+        n_samples = torch.empty(n, dtype=torch.int32, device=weights.device)
+        interval_weights = weights.new_zeros(n, operation.n_intervals)
         outputs = rgb, transmittance, depth, n_samples, channels
-        with _stream(raw):
+        with _stream(weights):
             operation.forward(
-                _inputs(operation, raw, weights, origins, directions, call),
+                _inputs(call, weights, stored),
                 _outputs(operation, *outputs),
+                _array(interval_weights),
             )
         ctx.call = call
-        ctx.save_for_backward(raw, weights, origins, directions, *outputs)
-        return rgb, 1.0 - transmittance, depth
+        ctx.save_for_backward(weights, *outputs, *stored)
+        ctx.mark_non_differentiable(interval_weights)
+        return rgb, 1.0 - transmittance, depth, interval_weights
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        """Gradients of raw and weights; rays are rendered once more."""
-        raw, weights, origins, directions, *outputs = ctx.saved_tensors
-        operation = _operation(raw, ctx.call)
-        launch = operation.adjoint(len(origins))
-        adj_rgb, adj_opacity, adj_depth = (grad.contiguous() for grad in grads)
-        adj_raw = raw.new_zeros(raw.shape)
-        adj_weights = raw.new_zeros(launch.workers.count, len(weights))
-        touched = torch.zeros(operation.n_tiles, dtype=torch.uint8, device=raw.device)
-        with _stream(raw):
+        """Gradients of weights and of what is stored; rays are rendered once more."""
+        call, operation = ctx.call, ctx.call.operation
+        (weights, *rest), n_outputs = ctx.saved_tensors, len(Outputs._fields)
+        outputs, stored = rest[:n_outputs], tuple(rest[n_outputs:])
+        adj_rgb, adj_opacity, adj_depth = (grad.contiguous() for grad in grads[:3])
+        of_weights = torch.zeros_like(weights)
+        of_stored = tuple(tensor.new_zeros(tensor.shape) for tensor in stored)
+        with _stream(weights):
             operation.backward(
-                launch,
-                _inputs(operation, raw, weights, origins, directions, ctx.call),
+                _inputs(call, weights, stored),
                 _outputs(operation, *outputs),
                 (_array(adj_rgb, operation.types.vec3), _array(adj_opacity), _array(adj_depth)),
-                _nodes(operation, adj_raw),
-                _array(touched),
-                _array(adj_weights),
+                _stored(operation, of_stored),
+                _array(of_weights),
             )
-        return adj_raw, adj_weights.sum(dim=0), None, None, None
+        return None, of_weights, *of_stored
 
 
-def _operation(raw: torch.Tensor, call: Call) -> Operation:
-    return Operation(
-        model=call.model,
-        precision=PRECISIONS[raw.dtype],
-        device=str(raw.device),
-        size=(raw.shape[0], raw.shape[1], raw.shape[2]),
-        corners=call.corners,
-        steps=call.steps,
-        density_shift=call.density_shift,
-        scaling=call.scaling,
-    )
-
-
-def _inputs(
-    operation: Operation,
-    raw: torch.Tensor,
-    weights: torch.Tensor,
-    origins: torch.Tensor,
-    directions: torch.Tensor,
-    call: Call,
-) -> Inputs:
-    vec3 = operation.types.vec3
+def _inputs(call: Call, weights: torch.Tensor, stored: tuple[torch.Tensor, ...]) -> Inputs:
+    vec3 = call.operation.types.vec3
     return Inputs(
-        raw=_nodes(operation, raw.detach().contiguous()),
+        stored=_stored(call.operation, tuple(tensor.contiguous() for tensor in stored)),
         weights=_array(weights),
-        origins=_array(origins, vec3),
-        directions=_array(directions, vec3),
+        origins=_array(call.origins, vec3),
+        directions=_array(call.directions, vec3),
         background=_array(call.background, vec3),
         content_distance=_array(call.content_distance),
+        edges=_array(call.edges),
     )
 
 
@@ -129,16 +99,21 @@ def _outputs(
     )
 
 
-def _nodes(operation: Operation, raw: torch.Tensor) -> wp.array:
-    """[X, Y, Z, n_floats] as vectors of nodes."""
-    n_floats = raw.shape[3]
-    return _array(raw.reshape(-1, n_floats), operation.types.vector(n_floats))
+def _stored(operation: Operation, tensors: tuple[torch.Tensor, ...]) -> dict[str, wp.array]:
+    """Contiguous tensors in the order of the layout, as launches take them."""
+    arrays, vector = operation.layout.arrays, operation.types.vector
+    return {
+        name: _array(tensor.reshape(-1))
+        if array.width is None
+        else _array(tensor.reshape(-1, array.width), vector(array.width))
+        for (name, array), tensor in zip(arrays.items(), tensors, strict=True)
+    }
 
 
-def _stream(raw: torch.Tensor) -> Any:
+def _stream(like: torch.Tensor) -> Any:
     """Work in torch's own order on CUDA; nothing to do on the CPU."""
-    if raw.is_cuda:
-        return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(raw.device)))
+    if like.is_cuda:
+        return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(like.device)))
     return contextlib.nullcontext()
 
 

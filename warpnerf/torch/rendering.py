@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, get_args
+from typing import Any, NamedTuple, get_args
 
-import numpy as np
 import torch
 
 from warpnerf.checks import InputError, require_finite, require_one_of
@@ -15,22 +14,26 @@ from warpnerf.rendering.arguments import (
     Head,
     March,
     head_of,
-    require_ascending,
-    require_box,
+    require_intervals,
     require_reach,
     steps_of,
+    steps_of_intervals,
 )
+from warpnerf.rendering.operation import Operation
+from warpnerf.rendering.steps import Steps
+from warpnerf.rendering.stored import StoredField
 from warpnerf.torch.arguments import accept_old_spelling
 from warpnerf.torch.launches import Call, Render
 from warpnerf.torch.tensors import (
     PRECISIONS,
-    corner_of,
+    corners_of,
     flat_head,
     rays_of,
     require_constant,
     require_dense,
-    require_grid,
     require_numbers,
+    require_tensor,
+    stored_by,
 )
 
 
@@ -45,9 +48,22 @@ class RenderedRays(NamedTuple):
     """[n_rays] sum of weight times t, scene units."""
 
 
+class RenderedIntervals(NamedTuple):
+    """Rendered rays, and the weights of their samples."""
+
+    rgb: torch.Tensor
+    """[n_rays, 3], with background."""
+    opacity: torch.Tensor
+    """[n_rays] in [0, 1]."""
+    depth: torch.Tensor
+    """[n_rays] sum of weight times t, scene units."""
+    weights: torch.Tensor
+    """[n_rays, n] of samples, which add up to opacity; without gradient."""
+
+
 @accept_old_spelling
 def render_rays(
-    raw: torch.Tensor,
+    raw: torch.Tensor | StoredField,
     origins: torch.Tensor,
     directions: torch.Tensor,
     box: tuple[Sequence[float] | torch.Tensor, Sequence[float] | torch.Tensor],
@@ -59,7 +75,7 @@ def render_rays(
     content_distance: float | torch.Tensor = 1.0,
     head: str | Model | Head = "rgb",
 ) -> RenderedRays:
-    """Render rays through a grid of raw values, differentiable with respect to these and the head.
+    """Render rays through a field, differentiable with respect to what it stores and the head.
 
     Samples sit at t = near + (k + 1/2) step for every k >= 0 whose point lies in the box and whose
     t is below far; sigma = softplus(raw density + density_shift), and c as the model says, for rgb
@@ -69,13 +85,14 @@ def render_rays(
 
     The gradient is warpnerf's hand-written adjoint (kernels/README.md), in which each sample's
     share is multiplied by its distance scaling. It is then the gradient of no loss: see the paper.
-    Only raw and the head's layers have gradients: rays, box, background and content distance that
-    require grad are refused. A background that is trained is added outside, over a black one:
-    rgb + (1 - opacity)[:, None] * background.
+    Only what is stored and the head's layers have gradients: rays, box, background and content
+    distance that require grad are refused. A background that is trained is added outside, over a
+    black one: rgb + (1 - opacity)[:, None] * background.
 
     Args:
         raw: [X, Y, Z, 1 + n_features] raw density and raw features, of rgb raw r, g, b, at nodes
-            box[0] + index (box[1] - box[0]) / (size - 1); float32 or float64, CPU or CUDA.
+            box[0] + index (box[1] - box[0]) / (size - 1); float32 or float64, CPU or CUDA. Or a
+            StoredField: planes and lines (vm), or a hash.
         origins: [n_rays, 3] scene units, on the same device.
         directions: [n_rays, 3] of unit length.
         box: Its lower and its upper corner, [3] each, scene units.
@@ -90,70 +107,151 @@ def render_rays(
         rgb [n_rays, 3], opacity [n_rays] and depth [n_rays], of raw's type and device.
 
     Raises:
-        InputError: A shape, type, device or number does not fit, or a tensor other than raw and
-            layers requires grad.
+        InputError: A shape, type, device or number does not fit, or what has no gradient requires
+            grad.
     """
-    require_box(box)
-    box_min, box_max = box
+    steps = steps_of(step)
+    options = Options(density_shift, background, scaling, content_distance, head)
+    return RenderedRays(*_rendered(raw, origins, directions, box, options, steps=steps)[:3])
+
+
+def render_intervals(
+    raw: torch.Tensor | StoredField,
+    origins: torch.Tensor,
+    directions: torch.Tensor,
+    box: tuple[Sequence[float] | torch.Tensor, Sequence[float] | torch.Tensor],
+    edges: torch.Tensor,
+    *,
+    density_shift: float = 0.0,
+    background: Sequence[float] | torch.Tensor = (1.0, 1.0, 1.0),
+    scaling: Scaling = "none",
+    content_distance: float | torch.Tensor = 1.0,
+    head: str | Model | Head = "rgb",
+) -> RenderedIntervals:
+    """Render rays with a sample in the middle of each of their intervals, as a proposal draws them.
+
+    As ``render_rays`` but for t = (edges[k] + edges[k + 1]) / 2, and the difference in place of the
+    step. Samples outside the box are skipped. Edges have no gradient: what draws them learns from
+    the weights (Mip-NeRF 360, Barron et al. 2022, eq. 13).
+
+    Args:
+        raw: See ``render_rays``; so are arguments that are not named here.
+        origins: [n_rays, 3] scene units.
+        directions: [n_rays, 3] of unit length.
+        box: Its lower and its upper corner, [3] each, scene units.
+        edges: [n_rays, n + 1] where intervals of each ray begin and end, 0 or above, in rising
+            order, scene units; 2 to 1024 intervals.
+        density_shift: Added to raw densities before their activation.
+        background: [3] or [n_rays, 3], rgb.
+        scaling: none, quadratic or clamped.
+        content_distance: Where gradients reach full strength, scene units; a number or [n_rays].
+        head: The name of a model without an MLP, the model itself, or a Head.
+
+    Returns:
+        rgb [n_rays, 3], opacity [n_rays], depth [n_rays] and weights [n_rays, n], of raw's type and
+        device.
+
+    Raises:
+        InputError: As ``render_rays``.
+    """
+    options = Options(density_shift, background, scaling, content_distance, head)
+    return RenderedIntervals(*_rendered(raw, origins, directions, box, options, edges=edges))
+
+
+class Options(NamedTuple):
+    """What both ways to render take by name."""
+
+    density_shift: float
+    background: Sequence[float] | torch.Tensor
+    scaling: Scaling
+    content_distance: float | torch.Tensor
+    head: str | Model | Head
+
+
+def _rendered(
+    raw: torch.Tensor | StoredField,
+    origins: torch.Tensor,
+    directions: torch.Tensor,
+    box: tuple[Sequence[float] | torch.Tensor, Sequence[float] | torch.Tensor],
+    options: Options,
+    steps: Steps | None = None,
+    edges: torch.Tensor | None = None,
+) -> tuple[torch.Tensor, ...]:
+    """Rgb, opacity, depth and weights of rays, that are marched, or have edges."""
     for field, value in {
         "origins": origins,
         "directions": directions,
-        "box_min": box_min,
-        "box_max": box_max,
-        "density_shift": density_shift,
-        "background": background,
-        "content_distance": content_distance,
+        "edges": edges,
+        "density_shift": options.density_shift,
+        "background": options.background,
+        "content_distance": options.content_distance,
     }.items():
         require_constant(field, value)
-    require_one_of("scaling", scaling, get_args(Scaling))
-    steps = steps_of(step)
-    require_finite("density_shift", density_shift)
-    model, layers = head_of(head)
-    require_grid(raw, model)
-    weights = flat_head(layers, model, raw)
-    if raw.shape[3] < model.n_floats:
-        raw = torch.nn.functional.pad(raw, (0, model.n_floats - raw.shape[3]))
-    corners = corner_of("box_min", box_min), corner_of("box_max", box_max)
-    require_ascending(corners)
-    rays = rays_of("origins", origins, raw), rays_of("directions", directions, raw)
-    if len(rays[0]) != len(rays[1]):
+    require_one_of("scaling", options.scaling, get_args(Scaling))
+    require_finite("density_shift", options.density_shift)
+    model, layers = head_of(options.head)
+    corners = corners_of(box)
+    layout, stored = stored_by(raw, model, corners)
+    like, precision = stored[0], PRECISIONS[stored[0].dtype]
+    weights = flat_head(layers, model, like)
+    rays = rays_of("origins", origins, like), rays_of("directions", directions, like)
+    n = len(rays[0])
+    if n != len(rays[1]):
         raise InputError(
-            f"origins and directions must be equally many, not {len(rays[0])} and {len(rays[1])}."
+            f"origins and directions must be equally many, not {n} and {len(rays[1])}."
         )
     norms = rays[1].norm(dim=1)
-    if len(norms) and not bool(((norms - 1.0).abs() < 1e-3).all()):
+    if n and not bool(((norms - 1.0).abs() < 1e-3).all()):
         raise InputError(
             "directions must be unit vectors, so that t is a distance; divide them by their length."
         )
-    reach = (
-        float((rays[0] - rays[0].new_tensor((corners[0] + corners[1]) / 2)).norm(dim=1).max())
-        if len(rays[0])
-        else 0.0
+    if steps is not None:
+        middle = like.new_tensor((corners[0] + corners[1]) / 2)
+        reach = float((rays[0] - middle).norm(dim=1).max()) if n else 0.0
+        require_reach(reach + layout.lattice.diagonal, steps.step, precision)
+    intervals = like.new_zeros(n, 1) if steps is not None else _edges(edges, n, like)
+    operation = Operation(
+        layout=layout,
+        precision=precision,
+        steps=steps or steps_of_intervals(),
+        n_intervals=intervals.shape[1] - 1,
+        density_shift=float(options.density_shift),
+        scaling=options.scaling,
     )
-    reach += float(np.linalg.norm(corners[1] - corners[0]))
-    require_reach(reach, steps.step, PRECISIONS[raw.dtype])
-    require_dense("background", background)
-    require_dense("content_distance", content_distance)
-    require_numbers("background", background)
-    require_numbers("content_distance", content_distance)
-    behind = torch.as_tensor(background, dtype=raw.dtype, device=raw.device).detach()
-    if behind.shape not in ((3,), (len(rays[0]), 3)) or not bool(behind.isfinite().all()):
+    behind, content = _constants(options, n, like)
+    call = Call(operation, *rays, behind, content, intervals)
+    found: tuple[torch.Tensor, ...] = Render.apply(call, weights, *stored)
+    return found
+
+
+def _edges(edges: Any, n_rays: int, like: torch.Tensor) -> torch.Tensor:
+    """Of intervals, [n_rays, n + 1], as kernels take them."""
+    require_tensor("edges", edges, like)
+    require_intervals(edges.shape, n_rays)
+    given = edges.detach().to(like.dtype).contiguous()
+    rising = (given[:, 1:] >= given[:, :-1]).all() and (given[:, 0] >= 0.0).all()
+    if not (bool(given.isfinite().all()) and bool(rising)):
+        raise InputError("edges must be finite distances of 0 or above, in rising order.")
+    return given
+
+
+def _constants(
+    options: Options, n_rays: int, like: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Background, [n_rays or 1, 3], and content distances, [n_rays or 1], as kernels take them."""
+    background, content_distance = options.background, options.content_distance
+    for field, value in (("background", background), ("content_distance", content_distance)):
+        require_dense(field, value)
+        require_numbers(field, value)
+    behind = torch.as_tensor(background, dtype=like.dtype, device=like.device).detach()
+    if behind.shape not in ((3,), (n_rays, 3)) or not bool(behind.isfinite().all()):
         raise InputError(
             f"background must be finite rgb, [3] or [n_rays, 3], not {list(behind.shape)}."
         )
-    content = torch.as_tensor(content_distance, dtype=raw.dtype, device=raw.device).detach()
-    if content.shape not in ((), (1,), (len(rays[0]),)) or not bool((content > 0).all()):
+    content = torch.as_tensor(content_distance, dtype=like.dtype, device=like.device).detach()
+    if content.shape not in ((), (1,), (n_rays,)) or not bool((content > 0).all()):
         raise InputError(
             "content_distance must be above 0: a number or [n_rays], "
             f"not {content.tolist() if content.dim() == 0 else list(content.shape)}."
         )
-    call = Call(
-        corners=corners,
-        steps=steps,
-        density_shift=density_shift,
-        background=behind.reshape(-1, 3).contiguous(),
-        scaling=scaling,
-        content_distance=content.reshape(-1).contiguous(),
-        model=model,
-    )
-    return RenderedRays(*Render.apply(raw, weights, *rays, call))
+    return behind.reshape(-1, 3).contiguous(), content.reshape(-1).contiguous()

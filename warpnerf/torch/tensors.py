@@ -10,17 +10,50 @@ import torch
 
 from warpnerf.checks import InputError, said
 from warpnerf.model.interface import Model
-from warpnerf.rendering.arguments import require_layers, require_nodes
+from warpnerf.rendering.arguments import require_ascending, require_box, require_layers
+from warpnerf.rendering.stored import Layout, StoredField, dense_layout, layout_of, require_stored
 
 PRECISIONS = {torch.float32: "float32", torch.float64: "float64"}
 
 
-def require_grid(raw: torch.Tensor, model: Model) -> None:
-    """Raise InputError unless raw is a grid of the model's nodes."""
-    require_tensor("raw", raw)
-    if raw.dtype not in PRECISIONS:
-        raise InputError(f"raw must be float32 or float64, not {raw.dtype}; call raw.float().")
-    require_nodes(raw.shape, model)
+def stored_by(
+    raw: torch.Tensor | StoredField, model: Model, corners: tuple[np.ndarray, np.ndarray]
+) -> tuple[Layout, list[torch.Tensor]]:
+    """How a field is stored, and its tensors in the order of its layout, with padding.
+
+    Args:
+        raw: A dense grid, or what is stored otherwise.
+        model: What it holds.
+        corners: [3] each of its box, scene units.
+
+    Raises:
+        InputError: A shape, type or device does not fit.
+    """
+    if not isinstance(raw, StoredField):
+        require_precision("raw", raw)
+        layout = dense_layout(raw.shape, model, corners)
+        padding = model.n_floats - raw.shape[3]
+        return layout, [torch.nn.functional.pad(raw, (0, padding)) if padding else raw]
+    layout = layout_of(raw, model, corners)
+    arrays = layout.arrays
+    tensors = [raw.tensors[name] for name in arrays]
+    for (name, expected), tensor in zip(arrays.items(), tensors, strict=True):
+        field = f"tensors[{name!r}]"
+        require_precision(field, tensor)
+        require_tensor(field, tensor, tensors[0])
+        require_stored(name, tensor.shape, expected)
+        if tensor.dtype != tensors[0].dtype:
+            raise InputError(f"{field} must be {tensors[0].dtype}, as others, not {tensor.dtype}.")
+    return layout, tensors
+
+
+def require_precision(field: str, value: torch.Tensor) -> None:
+    """Raise InputError unless a value is a tensor that kernels can work on."""
+    require_tensor(field, value)
+    if value.dtype not in PRECISIONS:
+        raise InputError(
+            f"{field} must be float32 or float64, not {value.dtype}; call its float()."
+        )
 
 
 def require_tensor(field: str, value: Any, like: torch.Tensor | None = None) -> None:
@@ -68,6 +101,20 @@ def require_numbers(field: str, value: Any) -> None:
         array = np.array(None)
     if array.dtype.kind not in "fiu":
         raise InputError(f"{field} must be a tensor or numbers, not {said(value)}.")
+
+
+def corners_of(box: Sequence[Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Of a box, [3] each, float64.
+
+    Raises:
+        InputError: It is none, or its gradient is requested.
+    """
+    require_box(box)
+    for field, value in zip(("box_min", "box_max"), box, strict=True):
+        require_constant(field, value)
+    corners = corner_of("box_min", box[0]), corner_of("box_max", box[1])
+    require_ascending(corners)
+    return corners
 
 
 def corner_of(field: str, value: Sequence[float] | torch.Tensor) -> np.ndarray:

@@ -19,7 +19,6 @@ from warpnerf.fields.occupancy import free_struct
 from warpnerf.fields.storage import density_struct
 from warpnerf.model.sampler_kinds import ProposedDensity
 from warpnerf.model.spaces import SPACES, part_of
-from warpnerf.model.storage_kinds import DENSE
 from warpnerf.rendering.adjoint import AdjointLaunch
 from warpnerf.rendering.proposal import bins_struct, scratch_of, shares_of
 from warpnerf.rendering.rays import rays_struct
@@ -231,17 +230,15 @@ class ProblemKernels:
 
     def _stored(self, problem: RayProblem, workers: Workers) -> Any:
         """The encoding's ``Params``."""
-        if problem.stored == DENSE:
-            return self._grid(problem.raw, problem.border)
-        storage = problem.storage(self._workers.device)
-        arrays = {
-            name: self._array(array, self._types.vector(array.shape[1]))
-            if problem.stored.rules[name] == "nodes"
-            else self._array(array.ravel())
-            for name, array in problem.tensors.items()
-        }
-        transposed = self._rows(storage.n_transposed, workers)
-        return storage.struct_with(self._load, arrays, transposed)
+        arrays = {}
+        for name, rule in problem.stored.rules.items():
+            values = problem.learned[name]
+            if rule == "nodes":
+                width = values.shape[-1]
+                arrays[name] = self._array(values.reshape(-1, width), self._types.vector(width))
+            else:
+                arrays[name] = self._array(values.ravel())
+        return problem.storage(arrays).struct_in(self._load, workers)
 
     def _rays(self, problem: RayProblem) -> Any:
         return rays_struct(

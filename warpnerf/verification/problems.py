@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 import warp as wp
 
 from warpnerf.config import LossConfig
-from warpnerf.fields.decoded import Decoded
 from warpnerf.fields.lattice import Lattice
+from warpnerf.fields.storage import Storage
 from warpnerf.fields.storages import class_of
 from warpnerf.grid_config import Contraction
 from warpnerf.model.interface import Model, n_weights
@@ -93,14 +94,14 @@ class RayProblem:
             return replace(self, tensors=self.tensors | {name: self.tensors[name] + by})
         return replace(self, **{"raw" if name == "values" else name: self.learned[name] + by})
 
-    def storage(self, device: wp.Device) -> Decoded:
-        """The storage of these arrays, in float32 and as fine as it becomes."""
-        lattice = _lattice(self)
-        rounded = {name: array.astype(np.float32) for name, array in self.tensors.items()}
+    def storage(self, arrays: Mapping[str, wp.array]) -> Storage:
+        """The field's storage, as fine as it becomes.
+
+        Args:
+            arrays: What is learned of it; see ``Storage.over``.
+        """
         of_kind = class_of(self.stored)
-        made = of_kind.from_tensors(self.stored, self.model, lattice, rounded, device)
-        assert isinstance(made, Decoded)
-        return replace(made, density_scale=1.0 / float(lattice.voxel_size.min()))
+        return of_kind.over(self.stored, self.model, _lattice(self), arrays).as_final()
 
     def rounded(self) -> RayProblem:
         """The same in numbers that float32 holds, so that only arithmetic can differ."""

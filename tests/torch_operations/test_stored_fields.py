@@ -1,0 +1,258 @@
+"""render_rays of fields that are no dense grids, and render_intervals, against the oracle."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from tests.support.expected import assert_close
+from tests.support.field_trainings import config_of
+from tests.support.problems import Problem
+from tests.support.stored_problems import (
+    HASH,
+    KINDS,
+    SIZE,
+    VM,
+    oracle,
+    oracle_gradients,
+    random_edges,
+    random_tensors,
+    stored,
+)
+from tests.support.tiny_trainings import ball
+from tests.support.torch_calls import call, problem, torch_device
+from warpnerf.checks import InputError
+from warpnerf.config import GridConfig
+from warpnerf.model.storage_kinds import AUTO_FIELD, StorageKind
+from warpnerf.rendering.rays import camera_rays
+from warpnerf.torch import March, StoredField, first_tensors, render_intervals, render_rays
+from warpnerf.training.trainer import Trainer
+
+BOX = (-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)
+RAY = torch.tensor([[0.1, 0.2, -2.0]]), torch.tensor([[0.0, 0.0, 1.0]])
+
+
+def varied(seed: int) -> Problem:
+    return problem(seed, content_distance=np.random.default_rng(seed).uniform(0.5, 3.0, size=12))
+
+
+def leaves(
+    tensors: dict[str, Any], device: str, dtype: torch.dtype = torch.float64
+) -> dict[str, torch.Tensor]:
+    return {
+        name: torch.tensor(x, dtype=dtype, device=torch_device(device)).requires_grad_()
+        for name, x in tensors.items()
+    }
+
+
+def gradients(p: Problem, out: Any, given: dict[str, torch.Tensor]) -> dict[str, Any]:
+    like = next(iter(given.values()))
+    adjoints = [
+        torch.tensor(a, dtype=like.dtype, device=like.device)
+        for a in (p.adj_rgb, p.adj_opacity, p.adj_depth)
+    ]
+    found = torch.autograd.grad(out[:3], [*given.values()], adjoints)
+    return {name: x.cpu().numpy() for name, x in zip(given, found, strict=True)}
+
+
+def with_edges(
+    p: Problem, raw: Any, like: torch.Tensor, edges: Any, scaling: Any, **options: Any
+) -> Any:
+    """render_intervals of a problem."""
+
+    def like_raw(values: Any) -> torch.Tensor:
+        return torch.tensor(values, dtype=like.dtype, device=like.device)
+
+    return render_intervals(
+        raw,
+        like_raw(p.origins),
+        like_raw(p.directions),
+        (p.box_min, p.box_max),
+        like_raw(edges),
+        density_shift=p.density_shift,
+        background=like_raw(p.background),
+        scaling=scaling,
+        content_distance=like_raw(p.content_distance),
+        **options,
+    )
+
+
+def require_oracle(p: Problem, kind: StorageKind, device: str, edges: Any = None) -> None:
+    """In both precisions, for every scaling."""
+    tensors = random_tensors(p, kind)
+    expected = oracle(p, kind, {k: torch.tensor(v) for k, v in tensors.items()}, "none", edges)
+    for scaling in ("none", "quadratic", "clamped"):
+        slopes = oracle_gradients(p, kind, tensors, scaling, edges)
+        for dtype, tolerance in ((torch.float64, 1e-9), (torch.float32, 3e-5)):
+            given = leaves(tensors, device, dtype)
+            field, like = stored(kind, given), given["decoder"]
+            if edges is None:
+                out: Any = call(p, field, scaling, like=like)
+            else:
+                out = with_edges(p, field, like, edges, scaling)
+                assert_close(out.weights.cpu(), expected.weights, tolerance)
+            assert {x.dtype for x in out} == {dtype}
+            for ours, theirs in zip(out, expected[:3], strict=False):
+                assert_close(ours.detach().cpu(), theirs, tolerance)
+            for name, found in gradients(p, out, given).items():
+                assert_close(found, slopes[name], tolerance)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_stored_fields_against_the_oracle(name: str, device: str) -> None:
+    require_oracle(varied(3), KINDS[name], device)
+
+
+@pytest.mark.parametrize("name", ["vm", "hash"])
+def test_intervals_of_stored_fields_against_the_oracle(name: str, device: str) -> None:
+    p = varied(4)
+    require_oracle(p, KINDS[name], device, random_edges(p))
+
+
+def test_gradcheck(device: str) -> None:
+    p = problem(2, n_rays=4)
+    given = leaves(random_tensors(p, VM), device)
+
+    def seen(*tensors: torch.Tensor) -> Any:
+        named = dict(zip(given, tensors, strict=True))
+        return tuple(call(p, stored(VM, named), like=named["decoder"]))
+
+    assert torch.autograd.gradcheck(
+        seen, tuple(given.values()), atol=1e-8, rtol=1e-6, fast_mode=True
+    )
+
+
+def test_intervals_that_are_steps_are_steps(device: str) -> None:
+    """Of a dense grid: the same numbers as a march."""
+    p = varied(5)
+    raw = torch.tensor(p.raw, device=torch_device(device)).requires_grad_()
+    n = int((p.steps.far - p.steps.near) / p.steps.step)
+    edges = np.tile(p.steps.near + p.steps.step * np.arange(n + 1), (12, 1))
+    marched = call(p, raw, "clamped", far=p.steps.near + n * p.steps.step)
+    found = with_edges(p, raw, raw, edges, "clamped")
+    for ours, theirs in zip(found[:3], marched, strict=True):
+        assert_close(ours.detach().cpu(), theirs.detach().cpu(), 1e-12)
+    slopes = [gradients(p, out, {"raw": raw})["raw"] for out in (found, marched)]
+    assert_close(*slopes, 1e-12)
+    assert not found.weights.requires_grad
+    assert_close(found.weights.sum(dim=1).cpu(), found.opacity.detach().cpu(), 1e-12)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_it_learns_from_its_first_tensors(name: str) -> None:
+    """As the documentation has it: Adam on all tensors, until rays see what they should."""
+    kind = KINDS[name]
+    size = SIZE if name == "vm" else None
+    tensors = {
+        key: torch.tensor(x, requires_grad=True)
+        for key, x in first_tensors(kind, BOX, size, seed=1).items()
+    }
+    origins = torch.tensor([[x, y, -2.0] for x in (-0.5, 0.0, 0.5) for y in (-0.5, 0.5)])
+    directions = torch.tensor([[0.0, 0.0, 1.0]]).expand(6, 3)
+    target = torch.linspace(0.1, 0.9, 18).reshape(6, 3)
+    adam, losses = torch.optim.Adam(tensors.values(), 0.03), []
+    for _ in range(60):
+        rays = render_rays(
+            StoredField(kind, tensors, size),
+            *(origins, directions, BOX),
+            step=0.1,
+            scaling="clamped",
+            content_distance=2.0,
+        )
+        loss = (rays.rgb - target).square().mean()
+        adam.zero_grad()
+        loss.backward()
+        adam.step()
+        losses.append(loss.item())
+    assert losses[-1] < 0.1 * losses[0]
+
+
+def test_first_tensors_are_those_of_a_training() -> None:
+    """The same seed, the same numbers; by name or configured."""
+    ours, same, other = (
+        first_tensors(kind, BOX, SIZE, seed=seed) for kind, seed in (("vm", 3), (VM, 3), ("vm", 4))
+    )
+    assert list(ours) == ["planes", "lines", "decoder"]
+    assert all(x.dtype == np.float32 for x in ours.values())
+    assert all(np.array_equal(ours[name], same[name]) for name in ours)
+    assert not np.array_equal(ours["planes"], other["planes"])
+    assert first_tensors("vm", BOX, SIZE, head="deferred")["decoder"].shape == (48, 16)
+    assert list(first_tensors("hash", BOX)) == ["values", "decoder"]
+
+
+@pytest.mark.parametrize("kind", [VM, replace(HASH, coarsest=4, finest=16)])
+def test_tensors_of_a_training_are_seen_as_its_field_is(kind: StorageKind) -> None:
+    """But for what is next to nothing, which a field skips."""
+    config = replace(config_of(kind), steps=40, grid=GridConfig(voxels=1000, grow_at=()))
+    trainer = Trainer(ball(), config)
+    trainer.run()
+    field, camera = trainer.field(), ball().cameras[0]
+    storage, lattice = field.storage, field.lattice
+    origins, directions = (x.numpy() for x in camera_rays(camera, field.workers))
+    expected = field.render_rays(origins, directions)
+    tensors = {name: torch.tensor(x) for name, x in storage.tensors().items()}
+    size = lattice.size if kind == VM else None
+    unit = storage.density_scale  # lengths are multiples of 1 / that
+    lengths = (unit * x for x in (field.steps.step, field.steps.near, field.steps.far))
+    seen = render_rays(
+        StoredField(kind, tensors, size),
+        *(torch.tensor(x, dtype=torch.float32) for x in (unit * origins, directions)),
+        (unit * lattice.box_min, unit * lattice.box_max),
+        March(*lengths),
+        density_shift=storage.density_shift,
+        background=field.background,
+    )
+    assert expected.opacity.max() > 0.5
+    np.testing.assert_allclose(seen.rgb, expected.rgb, atol=2e-3)
+
+
+def refused(match: str, kind: Any = "vm", size: Any = SIZE, **changed: Any) -> None:
+    tensors = {k: torch.tensor(v) for k, v in first_tensors("vm", BOX, SIZE).items()}
+    tensors = {k: v for k, v in (tensors | changed).items() if v is not None}
+    with pytest.raises(InputError, match=match):
+        render_rays(StoredField(kind, tensors, size), *RAY, BOX, step=0.1)
+
+
+def test_bad_fields_are_refused() -> None:
+    refused("kind must be one of dense, vm, hash", kind="tensorf")
+    refused("kind must be vm, hash, or one of these configured", kind=AUTO_FIELD)
+    refused("kind must be vm, hash, or one of these configured", kind=5)
+    refused("size must be three whole numbers, the nodes of a vm", size=None)
+    refused("size must be three whole numbers", size=(4, 5.5, 6))
+    refused("size must be two nodes or more", size=(1, 6, 5))
+    refused("tensors of a hash must be values, decoder, by name", kind="hash", size=None)
+    refused("tensors of a vm must be planes, lines, decoder", lines=None)
+    lines, named = torch.zeros(15, 16), r"tensors\['lines'\] must be "
+    refused(named + r"\[15, 16\] here, not \[14, 16\]", lines=lines[1:])
+    refused(named + "torch.float32, as others, not torch.float64", lines=lines.double())
+    refused(named + "float32 or float64", lines=lines.half())
+    refused(named + "a torch tensor, not float", lines=3.0)
+    with pytest.raises(InputError, match=r"size must be None, not .*a hash has its levels"):
+        first_tensors("hash", BOX, SIZE)
+    with pytest.raises(InputError, match="kind must be one of dense, vm, hash"):
+        first_tensors("nerf", BOX, SIZE)
+    with pytest.raises(InputError, match="box_max must lie above box_min"):
+        first_tensors("vm", BOX[::-1], SIZE)
+    with pytest.raises(InputError, match="box_min must be three finite numbers"):
+        first_tensors("vm", ("low", BOX[1]), SIZE)
+    with pytest.raises(InputError, match="seed must be"):
+        first_tensors("vm", BOX, SIZE, seed=-1)
+
+
+def test_bad_edges_are_refused() -> None:
+    raw = torch.zeros(3, 3, 3, 4)
+
+    def fails(match: str, edges: Any) -> None:
+        with pytest.raises(InputError, match=match):
+            render_intervals(raw, *RAY, BOX, edges)
+
+    fails("edges must be a torch tensor, not list", [[0.0, 1.0, 2.0]])
+    fails(r"edges must be \[n_rays, n \+ 1\]", torch.arange(5.0))
+    fails(r"edges must be \[n_rays, n \+ 1\]", torch.arange(6.0).reshape(2, 3))
+    fails("from 2 to 1024, of 1 rays", torch.arange(2.0)[None])
+    fails("finite distances of 0 or above, in rising order", torch.tensor([[0.0, 2.0, 1.0]]))
+    fails("finite distances of 0 or above, in rising order", torch.tensor([[-1.0, 2.0, 3.0]]))
+    fails("finite distances", torch.tensor([[0.0, 2.0, float("inf")]]))
+    fails("edges requires grad", torch.tensor([[0.0, 1.0, 2.0]], requires_grad=True))
