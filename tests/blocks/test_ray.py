@@ -42,8 +42,6 @@ def test_a_killed_worker_s_block_is_taken_over(tmp_path: Path) -> None:
     ray = ("--engine", "ray", "--workers", "2", "--threads", "1")
     steps = ("--steps", "600", "--checkpoint-every", "0.3", *OPTIONS)
     first, second = blocks.run(0), blocks.run(1)
-    code, _, err = run("train-blocks", blocks.folder, *ray[:2], "--threads", "9999")
-    assert code == 2 and "no machine of the cluster has so many cores" in err
     process = start("train-blocks", blocks.folder, *ray, "--", *steps)
     until(lambda: first.last_step is not None and second.last_step is not None, process)
     process.send_signal(signal.SIGINT)
@@ -63,7 +61,15 @@ def test_a_killed_worker_s_block_is_taken_over(tmp_path: Path) -> None:
     assert "resuming after step" in said
     assert "block-1 was lost" not in out and out.count("is done") == 2
     before = [path.stat().st_mtime_ns for path in blocks.folder.glob("*/field.safetensors")]
-    code, out, err = run("train-blocks", blocks.folder, *ray)
+    code, out, err = run("train-blocks", blocks.folder)
     assert code == 0 and "begins" not in out, (out, err)
     after = [path.stat().st_mtime_ns for path in blocks.folder.glob("*/field.safetensors")]
     assert before == after and len(after) == 2
+
+
+@pytest.mark.slow  # starts a Ray
+def test_more_cores_than_any_machine_has(tmp_path: Path) -> None:
+    pytest.importorskip("ray")
+    folder = cut(tmp_path / "room")
+    code, _, err = run("train-blocks", folder, "--engine", "ray", "--threads", "9999")
+    assert code == 2 and "no machine of the cluster has so many cores" in err

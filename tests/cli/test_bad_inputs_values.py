@@ -365,7 +365,7 @@ def test_70_kernel_cache_unwritable(tmp_path: Path) -> None:
     assert not said.err
 
 
-@pytest.mark.ci  # as the one before, which is about the same fallback
+@pytest.mark.slow  # as the one before, which is about the same fallback
 def test_70_read_only_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("WARP_CACHE_PATH", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)

@@ -69,6 +69,7 @@ class Server:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
+            env={**os.environ, "TMPDIR": self._folder.name},  # what it compiles with stays there
         )
         scene = make_scene(here)
         assert self._ask(arguments=["train", str(scene), "--output", str(here / "run"), *TINY]) == 0

@@ -12,8 +12,12 @@ import signal
 import sys
 import tempfile
 import time
+from pathlib import Path
 from typing import Any
 
+sys.path.insert(0, os.fspath(Path(__file__).parents[2]))
+
+from tests.support.compiling import compile_as_tests_do
 from warpnerf.cli.main import main
 from warpnerf.cli.start import start
 
@@ -44,6 +48,13 @@ def code_of(child: int, limit: float | None) -> int | None:
         time.sleep(0.005)
 
 
+def keep_precompiled_headers() -> None:
+    """In a child, which may read its parent's, but is not to remove them when it ends."""
+    if "warp._src.context" in sys.modules:
+        for folder in sys.modules["warp._src.context"].runtime._pch_dirs.values():
+            folder._finalizer.detach()
+
+
 def serve() -> int:
     """Answer requests until there are no more; in a child, its exit code."""
     requests, answers = os.fdopen(os.dup(0)), os.fdopen(os.dup(1), "w")
@@ -62,8 +73,7 @@ def serve() -> int:
             os.environ.update(asked["env"])
             os.chdir(asked["cwd"])
             tempfile.tempdir = None  # is asked of the variables again
-            if "warp" in sys.modules:  # its folder of precompiled headers is the parent's
-                sys.modules["warp"].config.use_precompiled_headers = False
+            keep_precompiled_headers()
             redirect(asked["out"], asked["err"])
             sys.argv = ["warpnerf", *asked["arguments"]]
             return start()
@@ -72,4 +82,5 @@ def serve() -> int:
 
 
 if __name__ == "__main__":
+    compile_as_tests_do()
     sys.exit(serve())

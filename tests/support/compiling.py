@@ -22,7 +22,12 @@ except ImportError:  # Windows: each compiles for itself
 OPTION = "optimization_level"
 FLOAT64 = "warpnerf_kernels_float64"
 """Where modules of kernels are that no training runs."""
-LOCKS = Path(tempfile.gettempdir()) / "warpnerf-tests-locks"
+LOCKS = Path(
+    os.environ.setdefault(
+        "WARPNERF_TESTS_LOCKS", str(Path(tempfile.gettempdir()) / "warpnerf-tests-locks")
+    )
+)
+"""The same for all processes of the tests, also for those with temporary files elsewhere."""
 
 
 @contextmanager
