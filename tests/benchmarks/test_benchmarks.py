@@ -186,6 +186,7 @@ def test_one_thread_uses_all_that_it_has_room_for(on_cpu):
     assert 0 < used == room
 
 
+@pytest.mark.ci
 def test_rendering(tmp_path):
     options = ("--grid", "24", "--pixels", "16", "--rounds", "2", "--threads", "2")
     record, _ = run("rendering.py", tmp_path / "record.json", *options)

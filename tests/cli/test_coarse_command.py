@@ -53,6 +53,7 @@ def test_the_command_refuses_distances_of_cameras_that_see_nothing(tmp_path: Pat
     assert done.err.count("\n") == 1 and "something opaque; use auto, or a number" in done.err
 
 
+@pytest.mark.ci
 def test_the_command_keeps_what_it_found(tmp_path: Path) -> None:
     scene = make_scene(tmp_path)
     done = command("train", scene, "--output", "run", *FEW, folder=tmp_path, limit=None)
@@ -64,6 +65,7 @@ def test_the_command_keeps_what_it_found(tmp_path: Path) -> None:
     assert config.found.content_distance == config.content_distance
 
 
+@pytest.mark.ci
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGINT for one process there")
 def test_stopped_while_it_looks_the_command_leaves_nothing(tmp_path: Path) -> None:
     scene, run = make_scene(tmp_path), tmp_path / "run"

@@ -47,6 +47,7 @@ def test_version() -> None:
     assert out.startswith("warpnerf ")
 
 
+@pytest.mark.ci
 def test_photographs_that_do_not_fit_are_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -99,6 +100,7 @@ def test_training_leaves_a_whole_run(trained: tuple[Path, str]) -> None:
     assert (config["scene"], config["downscale"]) == ("builtin:room-sparse", 8)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(("views", "looked_at"), [("1", 1), ("none", None)])
 def test_fewer_views_are_looked_at(views: str, looked_at: int | None, tmp_path: Path) -> None:
     small = "16" if views == "none" else "8"  # too small for SSIM
@@ -316,6 +318,7 @@ def test_a_folder_that_is_trained_into_is_left_alone(trained: tuple[Path, str]) 
     assert (folder / "field.safetensors").exists()
 
 
+@pytest.mark.ci
 def test_a_training_that_nobody_reads_goes_on(tmp_path: Path) -> None:
     process = start("train", *TINY, "--steps", "30", "--output", tmp_path / "run")
     assert process.stdout is not None and process.stderr is not None

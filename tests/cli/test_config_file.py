@@ -15,6 +15,7 @@ from warpnerf.cli.configured import STEPS_OF_TIMED
 from warpnerf.cli.main import main
 
 
+@pytest.mark.ci
 def test_a_run_is_repeated_from_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     tiny = "builtin:room-sparse --downscale 8 --threads 1 --steps 20 --grid.voxels 512 --model rgb"
     assert main(["train", *tiny.split(), "--output", str(tmp_path / "a")]) == 0

@@ -16,6 +16,7 @@ from warpnerf.reports.demonstration import CAMERAS, NAMES, SHOWN, demo
 from warpnerf.training.trainer import Trainer
 
 
+@pytest.mark.ci
 def test_the_command_says_what_goes_on_and_shows_both(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

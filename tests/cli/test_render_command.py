@@ -290,6 +290,7 @@ def test_what_is_no_run_ends_with_a_sentence(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.ci
 def test_ctrl_c_leaves_nothing_behind(run_folder: Path, tmp_path: Path) -> None:
     target = tmp_path / "film.gif"
     command = [sys.executable, "-m", "warpnerf", "render", str(run_folder), "--seconds", "600"]

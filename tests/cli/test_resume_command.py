@@ -50,7 +50,12 @@ def begun(folder: Path, *signals: int, resumed: bool = False) -> tuple[int, str,
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGINT for one process there")
 @pytest.mark.parametrize(
-    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
+    ("number", "code"),
+    [
+        (signal.SIGINT, 130),
+        pytest.param(signal.SIGTERM, 143, marks=pytest.mark.ci),
+        pytest.param(signal.SIGHUP, 129, marks=pytest.mark.slow),
+    ],
 )
 def test_stopped_it_saves_and_says_how_to_go_on(tmp_path: Path, number: int, code: int) -> None:
     folder = tmp_path / "my run"
@@ -94,6 +99,7 @@ def reports(folder: Path) -> list[tuple[int, float]]:
     return [(line["step"], line["loss"]) for line in map(json.loads, lines)]
 
 
+@pytest.mark.ci
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGINT for one process there")
 def test_asked_twice_it_ends_at_once_and_the_checkpoint_stays(tmp_path: Path) -> None:
     folder = tmp_path / "run"
@@ -119,6 +125,7 @@ def test_a_finished_run_is_resumed_to_its_figures(
     assert (folder / "checkpoint-00000030.safetensors").stat().st_mtime_ns == before
 
 
+@pytest.mark.ci
 def test_a_finished_run_keeps_its_field_alone(trained: tuple[Path, str], tmp_path: Path) -> None:
     folder = tmp_path / "run"
     code, _, err = run("train", *TINY, "--steps", "30", "--output", folder)
@@ -139,6 +146,7 @@ def test_a_finished_run_keeps_its_field_alone(trained: tuple[Path, str], tmp_pat
     assert (folder / "metrics.json").read_bytes() == (trained[0] / "metrics.json").read_bytes()
 
 
+@pytest.mark.ci
 def test_a_finished_run_is_trained_for_longer(trained: tuple[Path, str], tmp_path: Path) -> None:
     folder = shutil.copytree(trained[0], tmp_path / "run")
     code, out, err = run("train", "--resume", folder, "--steps", "40")

@@ -67,6 +67,7 @@ def port_of(address: str) -> int:
     return int(address.rpartition(":")[2])
 
 
+@pytest.mark.ci
 def test_a_run_is_served_until_ctrl_c(run_folder: Path) -> None:
     before = {path: path.stat().st_mtime_ns for path in run_folder.rglob("*")}
     process, address = started("view", run_folder, "--port", "0", "--threads", "1")
@@ -179,6 +180,7 @@ def test_a_training_is_looked_at_and_stopped(run_folder: Path, tmp_path: Path) -
     assert Run(tmp_path / "run").last_step
 
 
+@pytest.mark.ci
 def test_a_training_with_a_page_ends_by_itself(run_folder: Path, tmp_path: Path) -> None:
     scene = run_folder.parent / "scene"
     tiny = ("--voxels", "512", "--threads", "1", "--steps", "50")

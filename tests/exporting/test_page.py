@@ -99,6 +99,7 @@ def in_unit(camera: Camera, unit: float) -> Camera:
     return replace(camera, c2w=camera.c2w * [1.0, 1.0, 1.0, unit])
 
 
+@pytest.mark.ci
 @pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
 def test_a_browser_without_a_network_shows_the_ball(page: Path, tmp_path: Path) -> None:
     """Opened as a file: red where x is above the middle's, green where not, gray around."""

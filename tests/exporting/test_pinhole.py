@@ -84,6 +84,7 @@ def test_no_picture_gets_smaller_than_it_has_to() -> None:
     assert -0.5 < at[0][:, 0].min() < 1.5 or 118.5 < at[1][:, 0].max() < 120.5
 
 
+@pytest.mark.ci
 def test_the_folder_has_pinhole_cameras_only(tmp_path: Path) -> None:
     scene = ball_scene(k1=0.1, k2=0.02)
     export(

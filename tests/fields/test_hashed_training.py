@@ -68,6 +68,7 @@ def test_files_hold_it(states: list[TrainingState], tmp_path: Path) -> None:
     require_files_hold(states[1], CONFIG, tmp_path / "field.safetensors")
 
 
+@pytest.mark.ci
 def test_a_hidden_layer_learns_and_is_kept(tmp_path: Path) -> None:
     config = replace(CONFIG, field=replace(CONFIG.field, hidden=16, learning_rate=0.02))
     states = states_of(config, early=100)

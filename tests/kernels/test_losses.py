@@ -109,6 +109,7 @@ def assert_packs(losses: LossConfig, model: Model) -> None:
                 assert_close(found[2], expected[2], 2e-5)
 
 
+@pytest.mark.ci
 def test_losses_with_a_models_own(kernels64: Kernels, on_cpu: None) -> None:
     """They add up, in packs as well, where the model's comes first."""
     own = WithLosses(near_two=0.3, together=2.0)

@@ -245,7 +245,8 @@ def fused_against_two(kernels: Kernels, p: Problem, scaling: str, tolerance: flo
     assert_close(error, ((rgb - p.target) ** 2).sum(-1), tolerance)
 
 
-@pytest.mark.parametrize("scaling", ["none", "clamped"])
+@pytest.mark.ci
+@pytest.mark.parametrize("scaling", [pytest.param("none", marks=pytest.mark.slow), "clamped"])
 def test_fused_launch_equals_forward_and_backward(
     scaling: str, kernels64: Kernels, kernels32: Kernels
 ) -> None:
@@ -329,6 +330,7 @@ def test_nothing_flows_back_from_behind_an_opaque_wall(kernels32: Kernels) -> No
         assert not gradient[6:].any()
 
 
+@pytest.mark.ci
 def test_float32_against_float64_on_300_000_samples(kernels64: Kernels, packed: Kernels) -> None:
     require_float32_like_float64(kernels64, packed)
 

@@ -41,7 +41,7 @@ def of(threads: int) -> Kernels:
 
 
 @pytest.mark.parametrize("threads", [2, 3, 4, PLANES + 2])
-@pytest.mark.parametrize("scaling", ["none", "clamped"])
+@pytest.mark.parametrize("scaling", [pytest.param("none", marks=pytest.mark.slow), "clamped"])
 def test_one_thread_against_more(threads: int, scaling: str) -> None:
     for seed in range(3):
         for p in (problem(seed), early(masked(problem(seed), seed))):

@@ -187,6 +187,7 @@ def test_a_model_has_one_loss_on_samples() -> None:
         parts_with(SmoothRgb(), "float32", LossConfig(sample_colour=0.1))
 
 
+@pytest.mark.ci
 def test_losses_in_a_frustum_are_those_of_distances_in_the_scene(kernels64: Kernels) -> None:
     """Weights of the oracle, its distances, and lengths of steps by differences of these."""
     packs = Kernels("float32", "cpu", packed=True)
@@ -337,6 +338,7 @@ def test_a_space_is_the_same_for_kernels_and_host(kernels64: Kernels) -> None:
     np.testing.assert_allclose(widths, by_differences(SMOOTH, seen, f, 0.3), rtol=1e-5)
 
 
+@pytest.mark.ci
 def test_gradients_in_another_space(kernels64: Kernels) -> None:
     problems = [unbounded(problem(model_of("rgb"), seed), "smooth", 0.4) for seed in range(4)]
     linf = [replace(p, contraction="linf") for p in problems]

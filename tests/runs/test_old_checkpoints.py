@@ -222,6 +222,7 @@ def in_folded_space() -> Scene:
     return replace(ball(), unbounded=True)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("scene", [ball, in_folded_space])
 @pytest.mark.parametrize("content_distance", ["auto", 1.5])
 def test_a_training_without_a_plan_goes_on_as_it_would_have(
@@ -250,7 +251,10 @@ ADDED_SINCE = ("content_distances", "restarted")
 """To a training's header, from format 5 to 7."""
 
 
-@pytest.mark.parametrize("step", [GROWING[0], GROWING[0] + 1, GROWING[1] + 1])
+@pytest.mark.ci
+@pytest.mark.parametrize(
+    "step", [GROWING[0], pytest.param(GROWING[0] + 1, marks=pytest.mark.slow), GROWING[1] + 1]
+)
 def test_growths_that_were_counted_with_a_tighter_box(
     step: int, tmp_path: Path, on_cpu: None
 ) -> None:

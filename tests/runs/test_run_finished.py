@@ -102,8 +102,13 @@ def test_a_field_alone_is_trained_no_longer_whether_it_was_looked_at_or_not(tmp_
     assert (tmp_path / "run" / "metrics.json").exists()
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
-    ("object", "named", "other"), [(False, "dense", "vm"), (True, "vm", "dense")]
+    ("object", "named", "other"),
+    [
+        (False, "dense", "vm"),
+        pytest.param(True, "vm", "dense", marks=pytest.mark.slow),  # compiles another field
+    ],
 )
 def test_what_auto_stood_for_may_be_named_when_views_are_left_to_look_at(
     object: bool, named: str, other: str, tmp_path: Path
@@ -160,6 +165,7 @@ def test_a_limit_that_did_not_end_the_training_is_not_raised_alone(
     assert files_of(tmp_path) == before
 
 
+@pytest.mark.ci
 def test_what_is_kept_is_remembered_when_it_is_resumed(tmp_path: Path) -> None:
     train(tmp_path, keep="checkpoint")
 

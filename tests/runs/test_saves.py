@@ -185,7 +185,7 @@ def whole_steps(folder: Path) -> set[int]:
 
 
 @pytest.mark.ci
-@pytest.mark.parametrize("finished", [False, True])
+@pytest.mark.parametrize("finished", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_killed_while_replacing_a_run_one_of_the_two_is_whole(
     tmp_path: Path, finished: bool
 ) -> None:

@@ -33,7 +33,9 @@ def shuffled(views: list[View]) -> list[View]:
 
 
 @pytest.mark.ci
-@pytest.mark.parametrize("factor", [0.5, 0.7, 2.0, 4.0])
+@pytest.mark.parametrize(
+    "factor", [0.5, *(pytest.param(x, marks=pytest.mark.slow) for x in (0.7, 2.0, 4.0))]
+)
 def test_focal_lengths_of_another_size_are_named(factor: float, room: list[View]) -> None:
     found, _, warning = held(with_focal(room, factor))
     assert warning.startswith("focal lengths do not fit the photographs")
@@ -50,12 +52,14 @@ def test_focal_lengths_that_cameras_do_not_tell_are_believed() -> None:
         assert "focal" not in held(with_focal(wall, factor))[2]
 
 
+@pytest.mark.ci
 def test_photographs_of_other_poses_are_named(room: list[View]) -> None:
     assert held(shuffled(room))[2].startswith(REFUTED)
     same = [replace(view, image=room[0].image) for view in room]
     assert held(same)[2].startswith(REFUTED)
 
 
+@pytest.mark.ci
 def test_photographs_that_hardly_overlap_refute_nothing(room: list[View]) -> None:
     """Nor do few, or such without texture."""
     far = room[::3]

@@ -190,6 +190,7 @@ def test_a_term_of_the_jacobian_that_does_nothing_is_refused(
         Trainer(facing(), config(jacobian="paper", **changes))
 
 
+@pytest.mark.ci
 def test_training_and_going_on(tmp_path: Path) -> None:
     """It learns and grows; the same bits after an interruption; files hold the frustum."""
     scene = facing()
@@ -269,6 +270,7 @@ def test_node_coordinates_are_those_that_kernels_read() -> None:
     assert ((behind < 0.0) | (behind > 48.0)).any()
 
 
+@pytest.mark.ci
 def test_surfaces_and_splats_come_out_in_scene_units(tmp_path: Path) -> None:
     field = ball_field(contraction="ndc")
     made = extract_surface(field, level=20.0 * math.log(2.0))

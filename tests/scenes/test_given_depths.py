@@ -106,6 +106,7 @@ def test_inverse_depths_and_depths_of_others_are_told(views: list[View]) -> None
     assert told(views, lambda depth: np.full_like(depth, np.nan)) == ""
 
 
+@pytest.mark.ci
 def test_a_scene_file_tells_of_its_depths(
     views: list[View], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

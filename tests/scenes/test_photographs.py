@@ -174,6 +174,7 @@ def test_a_disk_that_is_full_later_is_told(tmp_path: Path, monkeypatch: pytest.M
         load_scene(tmp_path, images="disk", image_folder=tmp_path / "nowhere")
 
 
+@pytest.mark.ci
 def test_the_command_says_where_they_are_and_goes_on_anywhere(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

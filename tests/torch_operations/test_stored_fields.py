@@ -181,6 +181,7 @@ def test_first_tensors_are_those_of_a_training() -> None:
     assert list(first_tensors("hash", BOX)) == ["values", "decoder"]
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("kind", [VM, replace(HASH, coarsest=4, finest=16)])
 def test_tensors_of_a_training_are_seen_as_its_field_is(kind: StorageKind) -> None:
     """But for what is next to nothing, which a field skips."""

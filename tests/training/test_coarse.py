@@ -129,6 +129,7 @@ def test_content_distance_of_a_room(
         assert (np.abs(middle - [0.0, 0.0, 1.3]) < 0.5).all()
 
 
+@pytest.mark.ci
 def test_trainings_with_and_without_scaling_have_one_extent() -> None:
     scene = of_room(outward(12))[0]
     config = wn.TrainConfig(model="rgb", loss=SQUARED, threads=2, coarse_steps=60)

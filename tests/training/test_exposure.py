@@ -185,6 +185,7 @@ def test_the_mean_of_one_photograph_is_itself() -> None:
     assert result.exposures is None
 
 
+@pytest.mark.ci
 def test_photographs_of_the_room_are_alike(monkeypatch: pytest.MonkeyPatch) -> None:
     """Also in a training that is too short to show more than a blur."""
     monkeypatch.undo()

@@ -127,6 +127,7 @@ def test_it_says_what_is_trained() -> None:
     assert blind.random_background and blind.background == (1.0, 1.0, 1.0)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(("scene", "config"), [(contracted, tiny_config), (facing, in_ndc)])
 def test_a_training_does_what_its_plan_says(
     scene: Callable[[], Scene], config: Callable[[], wn.TrainConfig], on_cpu: None

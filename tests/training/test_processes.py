@@ -136,6 +136,7 @@ def sentences(ended: list[Ended]) -> list[str]:
     return [line for line in lines if line.startswith("warpnerf: ")]
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("lost", "by"), [(1, signal.SIGKILL), (1, signal.SIGSTOP), (0, signal.SIGKILL)]
 )

@@ -69,7 +69,8 @@ def test_the_same_seed_gives_the_same_bits(threads: int, on_cpu: None) -> None:
     np.testing.assert_array_equal(found[0], found[1])
 
 
-@pytest.mark.parametrize("step", [3, 7, 14])
+@pytest.mark.ci
+@pytest.mark.parametrize("step", [pytest.param(3, marks=pytest.mark.slow), 7, 14])
 def test_a_training_goes_on_with_equal_bits(step: int, tmp_path: Path, on_cpu: None) -> None:
     """Before, at and after a growth, which makes box and proposal tighter."""
     begun = config()
@@ -127,6 +128,7 @@ def test_a_proposal_learns_every_few_updates_once_it_is_not_flattened() -> None:
     assert 0.0 < kind.anneal(0.0) < kind.anneal(0.01) < kind.anneal(0.05)
 
 
+@pytest.mark.ci
 def test_a_field_comes_back_with_its_proposal(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, on_cpu: None
 ) -> None:

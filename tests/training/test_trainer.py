@@ -63,6 +63,7 @@ def test_resumed_after_any_step_it_ends_the_same(
         assert_same_state(without_seconds(resumed), without_seconds(whole))
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("grow_at", ["auto", ()])
 def test_resumed_it_grows_as_its_kind_of_scene_does(
     grow_at: Any, tmp_path: Path, on_cpu: None
@@ -123,6 +124,7 @@ def test_the_grid_of_an_object_grows_earlier_into_a_tighter_box(on_cpu: None) ->
         GridConfig(grow_at="never")  # type: ignore[arg-type]
 
 
+@pytest.mark.ci
 def test_pixels_that_see_nothing_are_left_out_of_bounded_scenes(on_cpu: None) -> None:
     def seen(scene: Scene, **changes: Any) -> tuple[float, float]:
         config = tiny_config(**QUICK, **changes)

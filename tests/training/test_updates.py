@@ -144,7 +144,7 @@ def test_updates_are_counted_apart_from_steps(monkeypatch: pytest.MonkeyPatch) -
     [
         *(("deferred", *how) for how in ((1, 1 << 26), (3, 1 << 26), (3, 32000))),
         ("rgb", 3, 32000),
-        ("per_sample", 3, 32000),
+        pytest.param("per_sample", 3, 32000, marks=pytest.mark.slow),
     ],
 )
 def test_an_update_adds_up_the_gradients_of_its_steps(

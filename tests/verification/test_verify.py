@@ -171,6 +171,7 @@ def test_each_can_fail(
     assert all(any(word in name for name in spoilt) for word in words)
 
 
+@pytest.mark.ci
 def test_training_that_differs_fails(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], device: str, on_cpu: None
 ) -> None:
