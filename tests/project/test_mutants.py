@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import warp as wp
 
-from tests.support.marks import SLOW
+from tests.support.marks import LISTED, SLOW
 from warpnerf.runtime import kernel_cache
 
 HERE = Path(__file__).parents[1]
@@ -46,10 +46,11 @@ def test_each_mutant_finds_its_text(mutants: tuple, tmp_path: Path) -> None:
 @pytest.mark.ci  # collects all tests
 def test_each_mutant_names_tests_that_there_are(mutants: tuple) -> None:
     """Also by the parameters in brackets, and where the host's are those that CI runs."""
-    options = ("--collect-only", "-q", "-n0", "-m", "", "-p", "tests.support.marks")
+    options = ("--collect-only", "-qq", "-n0", "-m", "", "-p", "tests.support.marks")
     command = [sys.executable, "-m", "pytest", *options]
     done = subprocess.run(command, capture_output=True, text=True, cwd=HERE.parent, check=True)
-    tests = [line.removeprefix("tests/") for line in done.stdout.splitlines() if "::" in line]
+    lines = [line for line in done.stdout.splitlines() if line.startswith(LISTED)]
+    tests = [line.removeprefix(f"{LISTED}tests/") for line in lines]
     for marks, found in (
         ("", [test.removesuffix(SLOW) for test in tests]),
         ("not slow", [test for test in tests if not test.endswith(SLOW)]),
