@@ -19,17 +19,15 @@ from tests.support.stored_problems import (  # noqa: E402
     random_tensors,
     stored,
 )
-from tests.support.torch_calls import problem  # noqa: E402
-from tests.torch_operations.test_stored_fields import (  # noqa: E402
-    gradients,
-    leaves,
-    with_edges,
-)
+from tests.support.torch_calls import gradients, leaves, problem, with_edges  # noqa: E402
 from warpnerf import jax as wj  # noqa: E402
 from warpnerf.checks import InputError  # noqa: E402
 
 
-@pytest.mark.parametrize(("name", "dtype"), [("vm", "float64"), ("hash", "float32")])
+@pytest.mark.parametrize(
+    ("name", "dtype"),
+    [("vm", "float64"), ("hash with a hidden layer", "float64"), ("hash", "float32")],
+)
 def test_they_are_those_of_torch(name: str, dtype: str) -> None:
     """Bit for bit, gradients too."""
     p, kind = problem(3), KINDS[name]
@@ -90,8 +88,15 @@ def test_bad_edges_are_refused() -> None:
     def drawn(edges: Any) -> Any:
         return wj.render_intervals(raw, ray, ray, box, edges).rgb.sum()
 
+    def weighs(raw: Any) -> Any:
+        return wj.render_intervals(raw, ray, ray, box, edges).weights.sum()
+
     with pytest.raises(InputError, match="rising order"):
         drawn(edges[:, ::-1])
+    single = raw.astype("float32")
+    with pytest.raises(InputError, match="finite distances"):
+        wj.render_intervals(single, ray, ray, box, np.array([[0.0, 1.0, 1e39]]))
+    assert not jax.grad(weighs)(raw).any()
     with pytest.raises(Exception, match=r"InputError: edges must be .* in rising order"):
         jax.jit(drawn)(edges[:, ::-1]).block_until_ready()
     with pytest.raises(InputError, match=r"edges must be \[n_rays, n \+ 1\]"):

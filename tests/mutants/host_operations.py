@@ -8,6 +8,12 @@ INTERVALS = f"{TESTS}test_intervals_of_stored_fields_against_the_oracle"
 ALIKE = f"{TESTS}test_intervals_that_are_steps_are_steps"
 FIELDS = f"{TESTS}test_bad_fields_are_refused"
 EDGES = f"{TESTS}test_bad_edges_are_refused"
+IN_PLACE = f"{TESTS}test_what_changes_in_place_is_noticed"
+BOXES = f"{TESTS}test_bad_boxes_are_refused"
+OTHER = f"{TESTS}test_other_forms_of_the_same"
+OF_JAX = "jax_operations/test_stored_fields.py::test_they_are_those_of_torch"
+EDGES_OF_JAX = "jax_operations/test_stored_fields.py::test_bad_edges_are_refused"
+ARGUMENTS, JAX = "rendering/arguments.py", "jax/launches.py"
 FIRST = f"{TESTS}test_first_tensors_are_those_of_a_training"
 OPERATION, STORED = "rendering/operation.py", "rendering/stored.py"
 RENDERING, TENSORS = "torch/rendering.py", "torch/tensors.py"
@@ -53,7 +59,7 @@ MUTANTS = [
     of_host(
         "operation: any shapes", STORED, "if tuple(shape) != expected.shape:", "if False:", FIELDS
     ),
-    of_host("operation: one node is enough", STORED, "if min(size) < 2 or", "if", FIELDS),
+    of_host("operation: one node is enough", STORED, "if min(x, y, z) < 2 or", "if", FIELDS),
     of_host("operation: a hash with a size", STORED, "if size is not None:", "if False:", FIELDS),
     of_host(
         "operation: tensors of several types",
@@ -96,5 +102,65 @@ MUTANTS = [
         "not 2 <= shape[1] - 1 <= MOST",
         "shape[1] - 1 > MOST",
         EDGES,
+    ),
+    of_host(
+        "operation: tensors that are not watched",
+        "torch/launches.py",
+        "ctx.save_for_backward(*outputs, *given)",
+        "ctx.save_for_backward(*outputs, *(x.clone() for x in given))",
+        IN_PLACE,
+    ),
+    of_host(
+        "operation: a box of any size",
+        ARGUMENTS,
+        " or np.abs(array).max() > MAX_COORDINATE",
+        "",
+        BOXES,
+    ),
+    of_host(
+        "operation: a box of no size",
+        ARGUMENTS,
+        "if not (lower < upper).all():",
+        "if False:",
+        BOXES,
+    ),
+    of_host(
+        "operation: two corners of two numbers", ARGUMENTS, " and array.shape == (3,)", "", BOXES
+    ),
+    of_host("operation: dense is no stored field", STORED, "if name != DENSE.name", "", FIELDS),
+    of_host(
+        "operation: used up without a word",
+        ARGUMENTS,
+        'used_up = "" if found else',
+        'used_up = "" if True else',
+        OTHER,
+    ),
+    of_host(
+        "operation: first tensors use a head up",
+        STORED,
+        "model = model_in(head)",
+        "model = model_in(head); list(getattr(head, 'layers', ()))",
+        OTHER,
+    ),
+    of_host(
+        "operation, JAX: weights that are not zeroed",
+        JAX,
+        "interval_weights.zero_()",
+        "interval_weights.fill_(1.0)",
+        OF_JAX,
+    ),
+    of_host(
+        "operation, JAX: gradients that are not zeroed",
+        JAX,
+        "            gradient.zero_()",
+        "            gradient.fill_(1.0)",
+        OF_JAX,
+    ),
+    of_host(
+        "operation, JAX: edges that fall",
+        JAX,
+        "(edges[:, 1:] >= edges[:, :-1]).all() and",
+        "",
+        EDGES_OF_JAX,
     ),
 ]

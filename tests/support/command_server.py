@@ -50,9 +50,13 @@ def code_of(child: int, limit: float | None) -> int | None:
 
 def keep_precompiled_headers() -> None:
     """In a child, which may read its parent's, but is not to remove them when it ends."""
-    if "warp._src.context" in sys.modules:
+    if "warp" not in sys.modules:
+        return
+    try:
         for folder in sys.modules["warp._src.context"].runtime._pch_dirs.values():
             folder._finalizer.detach()
+    except (AttributeError, KeyError):  # another version of Warp: the child does without
+        sys.modules["warp"].config.use_precompiled_headers = False
 
 
 def serve() -> int:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from tests.support.problems import Problem, make_problem
 from warpnerf.rendering.steps import Steps
-from warpnerf.torch import March, RenderedRays, render_rays
+from warpnerf.torch import March, RenderedRays, render_intervals, render_rays
 
 
 def problem(seed: int, **changes: Any) -> Problem:
@@ -61,3 +61,44 @@ def torch_device(device: str) -> str:
 
 def tensor(values: Any, device: str, dtype: torch.dtype = torch.float64) -> Tensor:
     return torch.tensor(values, dtype=dtype, device=torch_device(device))
+
+
+def leaves(
+    tensors: dict[str, Any], device: str, dtype: torch.dtype = torch.float64
+) -> dict[str, torch.Tensor]:
+    return {
+        name: torch.tensor(x, dtype=dtype, device=torch_device(device)).requires_grad_()
+        for name, x in tensors.items()
+    }
+
+
+def gradients(p: Problem, out: Any, given: dict[str, torch.Tensor]) -> dict[str, Any]:
+    like = next(iter(given.values()))
+    adjoints = [
+        torch.tensor(a, dtype=like.dtype, device=like.device)
+        for a in (p.adj_rgb, p.adj_opacity, p.adj_depth)
+    ]
+    found = torch.autograd.grad(out[:3], [*given.values()], adjoints)
+    return {name: x.cpu().numpy() for name, x in zip(given, found, strict=True)}
+
+
+def with_edges(
+    p: Problem, raw: Any, like: torch.Tensor, edges: Any, scaling: Any, **options: Any
+) -> Any:
+    """render_intervals of a problem."""
+
+    def like_raw(values: Any) -> torch.Tensor:
+        return torch.tensor(values, dtype=like.dtype, device=like.device)
+
+    return render_intervals(
+        raw,
+        like_raw(p.origins),
+        like_raw(p.directions),
+        (p.box_min, p.box_max),
+        like_raw(edges),
+        density_shift=p.density_shift,
+        background=like_raw(p.background),
+        scaling=scaling,
+        content_distance=like_raw(p.content_distance),
+        **options,
+    )

@@ -1,7 +1,7 @@
 """render_rays of fields that are no dense grids, and render_intervals, against the oracle."""
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -9,9 +9,11 @@ import torch
 
 from tests.support.expected import assert_close
 from tests.support.field_trainings import config_of
+from tests.support.model_problems import FEATURES_SMALL
 from tests.support.problems import Problem
 from tests.support.stored_problems import (
     HASH,
+    HIDDEN,
     KINDS,
     SIZE,
     VM,
@@ -22,12 +24,21 @@ from tests.support.stored_problems import (
     stored,
 )
 from tests.support.tiny_trainings import ball
-from tests.support.torch_calls import call, problem, torch_device
+from tests.support.torch_calls import (
+    call,
+    gradients,
+    leaves,
+    problem,
+    torch_device,
+    with_edges,
+)
 from warpnerf.checks import InputError
 from warpnerf.config import GridConfig
-from warpnerf.model.storage_kinds import AUTO_FIELD, StorageKind
+from warpnerf.model.interface import loader
+from warpnerf.model.storage_kinds import AUTO_FIELD, DENSE, StorageKind, Vm
 from warpnerf.rendering.rays import camera_rays
-from warpnerf.torch import March, StoredField, first_tensors, render_intervals, render_rays
+from warpnerf.torch import Head, March, StoredField, first_tensors, render_intervals, render_rays
+from warpnerf.torch.launches import Constants
 from warpnerf.training.trainer import Trainer
 
 BOX = (-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)
@@ -36,47 +47,6 @@ RAY = torch.tensor([[0.1, 0.2, -2.0]]), torch.tensor([[0.0, 0.0, 1.0]])
 
 def varied(seed: int) -> Problem:
     return problem(seed, content_distance=np.random.default_rng(seed).uniform(0.5, 3.0, size=12))
-
-
-def leaves(
-    tensors: dict[str, Any], device: str, dtype: torch.dtype = torch.float64
-) -> dict[str, torch.Tensor]:
-    return {
-        name: torch.tensor(x, dtype=dtype, device=torch_device(device)).requires_grad_()
-        for name, x in tensors.items()
-    }
-
-
-def gradients(p: Problem, out: Any, given: dict[str, torch.Tensor]) -> dict[str, Any]:
-    like = next(iter(given.values()))
-    adjoints = [
-        torch.tensor(a, dtype=like.dtype, device=like.device)
-        for a in (p.adj_rgb, p.adj_opacity, p.adj_depth)
-    ]
-    found = torch.autograd.grad(out[:3], [*given.values()], adjoints)
-    return {name: x.cpu().numpy() for name, x in zip(given, found, strict=True)}
-
-
-def with_edges(
-    p: Problem, raw: Any, like: torch.Tensor, edges: Any, scaling: Any, **options: Any
-) -> Any:
-    """render_intervals of a problem."""
-
-    def like_raw(values: Any) -> torch.Tensor:
-        return torch.tensor(values, dtype=like.dtype, device=like.device)
-
-    return render_intervals(
-        raw,
-        like_raw(p.origins),
-        like_raw(p.directions),
-        (p.box_min, p.box_max),
-        like_raw(edges),
-        density_shift=p.density_shift,
-        background=like_raw(p.background),
-        scaling=scaling,
-        content_distance=like_raw(p.content_distance),
-        **options,
-    )
 
 
 def require_oracle(p: Problem, kind: StorageKind, device: str, edges: Any = None) -> None:
@@ -215,13 +185,19 @@ def refused(match: str, kind: Any = "vm", size: Any = SIZE, **changed: Any) -> N
         render_rays(StoredField(kind, tensors, size), *RAY, BOX, step=0.1)
 
 
+class Unregistered(Vm):
+    name: ClassVar[str] = "unregistered"
+
+
 def test_bad_fields_are_refused() -> None:
-    refused("kind must be one of dense, vm, hash", kind="tensorf")
-    refused("kind must be vm, hash, or one of these configured", kind=AUTO_FIELD)
-    refused("kind must be vm, hash, or one of these configured", kind=5)
-    refused("size must be three whole numbers, the nodes of a vm", size=None)
+    refused("kind must be one of vm, hash, not 'tensorf'", kind="tensorf")
+    refused("kind must be one of vm, hash, not 'dense'", kind="dense")
+    for kind in (AUTO_FIELD, DENSE, Unregistered(), Vm, 5, None):
+        refused("kind must be vm or hash, or one configured, as warpnerf.Vm", kind=kind)
+    refused("size must be three whole numbers, nodes along each axis for the vm", size=None)
     refused("size must be three whole numbers", size=(4, 5.5, 6))
     refused("size must be two nodes or more", size=(1, 6, 5))
+    refused("size must be two nodes or more", size=(np.int64(2**22),) * 3)
     refused("tensors of a hash must be values, decoder, by name", kind="hash", size=None)
     refused("tensors of a vm must be planes, lines, decoder", lines=None)
     lines, named = torch.zeros(15, 16), r"tensors\['lines'\] must be "
@@ -229,16 +205,101 @@ def test_bad_fields_are_refused() -> None:
     refused(named + "torch.float32, as others, not torch.float64", lines=lines.double())
     refused(named + "float32 or float64", lines=lines.half())
     refused(named + "a torch tensor, not float", lines=3.0)
-    with pytest.raises(InputError, match=r"size must be None, not .*a hash has its levels"):
+    for nameless in (None, [lines], lines):
+        with pytest.raises(InputError, match="tensors of a field must be a dictionary of them"):
+            render_rays(StoredField("vm", nameless, SIZE), *RAY, BOX, step=0.1)  # type: ignore[arg-type]
+
+
+BAD_BOXES: dict[str, tuple[Any, str]] = {
+    "reversed": (BOX[::-1], "box_max must lie above box_min"),
+    "text": (("low", BOX[1]), "box_min must be three finite numbers"),
+    "two": (((0, 0), BOX[1]), "box_min must be three finite numbers within 1e"),
+    "too large": (((-1e300,) * 3, (1e300,) * 3), "box_min must be three finite numbers within 1e"),
+    "too small": (((0, 0, 0), (5e-324,) * 3), "the box's edge along x must lie between 1e-12"),
+    "one corner": (BOX[:1], "box must be its lower and its upper corner"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_BOXES)
+def test_bad_boxes_are_refused(name: str) -> None:
+    box, message = BAD_BOXES[name]
+    given = {k: torch.tensor(v) for k, v in first_tensors("hash", BOX).items()}
+    with pytest.raises(InputError, match=message):
+        first_tensors("hash", box)
+    with pytest.raises(InputError, match=message):
+        render_rays(StoredField("hash", given), *RAY, box, step=0.1)
+
+
+def test_bad_first_tensors_are_refused() -> None:
+    with pytest.raises(InputError, match=r"size must be left out, not .*: a hash has levels"):
         first_tensors("hash", BOX, SIZE)
-    with pytest.raises(InputError, match="kind must be one of dense, vm, hash"):
+    with pytest.raises(InputError, match="kind must be one of vm, hash"):
         first_tensors("nerf", BOX, SIZE)
-    with pytest.raises(InputError, match="box_max must lie above box_min"):
-        first_tensors("vm", BOX[::-1], SIZE)
-    with pytest.raises(InputError, match="box_min must be three finite numbers"):
-        first_tensors("vm", ("low", BOX[1]), SIZE)
     with pytest.raises(InputError, match="seed must be"):
         first_tensors("vm", BOX, SIZE, seed=-1)
+    with pytest.raises(InputError, match="model must be"):
+        first_tensors("vm", BOX, SIZE, head="nerf")
+
+
+def test_other_forms_of_the_same() -> None:
+    """A box of tensors, tensors in a module, and a head whose layers iterate once."""
+    corners = tuple(torch.tensor(x) for x in BOX)
+    network = torch.nn.Sequential(torch.nn.Linear(24, 64), torch.nn.Linear(64, 64))
+    once = Head("deferred", iter([*network.parameters(), torch.zeros(3, 64), torch.zeros(3)]))
+    given = first_tensors("vm", corners, SIZE, head=once)  # type: ignore[arg-type]
+    module = torch.nn.ParameterDict({k: torch.tensor(v) for k, v in given.items()})
+    field = StoredField("vm", module, SIZE)  # type: ignore[arg-type]
+    render_rays(field, *RAY, BOX, 0.1, head=once).rgb.sum().backward()
+    assert all(tensor.grad is not None for tensor in module.values())
+    with pytest.raises(InputError, match="what iterates once, as parameters"):
+        render_rays(field, *RAY, BOX, 0.1, head=once)
+
+
+def test_a_head_has_gradients_beside_the_field() -> None:
+    """Of a hash with a hidden layer, whose samples an MLP shades."""
+    model, p = FEATURES_SMALL, problem(6, n_rays=3)
+    n_inputs = model.layout(loader("float64")).n_inputs
+    rng = np.random.default_rng(6)
+    first = first_tensors(HIDDEN, (p.box_min, p.box_max), head=model)
+    given = leaves({name: rng.normal(size=x.shape) / 4.0 for name, x in first.items()}, "cpu")
+    layers = [
+        torch.tensor(rng.normal(size=size) / 2.0, requires_grad=True)
+        for size in ((16, n_inputs), (16,), (3, 16), (3,))
+    ]
+
+    def seen(*tensors: torch.Tensor) -> Any:
+        named = dict(zip(given, tensors, strict=False))
+        head = Head(model, tensors[len(given) :])
+        return tuple(call(p, stored(HIDDEN, named), like=tensors[0], head=head))
+
+    inputs = (*given.values(), *layers)
+    assert torch.autograd.gradcheck(seen, inputs, atol=1e-7, rtol=1e-5, fast_mode=True)
+
+
+@pytest.mark.parametrize("name", Constants._fields)
+def test_what_changes_in_place_is_noticed(name: str) -> None:
+    """Before the way back, which reads it again."""
+    p = problem(7, n_rays=4)
+    given = {
+        field: torch.tensor(getattr(p, field))
+        for field in ("origins", "directions", "background", "content_distance")
+    }
+    given["edges"] = torch.tensor(random_edges(p))
+    raw = torch.tensor(p.raw, requires_grad=True)
+    out = render_intervals(raw, box=(p.box_min, p.box_max), **given)
+    given[name].mul_(0.5)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        out.rgb.sum().backward()
+
+
+def test_no_rays(device: str) -> None:
+    given = leaves(first_tensors("vm", BOX, SIZE), device)
+    none = torch.zeros(0, 3, dtype=torch.float64, device=torch_device(device))
+    edges = none.new_zeros(0, 5)
+    out = render_intervals(StoredField("vm", given, SIZE), none, none, BOX, edges)
+    assert [tuple(x.shape) for x in out] == [(0, 3), (0,), (0,), (0, 4)]
+    found = torch.autograd.grad(out.rgb.sum(), [*given.values()])
+    assert not any(x.any() for x in found)
 
 
 def test_bad_edges_are_refused() -> None:
@@ -255,4 +316,5 @@ def test_bad_edges_are_refused() -> None:
     fails("finite distances of 0 or above, in rising order", torch.tensor([[0.0, 2.0, 1.0]]))
     fails("finite distances of 0 or above, in rising order", torch.tensor([[-1.0, 2.0, 3.0]]))
     fails("finite distances", torch.tensor([[0.0, 2.0, float("inf")]]))
+    fails("finite distances", torch.tensor([[0.0, 2.0, 1e39]], dtype=torch.float64))
     fails("edges requires grad", torch.tensor([[0.0, 1.0, 2.0]], requires_grad=True))

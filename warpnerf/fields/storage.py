@@ -53,6 +53,16 @@ class Regulariser(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ArrayShape:
+    """The shape of what a storage holds under some name."""
+
+    shape: tuple[int, ...]
+    """Of the tensor."""
+    width: int | None
+    """Of the vectors, its last dimension, that it is as a Warp array [n]; None: of numbers."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class TrainedOn:
     """What regularisation may know of a training."""
 
@@ -120,10 +130,21 @@ class Storage(ABC):
             kind: How it is configured.
             model: What they hold.
             lattice: Of the field.
-            arrays: By name, in the shapes of ``shapes`` but flat: vectors as long as the last
-                dimension where the kind's rule is nodes, else numbers. In float32, but for
-                ``struct_in``, which takes any precision.
+            arrays: By name, [n] each, as ``array_shapes`` says. In float32, but for ``struct_in``,
+                which takes any precision.
         """
+
+    @classmethod
+    def array_shapes(
+        cls, kind: StorageKind, model: Model, lattice: Lattice
+    ) -> dict[str, ArrayShape]:
+        """Shapes of ``tensors``, and which of them are vectors: those with the rule nodes."""
+        return {
+            name: ArrayShape(
+                shape=shape, width=shape[-1] if kind.rules.get(name) == "nodes" else None
+            )
+            for name, shape in cls.shapes(kind, model, lattice).items()
+        }
 
     @classmethod
     def from_tensors(
@@ -139,15 +160,15 @@ class Storage(ABC):
         Raises:
             ValueError: Shapes or types do not fit.
         """
-        require_shapes(tensors, shapes := cls.shapes(kind, model, lattice))
+        require_shapes(tensors, cls.shapes(kind, model, lattice))
         arrays = {}
-        for name, shape in shapes.items():
-            tensor, width = tensors[name], shape[-1]
-            if kind.rules.get(name) == "nodes":
-                arrays[name] = allocate_nodes(tensor.size // width, vector(width), device)
-                arrays[name].assign(tensor.reshape(-1, width))
+        for name, of in cls.array_shapes(kind, model, lattice).items():
+            if of.width is None:
+                arrays[name] = wp.array(tensors[name].ravel(), dtype=real, device=device)
             else:
-                arrays[name] = wp.array(tensor.ravel(), dtype=real, device=device)
+                entries = tensors[name].reshape(-1, of.width)
+                arrays[name] = allocate_nodes(len(entries), vector(of.width), device)
+                arrays[name].assign(entries)
         return cls.over(kind, model, lattice, arrays)
 
     @abstractmethod
@@ -163,7 +184,8 @@ class Storage(ABC):
         """
 
     def as_final(self) -> Storage:
-        """The same as if its lattice were the last one of a training: all of it is read."""
+        """The same as if its lattice were the last one of a training: all levels of a hash are
+        read."""
         return replace(self, density_scale=1.0 / float(self.lattice.voxel_size.min()))
 
     # --- How it is read -----------------------------------------------------------------------

@@ -17,8 +17,8 @@ from warpnerf.model.interface import Model
 from warpnerf.rendering.arguments import (
     Head,
     March,
+    corners_of,
     head_of,
-    require_ascending,
     require_box,
     require_intervals,
     require_layers,
@@ -32,6 +32,7 @@ from warpnerf.rendering.stored import (
     StoredField,
     dense_layout,
     layout_of,
+    named_tensors,
     require_stored,
 )
 
@@ -57,7 +58,7 @@ class RenderedIntervals(NamedTuple):
     depth: jax.Array
     """[n_rays] sum of weight times t, scene units."""
     weights: jax.Array
-    """[n_rays, n] of samples, which add up to opacity; without gradient."""
+    """[n_rays, n] of samples, which add up to opacity; their gradient is zero."""
 
 
 def render_rays(
@@ -105,7 +106,8 @@ def render_rays(
     Raises:
         InputError: A shape, type or number does not fit, or what is differentiated has no gradient.
             Values that are not known while a function is traced, as under ``jax.jit``, are checked
-            later: rays on the CPU, in an error of JAX; background and content distance not at all.
+            later: rays and edges on the CPU, in an error of JAX; background and content distance
+            not at all.
     """
     steps = steps_of(step)
     options = Options(density_shift, background, scaling, content_distance, head)
@@ -125,7 +127,8 @@ def render_intervals(
     content_distance: float | jax.Array = 1.0,
     head: str | Model | Head = "rgb",
 ) -> RenderedIntervals:
-    """Render rays with a sample in the middle of each of their intervals, as a proposal draws them.
+    """Render rays with a sample in the middle of each of their intervals, as importance sampling by
+    a proposal network draws them.
 
     The same launches as those of ``warpnerf.torch.render_intervals``, which says what is computed,
     and on the CPU the same bits.
@@ -174,12 +177,10 @@ def _rendered(
     edges: jax.Array | None = None,
 ) -> tuple[jax.Array, ...]:
     """Rgb, opacity, depth and weights of rays, that are marched, or have edges."""
-    require_box(box)
     require_one_of("scaling", options.scaling, get_args(Scaling))
     require_finite("density_shift", options.density_shift)
     model, layers = head_of(options.head)
-    corners = _corner("box_min", box[0]), _corner("box_max", box[1])
-    require_ascending(corners)
+    corners = _corners(box)
     layout, stored = _stored_by(raw, model, corners)
     dtype = stored[0].dtype
     weights = _flat_head(layers, model, dtype)
@@ -189,16 +190,16 @@ def _rendered(
         raise InputError(
             f"origins and directions must be equally many, not {n} and {len(rays[1])}."
         )
-    intervals = jnp.zeros((n, 1), dtype) if steps is not None else _edges(edges, n, dtype)
+    intervals = jnp.zeros((n, 0), dtype) if steps is not None else _edges(edges, n, dtype)
     operation = Operation(
         layout=layout,
         precision=str(dtype),
         steps=steps or steps_of_intervals(),
-        n_intervals=intervals.shape[1] - 1,
+        n_intervals=max(0, intervals.shape[1] - 1),
         density_shift=float(options.density_shift),
         scaling=options.scaling,
     )
-    begins, towards = known("origins", origins), known("directions", directions)
+    begins, towards = known("origins", origins, dtype), known("directions", directions, dtype)
     if begins is not None and towards is not None:
         require_visible(operation, begins, towards)
     return render(operation, *stored, weights, *rays, *_constants(options, n, dtype), intervals)
@@ -216,9 +217,10 @@ def _stored_by(
     else:
         layout = layout_of(raw, model, corners)
         arrays = []
+        named = named_tensors(raw)
         for name, expected in layout.arrays.items():
             field = f"tensors[{name!r}]"
-            array = _precise(field, raw.tensors[name])
+            array = _precise(field, named[name])
             require_stored(name, array.shape, expected)
             if array.dtype != (first := [*arrays, array][0].dtype):
                 raise InputError(f"{field} must be {first}, as others, not {array.dtype}.")
@@ -245,7 +247,7 @@ def _edges(edges: Any, n_rays: int, dtype: Any) -> jax.Array:
     """Of intervals, [n_rays, n + 1], as kernels take them."""
     array = array_of("edges", edges)
     require_intervals(array.shape, n_rays)
-    values = known("edges", edges)
+    values = known("edges", edges, dtype)
     if values is not None:
         require_rising(values)
     return constant("edges", array.astype(dtype))
@@ -271,17 +273,16 @@ def _constants(options: Options, n_rays: int, dtype: Any) -> tuple[jax.Array, ja
     return behind.reshape(-1, 3), content.reshape(-1)
 
 
-def _corner(field: str, value: Any) -> np.ndarray:
-    """A corner of the box, [3] float64."""
-    corner = known(field, value)
-    if corner is None:
-        raise InputError(
-            f"{field} is traced, but a box is compiled in; give its numbers, or name the argument "
-            "in static_argnames of jax.jit."
-        )
-    if corner.shape != (3,) or not np.isfinite(corner).all():
-        raise InputError(f"{field} must be three finite numbers, not {value}.")
-    return corner.astype(np.float64)
+def _corners(box: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Of a box, [3] each, float64."""
+    require_box(box)
+    for field, value in zip(("box_min", "box_max"), box, strict=True):
+        if isinstance(value, jax.core.Tracer):
+            raise InputError(
+                f"{field} is traced, but a box is compiled in; give its numbers, or name the "
+                "argument in static_argnames of jax.jit."
+            )
+    return corners_of(box)
 
 
 def _rays(field: str, value: Any, dtype: Any) -> jax.Array:

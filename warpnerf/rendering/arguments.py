@@ -8,7 +8,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from warpnerf.checked import fits
-from warpnerf.checks import InputError, is_finite, require_at_least, require_positive, said
+from warpnerf.checks import (
+    MAX_COORDINATE,
+    InputError,
+    is_finite,
+    require_at_least,
+    require_length,
+    require_positive,
+    said,
+)
 from warpnerf.model.interface import Model, loader
 from warpnerf.model.models import model_of
 from warpnerf.model.sampler_kinds import MOST
@@ -37,8 +45,8 @@ class Head(NamedTuple):
     """rgb, sh, deferred, per_sample, or a model from ``warpnerf.model.models``."""
     layers: Iterable[Any] = ()
     """The model's MLP, as torch.nn.Linear holds it: weight [outputs, inputs] and bias [outputs] of
-    each layer, in turn; so ``network.parameters()``. Inputs are channels or features, then the
-    encoded direction. Its gradient is scaled where it passes samples, so for per_sample."""
+    each layer, in turn; so ``list(network.parameters())``. Inputs are channels or features, then
+    the encoded direction. Its gradient is scaled where it passes samples, so for per_sample."""
 
 
 def require_samples(colors: Sequence[int], sigmas: Sequence[int], distances: Sequence[int]) -> None:
@@ -92,15 +100,25 @@ def head_of(head: str | Model | Head) -> tuple[Model, list[Any]]:
     Raises:
         InputError: It is neither a model nor the name of one, or layers are no list.
     """
-    model, layers = head if isinstance(head, Head) else Head(head)
-    if isinstance(model, str):
-        model = model_of(model)
-    if not isinstance(model, Model):
-        raise InputError(f"model must be a name or a model, not {said(model)}.")
+    model, layers = model_in(head), head.layers if isinstance(head, Head) else ()
     try:
         return model, list(layers)
     except TypeError as error:
         raise InputError(f"head.layers must be a list of arrays, not {said(layers)}.") from error
+
+
+def model_in(head: str | Model | Head) -> Model:
+    """The model of what render_rays takes as its head, of which nothing else is looked at.
+
+    Raises:
+        InputError: It is neither a model nor the name of one.
+    """
+    model = head.model if isinstance(head, Head) else head
+    if isinstance(model, str):
+        model = model_of(model)
+    if not isinstance(model, Model):
+        raise InputError(f"model must be a name or a model, not {said(model)}.")
+    return model
 
 
 def require_box(box: Any) -> None:
@@ -109,12 +127,36 @@ def require_box(box: Any) -> None:
         raise InputError(f"box must be its lower and its upper corner, not {said(box)}.")
 
 
-def require_ascending(corners: tuple[np.ndarray, np.ndarray]) -> None:
-    """Raise InputError unless a box has a volume."""
-    if not (corners[0] < corners[1]).all():
+def corners_of(box: Any) -> tuple[np.ndarray, np.ndarray]:
+    """The lower and the upper corner of a box, [3] float64 each.
+
+    Args:
+        box: Two of three numbers each, or arrays, on any device, of any framework.
+
+    Raises:
+        InputError: It is none, or has no volume, or is as large as no scene is.
+    """
+    require_box(box)
+    lower, upper = (_corner(field, x) for field, x in zip(("box_min", "box_max"), box, strict=True))
+    if not (lower < upper).all():
+        raise InputError(f"box_max must lie above box_min on every axis, not {upper} over {lower}.")
+    for axis, length in zip("xyz", upper - lower, strict=True):
+        require_length(f"the box's edge along {axis}", float(length))
+    return lower, upper
+
+
+def _corner(field: str, value: Any) -> np.ndarray:
+    try:
+        array = np.asarray(value.detach().cpu() if hasattr(value, "detach") else value)
+    except (TypeError, ValueError):  # lists of different lengths
+        array = np.array(None)
+    good = array.dtype.kind in "fiu" and array.shape == (3,) and np.isfinite(array).all()
+    if not good or np.abs(array).max() > MAX_COORDINATE:
         raise InputError(
-            f"box_max must lie above box_min on every axis, not {corners[1]} over {corners[0]}."
+            f"{field} must be three finite numbers within {MAX_COORDINATE:g} scene units of 0, not "
+            f"{said(array.tolist() if array.dtype.kind in 'fiu' else value)}."
         )
+    return array.astype(np.float64)
 
 
 def require_intervals(shape: Sequence[int], n_rays: int) -> None:
@@ -158,7 +200,8 @@ def require_layers(found: list[tuple[int, ...]], model: Model, precision: str) -
         shape for n_in, n_out in itertools.pairwise(sizes) for shape in ((n_out, n_in), (n_out,))
     ]
     if found != shapes:
+        used_up = "" if found else "; what iterates once, as parameters() does, belongs in a list"
         raise InputError(
             f"head of the model {model.name} must be tensors of shapes {shapes}, weight and bias "
-            f"of each layer in turn, not {found}."
+            f"of each layer in turn, not {found}{used_up}."
         )

@@ -122,7 +122,9 @@ class Operation:
             assembly.render_forward_kernel(variant),
             -(-n // variant.batch),
             n,
-            self._scene(inputs, self._steps(inputs, interval_weights), workers),
+            self._scene(
+                inputs, self._storage(inputs), self._steps(inputs, interval_weights), workers
+            ),
             self._rays(inputs),
             scratch_struct(variant, 0, workers, assembly),
             self._seen(out),
@@ -148,7 +150,7 @@ class Operation:
             weights_gradient: [n_weights] written.
         """
         n_rays, model, workers = inputs.origins.shape[0], self.layout.model, _workers(inputs)
-        variant = self._variant(self.scaling, workers)
+        variant, storage = self._variant(self.scaling, workers), self._storage(inputs)
         nobody_asks = wp.empty((0, 0), dtype=self.types.real, device=inputs.origins.device)
         steps = self._steps(inputs, nobody_asks)
         launch = AdjointLaunch(
@@ -161,7 +163,7 @@ class Operation:
         )
         gradient = self.layout.kind.encoding(self._load, model).Gradient()
         shared = {"weights": weights_gradient}
-        for parameter in self._storage(inputs).parameters(model, OptimConfig()):
+        for parameter in storage.parameters(model, OptimConfig()):
             array, (name, *flags) = stored_gradient[parameter.name], parameter.gradient
             if flags:
                 tiles = wp.zeros(n_tiles(array.shape[0]), dtype=wp.uint8, device=array.device)
@@ -175,7 +177,7 @@ class Operation:
         launch.run(
             n_rays,
             gradient,
-            self._scene(inputs, steps, launch.workers),
+            self._scene(inputs, storage, steps, launch.workers),
             self._rays(inputs),
             self._seen(outputs),
             *output_gradients,
@@ -226,7 +228,7 @@ class Operation:
             weights=interval_weights,
         )
 
-    def _scene(self, inputs: Inputs, steps: AnySteps, workers: Workers) -> Any:
+    def _scene(self, inputs: Inputs, storage: Storage, steps: AnySteps, workers: Workers) -> Any:
         """What rays are marched through, as kernels take it."""
         types, lattice = self.types, self.layout.lattice
         occupied = wp.zeros(1, dtype=wp.uint8, device=inputs.origins.device)
@@ -236,7 +238,7 @@ class Operation:
             FieldStructs(
                 box=box_struct(types, lattice.box_min, lattice.box_max, 0.0),
                 free=free_struct(types, occupied, (1, 1, 1), 0.0),
-                values=self._storage(inputs).struct_in(self._load, workers),
+                values=storage.struct_in(self._load, workers),
                 density=density_struct(types, self.density_shift, 1.0),
                 weights=inputs.weights,
             ),

@@ -5,25 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from warpnerf.checked import fits
-from warpnerf.checks import InputError, is_finite, require_one_of, require_whole, said
+from warpnerf.checks import InputError, require_one_of, require_whole, said
 from warpnerf.fields.lattice import Lattice
-from warpnerf.fields.storages import class_of
+from warpnerf.fields.storage import ArrayShape
+from warpnerf.fields.storages import STORAGES, class_of
 from warpnerf.grid_config import MAX_VOXELS
 from warpnerf.model.interface import Model
-from warpnerf.model.storage_kinds import (
-    AUTO_FIELD,
-    DENSE,
-    STORAGE_KINDS,
-    StorageKind,
-    storage_of,
-)
-from warpnerf.rendering.arguments import Head, head_of, require_ascending, require_box
+from warpnerf.model.storage_kinds import DENSE, StorageKind, storage_of
+from warpnerf.rendering.arguments import Head, corners_of, model_in
 from warpnerf.runtime import kernel_cache
 
 
@@ -31,23 +27,14 @@ class StoredField(NamedTuple):
     """A field that is no dense grid: what it stores, and how; ``first_tensors`` begins one."""
 
     kind: str | StorageKind
-    """vm, hash, or a configured one: ``warpnerf.Vm``, ``warpnerf.Hash``."""
+    """vm, hash, or a configured one: ``warpnerf.Vm``, ``warpnerf.Hash``. What these say of a
+    training, as learning rates, does nothing here."""
     tensors: Mapping[str, Any]
-    """By name, in the shapes that ``first_tensors`` gives; all are learned, and of one
-    floating-point type."""
+    """By name, in the shapes that ``first_tensors`` gives, and of one floating-point type: a
+    dictionary, or ``torch.nn.ParameterDict``."""
     size: Sequence[int] | None = None
     """[3] nodes along each axis, over which a vm has planes and lines; a hash has levels of its
     own, and takes none."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ArrayShape:
-    """Of what a field stores under some name."""
-
-    shape: tuple[int, ...]
-    """Of the tensor."""
-    width: int | None
-    """Of the vectors, its last dimension, that it is as a Warp array [n]; None: of numbers."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,22 +50,31 @@ class Layout:
     size: tuple[int, int, int]
     """Nodes of its lattice along each axis."""
 
-    @property
+    @cached_property
     def lattice(self) -> Lattice:
         """Over its box."""
         lower, upper = (np.array(corner, np.float64) for corner in self.corners)
         return Lattice(box_min=lower, box_max=upper, size=self.size)
 
-    @property
+    @cached_property
     def arrays(self) -> dict[str, ArrayShape]:
-        """What it stores, by name."""
-        shapes = class_of(self.kind).shapes(self.kind, self.model, self.lattice)
-        return {
-            name: ArrayShape(
-                shape=shapes[name], width=shapes[name][-1] if rule == "nodes" else None
-            )
-            for name, rule in self.kind.rules.items()
-        }
+        """What it stores, by name, in the order of the kind's ``rules``."""
+        shapes = class_of(self.kind).array_shapes(self.kind, self.model, self.lattice)
+        return {name: shapes[name] for name in self.kind.rules}
+
+
+def named_tensors(field: StoredField) -> dict[str, Any]:
+    """What a field stores, by name.
+
+    Raises:
+        InputError: It has no names.
+    """
+    if not (hasattr(field.tensors, "keys") and hasattr(field.tensors, "__getitem__")):
+        raise InputError(
+            f"tensors of a field must be a dictionary of them, not {said(field.tensors)}; "
+            "first_tensors gives one."
+        )
+    return {name: field.tensors[name] for name in field.tensors.keys()}  # noqa: SIM118
 
 
 def layout_of(field: StoredField, model: Model, corners: tuple[np.ndarray, np.ndarray]) -> Layout:
@@ -92,18 +88,10 @@ def layout_of(field: StoredField, model: Model, corners: tuple[np.ndarray, np.nd
     Raises:
         InputError: It is stored in nothing that is known, or has other tensors or another size.
     """
-    kind, tensors = field.kind, field.tensors
-    if isinstance(kind, str):
-        require_one_of("kind", kind, [name for name in STORAGE_KINDS if name != AUTO_FIELD.name])
-        kind = storage_of(kind)
-    if not isinstance(kind, StorageKind) or kind == AUTO_FIELD:
-        raise InputError(f"kind must be vm, hash, or one of these configured, not {said(kind)}.")
-    names = list(kind.rules)
-    if not isinstance(tensors, Mapping) or set(tensors) != set(names):
-        found = list(tensors) if isinstance(tensors, Mapping) else tensors
-        raise InputError(
-            f"tensors of a {kind.name} must be {', '.join(names)}, by name, not {said(found)}."
-        )
+    kind, found = _kind_of(field.kind), list(named_tensors(field))
+    if set(found) != set(kind.rules):
+        names = ", ".join(kind.rules)
+        raise InputError(f"tensors of a {kind.name} must be {names}, by name, not {said(found)}.")
     return _layout(kind, model, corners, _size_of(kind, field.size))
 
 
@@ -141,7 +129,7 @@ def first_tensors(
     head: str | Model | Head = "rgb",
     seed: int = 0,
 ) -> dict[str, np.ndarray]:
-    """The tensors of a ``StoredField`` before training.
+    """Initial values of the tensors of a ``StoredField``, as a training begins.
 
     Those of a vm (TensoRF, Chen et al. 2022) are planes [X Y + X Z + Y Z, width]: xy, xz and yz,
     second axis fastest; lines [Z + Y + X, width]: z, y and x; and the decoder [3 width, columns],
@@ -162,14 +150,13 @@ def first_tensors(
     Raises:
         InputError: There is no such kind, or its size or box do not fit.
     """
-    model, _ = head_of(head)
+    model = model_in(head)
     require_whole("seed", seed, 0)
-    known = storage_of(kind) if isinstance(kind, str) and kind in STORAGE_KINDS else kind
-    names = known.rules if isinstance(known, StorageKind) and known != AUTO_FIELD else {}
-    layout = layout_of(StoredField(kind, names, size), model, _corners(box))
+    chosen, corners = _kind_of(kind), corners_of(box)
+    layout = _layout(chosen, model, corners, _size_of(chosen, size))
     kernel_cache.start()
     cpu = wp.get_device("cpu")
-    return class_of(layout.kind).first(layout.kind, model, layout.lattice, seed, cpu).tensors()
+    return class_of(chosen).first(chosen, model, layout.lattice, seed, cpu).tensors()
 
 
 def require_stored(name: str, shape: Sequence[int], expected: ArrayShape) -> None:
@@ -181,6 +168,24 @@ def require_stored(name: str, shape: Sequence[int], expected: ArrayShape) -> Non
         )
 
 
+def _kind_of(kind: Any) -> StorageKind:
+    """What a field is stored in.
+
+    Raises:
+        InputError: It is a dense grid, or nothing that is known.
+    """
+    known = [name for name in STORAGES if name != DENSE.name]
+    if isinstance(kind, str):
+        require_one_of("kind", kind, known)
+        kind = storage_of(kind)
+    if not isinstance(kind, StorageKind) or kind.name not in known:
+        raise InputError(
+            f"kind must be {' or '.join(known)}, or one configured, as warpnerf.Vm(appearance=28), "
+            f"not {said(kind)}; a dense grid is given as it is."
+        )
+    return kind
+
+
 def _size_of(kind: StorageKind, size: Any) -> tuple[int, int, int]:
     """Nodes of the lattice along each axis.
 
@@ -189,37 +194,22 @@ def _size_of(kind: StorageKind, size: Any) -> tuple[int, int, int]:
     """
     if not kind.as_fine_as_nodes:
         if size is not None:
-            raise InputError(f"size must be None, not {said(size)}: a {kind.name} has its levels.")
+            raise InputError(
+                f"size must be left out, not {said(size)}: a {kind.name} has levels of its own."
+            )
         return 2, 2, 2
     if not isinstance(size, Sequence) or len(size) != 3 or not all(fits(n, int) for n in size):
         raise InputError(
-            f"size must be three whole numbers, the nodes of a {kind.name} along each axis, not "
+            f"size must be three whole numbers, nodes along each axis for the {kind.name}, not "
             f"{said(size)}."
         )
-    if min(size) < 2 or math.prod(size) >= MAX_VOXELS:
+    x, y, z = map(int, size)
+    if min(x, y, z) < 2 or x * y * z >= MAX_VOXELS:
         raise InputError(
             f"size must be two nodes or more along each axis, and fewer than {MAX_VOXELS} in all, "
             f"not {said(size)}."
         )
-    x, y, z = map(int, size)
     return x, y, z
-
-
-def _corners(box: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Of a box that is given as numbers.
-
-    Raises:
-        InputError: It is none.
-    """
-    require_box(box)
-    for field, corner in zip(("box_min", "box_max"), box, strict=True):
-        if not fits(corner, Sequence | np.ndarray) or not all(map(is_finite, corner)):
-            raise InputError(f"{field} must be three finite numbers, not {said(corner)}.")
-        if len(corner) != 3:
-            raise InputError(f"{field} must be three finite numbers, not {len(corner)}.")
-    corners = np.array(box[0], np.float64), np.array(box[1], np.float64)
-    require_ascending(corners)
-    return corners
 
 
 def _layout(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -11,10 +12,9 @@ import warp as wp
 from warpnerf.rendering.operation import Inputs, Operation, Outputs
 
 
-class Call(NamedTuple):
-    """What a rendering depends on besides tensors with gradients."""
+class Constants(NamedTuple):
+    """Tensors without gradient that a rendering depends on; see ``Inputs``."""
 
-    operation: Operation
     origins: torch.Tensor
     directions: torch.Tensor
     background: torch.Tensor
@@ -22,28 +22,33 @@ class Call(NamedTuple):
     edges: torch.Tensor
 
 
+N_CONSTANTS, N_OUTPUTS = len(Constants._fields), len(Outputs._fields)
+
+
 class Render(torch.autograd.Function):
     """Rendering of rays, forward and backward, each one launch."""
 
     @staticmethod
-    def forward(
-        ctx: Any, call: Call, weights: torch.Tensor, *stored: torch.Tensor
-    ) -> tuple[torch.Tensor, ...]:
-        """Rgb, opacity and depth of the rays, and what samples in intervals weigh."""
-        n, operation = len(call.origins), call.operation
-        channels = weights.new_empty(n, operation.n_channels)
-        rgb, transmittance, depth = (weights.new_empty(n, *of) for of in ((3,), (), ()))
-        n_samples = torch.empty(n, dtype=torch.int32, device=weights.device)
-        interval_weights = weights.new_zeros(n, operation.n_intervals)
+    def forward(ctx: Any, operation: Operation, *given: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Rgb, opacity and depth of the rays, and what samples in intervals weigh.
+
+        Args:
+            ctx: Of torch.
+            operation: What is no tensor.
+            given: The constants, weights of the head, and what is stored, in the layout's order.
+        """
+        n, like = len(given[0]), given[N_CONSTANTS]
+        channels = like.new_empty(n, operation.n_channels)
+        rgb, transmittance, depth = (like.new_empty(n, *of) for of in ((3,), (), ()))
+        n_samples = torch.empty(n, dtype=torch.int32, device=like.device)
+        interval_weights = like.new_zeros(n, operation.n_intervals)
         outputs = rgb, transmittance, depth, n_samples, channels
-        with _stream(weights):
+        with _stream(like):
             operation.forward(
-                _inputs(call, weights, stored),
-                _outputs(operation, *outputs),
-                _array(interval_weights),
+                _inputs(operation, given), _outputs(operation, *outputs), _array(interval_weights)
             )
-        ctx.call = call
-        ctx.save_for_backward(weights, *outputs, *stored)
+        ctx.operation = operation
+        ctx.save_for_backward(*outputs, *given)
         ctx.mark_non_differentiable(interval_weights)
         return rgb, 1.0 - transmittance, depth, interval_weights
 
@@ -51,33 +56,35 @@ class Render(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         """Gradients of weights and of what is stored; rays are rendered once more."""
-        call, operation = ctx.call, ctx.call.operation
-        (weights, *rest), n_outputs = ctx.saved_tensors, len(Outputs._fields)
-        outputs, stored = rest[:n_outputs], tuple(rest[n_outputs:])
+        operation, saved = ctx.operation, ctx.saved_tensors
+        outputs, given = saved[:N_OUTPUTS], saved[N_OUTPUTS:]
         adj_rgb, adj_opacity, adj_depth = (grad.contiguous() for grad in grads[:3])
-        of_weights = torch.zeros_like(weights)
-        of_stored = tuple(tensor.new_zeros(tensor.shape) for tensor in stored)
-        with _stream(weights):
+        learned = given[N_CONSTANTS:]
+        of_weights, *of_stored = (x.new_zeros(x.shape) for x in learned)
+        with _stream(of_weights):
             operation.backward(
-                _inputs(call, weights, stored),
+                _inputs(operation, given),
                 _outputs(operation, *outputs),
                 (_array(adj_rgb, operation.types.vec3), _array(adj_opacity), _array(adj_depth)),
                 _stored(operation, of_stored),
                 _array(of_weights),
             )
-        return None, of_weights, *of_stored
+        found = (None,) * N_CONSTANTS + (of_weights, *of_stored)
+        wanted = zip(found, ctx.needs_input_grad[1:], strict=True)
+        return None, *(gradient if needed else None for gradient, needed in wanted)
 
 
-def _inputs(call: Call, weights: torch.Tensor, stored: tuple[torch.Tensor, ...]) -> Inputs:
-    vec3 = call.operation.types.vec3
+def _inputs(operation: Operation, given: tuple[torch.Tensor, ...]) -> Inputs:
+    vec3 = operation.types.vec3
+    constants, (weights, *stored) = Constants(*given[:N_CONSTANTS]), given[N_CONSTANTS:]
     return Inputs(
-        stored=_stored(call.operation, tuple(tensor.contiguous() for tensor in stored)),
+        stored=_stored(operation, [tensor.contiguous() for tensor in stored]),
         weights=_array(weights),
-        origins=_array(call.origins, vec3),
-        directions=_array(call.directions, vec3),
-        background=_array(call.background, vec3),
-        content_distance=_array(call.content_distance),
-        edges=_array(call.edges),
+        origins=_array(constants.origins, vec3),
+        directions=_array(constants.directions, vec3),
+        background=_array(constants.background, vec3),
+        content_distance=_array(constants.content_distance),
+        edges=_array(constants.edges),
     )
 
 
@@ -99,7 +106,7 @@ def _outputs(
     )
 
 
-def _stored(operation: Operation, tensors: tuple[torch.Tensor, ...]) -> dict[str, wp.array]:
+def _stored(operation: Operation, tensors: Sequence[torch.Tensor]) -> dict[str, wp.array]:
     """Contiguous tensors in the order of the layout, as launches take them."""
     arrays, vector = operation.layout.arrays, operation.types.vector
     return {

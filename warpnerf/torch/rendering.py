@@ -23,10 +23,10 @@ from warpnerf.rendering.operation import Operation
 from warpnerf.rendering.steps import Steps
 from warpnerf.rendering.stored import StoredField
 from warpnerf.torch.arguments import accept_old_spelling
-from warpnerf.torch.launches import Call, Render
+from warpnerf.torch.launches import Constants, Render
 from warpnerf.torch.tensors import (
     PRECISIONS,
-    corners_of,
+    corners_in,
     flat_head,
     rays_of,
     require_constant,
@@ -128,11 +128,12 @@ def render_intervals(
     content_distance: float | torch.Tensor = 1.0,
     head: str | Model | Head = "rgb",
 ) -> RenderedIntervals:
-    """Render rays with a sample in the middle of each of their intervals, as a proposal draws them.
+    """Render rays with a sample in the middle of each of their intervals, as importance sampling by
+    a proposal network draws them.
 
-    As ``render_rays`` but for t = (edges[k] + edges[k + 1]) / 2, and the difference in place of the
-    step. Samples outside the box are skipped. Edges have no gradient: what draws them learns from
-    the weights (Mip-NeRF 360, Barron et al. 2022, eq. 13).
+    As ``render_rays``, but for t = (edges[k] + edges[k + 1]) / 2, and the difference of the two in
+    place of the step. Samples outside the box are skipped. Edges have no gradient: what draws them
+    learns from the weights (Mip-NeRF 360, Barron et al. 2022, eq. 13).
 
     Args:
         raw: See ``render_rays``; so are arguments that are not named here.
@@ -190,7 +191,7 @@ def _rendered(
     require_one_of("scaling", options.scaling, get_args(Scaling))
     require_finite("density_shift", options.density_shift)
     model, layers = head_of(options.head)
-    corners = corners_of(box)
+    corners = corners_in(box)
     layout, stored = stored_by(raw, model, corners)
     like, precision = stored[0], PRECISIONS[stored[0].dtype]
     weights = flat_head(layers, model, like)
@@ -209,18 +210,18 @@ def _rendered(
         middle = like.new_tensor((corners[0] + corners[1]) / 2)
         reach = float((rays[0] - middle).norm(dim=1).max()) if n else 0.0
         require_reach(reach + layout.lattice.diagonal, steps.step, precision)
-    intervals = like.new_zeros(n, 1) if steps is not None else _edges(edges, n, like)
+    intervals = like.new_zeros(n, 0) if steps is not None else _edges(edges, n, like)
     operation = Operation(
         layout=layout,
         precision=precision,
         steps=steps or steps_of_intervals(),
-        n_intervals=intervals.shape[1] - 1,
+        n_intervals=max(0, intervals.shape[1] - 1),
         density_shift=float(options.density_shift),
         scaling=options.scaling,
     )
     behind, content = _constants(options, n, like)
-    call = Call(operation, *rays, behind, content, intervals)
-    found: tuple[torch.Tensor, ...] = Render.apply(call, weights, *stored)
+    constants = Constants(*rays, behind, content, intervals)
+    found: tuple[torch.Tensor, ...] = Render.apply(operation, *constants, weights, *stored)
     return found
 
 

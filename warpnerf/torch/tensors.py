@@ -10,8 +10,15 @@ import torch
 
 from warpnerf.checks import InputError, said
 from warpnerf.model.interface import Model
-from warpnerf.rendering.arguments import require_ascending, require_box, require_layers
-from warpnerf.rendering.stored import Layout, StoredField, dense_layout, layout_of, require_stored
+from warpnerf.rendering.arguments import corners_of, require_box, require_layers
+from warpnerf.rendering.stored import (
+    Layout,
+    StoredField,
+    dense_layout,
+    layout_of,
+    named_tensors,
+    require_stored,
+)
 
 PRECISIONS = {torch.float32: "float32", torch.float64: "float64"}
 
@@ -35,8 +42,8 @@ def stored_by(
         padding = model.n_floats - raw.shape[3]
         return layout, [torch.nn.functional.pad(raw, (0, padding)) if padding else raw]
     layout = layout_of(raw, model, corners)
-    arrays = layout.arrays
-    tensors = [raw.tensors[name] for name in arrays]
+    arrays, named = layout.arrays, named_tensors(raw)
+    tensors = [named[name] for name in arrays]
     for (name, expected), tensor in zip(arrays.items(), tensors, strict=True):
         field = f"tensors[{name!r}]"
         require_precision(field, tensor)
@@ -103,7 +110,7 @@ def require_numbers(field: str, value: Any) -> None:
         raise InputError(f"{field} must be a tensor or numbers, not {said(value)}.")
 
 
-def corners_of(box: Sequence[Any]) -> tuple[np.ndarray, np.ndarray]:
+def corners_in(box: Any) -> tuple[np.ndarray, np.ndarray]:
     """Of a box, [3] each, float64.
 
     Raises:
@@ -112,21 +119,8 @@ def corners_of(box: Sequence[Any]) -> tuple[np.ndarray, np.ndarray]:
     require_box(box)
     for field, value in zip(("box_min", "box_max"), box, strict=True):
         require_constant(field, value)
-    corners = corner_of("box_min", box[0]), corner_of("box_max", box[1])
-    require_ascending(corners)
-    return corners
-
-
-def corner_of(field: str, value: Sequence[float] | torch.Tensor) -> np.ndarray:
-    """A corner of the box, [3] float64."""
-    require_dense(field, value)
-    require_numbers(field, value)
-    corner = np.asarray(
-        value.detach().cpu() if isinstance(value, torch.Tensor) else value, dtype=np.float64
-    )
-    if corner.shape != (3,) or not np.isfinite(corner).all():
-        raise InputError(f"{field} must be three finite numbers, not {value}.")
-    return corner
+        require_dense(field, value)
+    return corners_of(box)
 
 
 def rays_of(field: str, value: torch.Tensor, raw: torch.Tensor) -> torch.Tensor:
