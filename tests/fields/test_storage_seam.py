@@ -240,6 +240,7 @@ class Marked(storage_kinds.Dense):
         return dense._replace(vectors=dense.vectors._replace(begin=mark))
 
 
+@pytest.mark.ci
 def test_an_encoding_may_begin_before_the_first_ray(on_cpu: None) -> None:
     """Once for each worker, in launches that end in a gradient."""
     config = replace(CONFIG, field=storage_kinds.Dense(), steps=1, threads=2)

@@ -54,6 +54,7 @@ def test_a_full_disk_after_the_field_is_saved_begins_nothing_again(tmp_path: Pat
     assert run.way_on() == way_on
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("during", ["save_field", "draw_curves"])
 def test_stopped_while_it_finishes_it_says_that_the_field_is_saved(
     during: str,

@@ -204,6 +204,7 @@ def test_a_gpu_with_a_number_is_refused() -> None:
     assert share_of_machine(config, {}).device == "cuda:0"  # as it was begun, elsewhere
 
 
+@pytest.mark.ci
 def test_processes_that_train_otherwise_are_refused(tmp_path: Path) -> None:
     scene, run = make_scene(tmp_path), tmp_path / "run"
     for options, name in ((("--seed", "1"), "configuration"), (("--downscale", "2"), "scene")):

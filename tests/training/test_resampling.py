@@ -87,6 +87,7 @@ def test_a_training_goes_on_with_equal_bits(step: int, tmp_path: Path, on_cpu: N
     np.testing.assert_array_equal(moments[0], moments[1])
 
 
+@pytest.mark.ci
 def test_a_proposal_grows_into_the_box_of_its_field(on_cpu: None) -> None:
     trainer = Trainer(ball(), config())
     first = trainer.proposal

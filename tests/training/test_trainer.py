@@ -78,6 +78,7 @@ def test_resumed_it_grows_as_its_kind_of_scene_does(
     assert whole.grown == (4 if grow_at else 0)
 
 
+@pytest.mark.ci
 def test_interrupted_after_every_step_it_ends_the_same(tmp_path: Path, on_cpu: None) -> None:
     """Also with what no checkpoint has."""
     config = tiny_config(optim=replace(tiny_config().optim, near_decay=0.1))
