@@ -190,10 +190,10 @@ class Unregistered(Vm):
 
 
 def test_bad_fields_are_refused() -> None:
-    refused("kind must be one of vm, hash, not 'tensorf'", kind="tensorf")
-    refused("kind must be one of vm, hash, not 'dense'", kind="dense")
+    refused(r"kind must be one of vm, hash.*, not 'tensorf'", kind="tensorf")
+    refused(r"kind must be one of vm, hash.*, not 'dense'", kind="dense")
     for kind in (AUTO_FIELD, DENSE, Unregistered(), Vm, 5, None):
-        refused("kind must be vm or hash, or one configured, as warpnerf.Vm", kind=kind)
+        refused(r"kind must be vm or hash.*, or one configured, as warpnerf.Vm", kind=kind)
     refused("size must be three whole numbers, nodes along each axis for the vm", size=None)
     refused("size must be three whole numbers", size=(4, 5.5, 6))
     refused("size must be two nodes or more", size=(1, 6, 5))
