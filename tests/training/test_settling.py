@@ -61,7 +61,7 @@ def test_short_trainings_do_not_settle(monkeypatch: pytest.MonkeyPatch, on_cpu: 
     assert trainer.field().steps.transmittance_min == 1e-3
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_a_hash_is_judged_with_its_neighbours(on_cpu: None) -> None:
     """There may be more between its nodes than at them."""
     hashed = Hash(levels=2, coarsest=4, finest=16, features=2, table=256)
