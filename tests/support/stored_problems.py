@@ -13,7 +13,8 @@ from tests.support.problems import Float64, Problem
 from warpnerf.fields.hashed import level_shapes
 from warpnerf.fields.lattice import Lattice
 from warpnerf.model.storage_kinds import Hash, StorageKind, Vm
-from warpnerf.rendering.stored import StoredField, first_tensors
+from warpnerf.rendering.arguments import StoredField
+from warpnerf.rendering.stored import first_tensors
 
 SIZE = (4, 6, 5)
 VM = Vm(density=4, appearance=12)

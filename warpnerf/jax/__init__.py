@@ -7,8 +7,8 @@ from warpnerf.jax.rendering import (
     render_rays,
 )
 from warpnerf.jax.scaling import scale_gradient
-from warpnerf.rendering.arguments import Head, March
-from warpnerf.rendering.stored import StoredField, first_tensors
+from warpnerf.rendering.arguments import Head, March, StoredField
+from warpnerf.rendering.stored import first_tensors
 
 __all__ = [
     "Head",

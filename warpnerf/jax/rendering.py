@@ -17,6 +17,7 @@ from warpnerf.model.interface import Model
 from warpnerf.rendering.arguments import (
     Head,
     March,
+    StoredField,
     corners_of,
     head_of,
     require_box,
@@ -29,7 +30,6 @@ from warpnerf.rendering.operation import Operation
 from warpnerf.rendering.steps import Steps
 from warpnerf.rendering.stored import (
     Layout,
-    StoredField,
     dense_layout,
     layout_of,
     named_tensors,

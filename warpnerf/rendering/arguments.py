@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,6 +20,7 @@ from warpnerf.checks import (
 from warpnerf.model.interface import Model, loader
 from warpnerf.model.models import model_of
 from warpnerf.model.sampler_kinds import MOST
+from warpnerf.model.storage_kinds import StorageKind
 from warpnerf.rendering.steps import MOST_LINEAR, Steps
 
 MAX_STEPS = {"float32": MOST_LINEAR, "float64": 10**9}
@@ -36,6 +37,20 @@ class March(NamedTuple):
     """Where the first step begins, scene units."""
     far: float | None = None
     """No sample at or beyond it, scene units; None: where the box ends."""
+
+
+class StoredField(NamedTuple):
+    """A field that is no dense grid: what it stores, and how; ``first_tensors`` begins one."""
+
+    kind: str | StorageKind
+    """vm, hash, or a configured one: ``warpnerf.Vm``, ``warpnerf.Hash``. What these say of a
+    training, as learning rates, does nothing here."""
+    tensors: Mapping[str, Any]
+    """By name, in the shapes that ``first_tensors`` gives, and of one floating-point type: a
+    dictionary, or ``torch.nn.ParameterDict``."""
+    size: Sequence[int] | None = None
+    """[3] nodes along each axis, over which a vm has planes and lines; a hash has levels of its
+    own, and takes none."""
 
 
 class Head(NamedTuple):

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -19,22 +19,8 @@ from warpnerf.fields.storages import STORAGES, class_of
 from warpnerf.grid_config import MAX_VOXELS
 from warpnerf.model.interface import Model
 from warpnerf.model.storage_kinds import DENSE, StorageKind, storage_of
-from warpnerf.rendering.arguments import Head, corners_of, model_in
+from warpnerf.rendering.arguments import Head, StoredField, corners_of, model_in
 from warpnerf.runtime import kernel_cache
-
-
-class StoredField(NamedTuple):
-    """A field that is no dense grid: what it stores, and how; ``first_tensors`` begins one."""
-
-    kind: str | StorageKind
-    """vm, hash, or a configured one: ``warpnerf.Vm``, ``warpnerf.Hash``. What these say of a
-    training, as learning rates, does nothing here."""
-    tensors: Mapping[str, Any]
-    """By name, in the shapes that ``first_tensors`` gives, and of one floating-point type: a
-    dictionary, or ``torch.nn.ParameterDict``."""
-    size: Sequence[int] | None = None
-    """[3] nodes along each axis, over which a vm has planes and lines; a hash has levels of its
-    own, and takes none."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,7 +1,7 @@
 """Drop-in torch operations: the paper's gradient scaling, and rendering through our own adjoint."""
 
-from warpnerf.rendering.arguments import Head, March
-from warpnerf.rendering.stored import StoredField, first_tensors
+from warpnerf.rendering.arguments import Head, March, StoredField
+from warpnerf.rendering.stored import first_tensors
 from warpnerf.torch.rendering import (
     RenderedIntervals,
     RenderedRays,

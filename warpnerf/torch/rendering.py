@@ -13,6 +13,7 @@ from warpnerf.model.interface import Model
 from warpnerf.rendering.arguments import (
     Head,
     March,
+    StoredField,
     head_of,
     require_intervals,
     require_reach,
@@ -21,7 +22,6 @@ from warpnerf.rendering.arguments import (
 )
 from warpnerf.rendering.operation import Operation
 from warpnerf.rendering.steps import Steps
-from warpnerf.rendering.stored import StoredField
 from warpnerf.torch.arguments import accept_old_spelling
 from warpnerf.torch.launches import Constants, Render
 from warpnerf.torch.tensors import (

@@ -10,10 +10,9 @@ import torch
 
 from warpnerf.checks import InputError, said
 from warpnerf.model.interface import Model
-from warpnerf.rendering.arguments import corners_of, require_box, require_layers
+from warpnerf.rendering.arguments import StoredField, corners_of, require_box, require_layers
 from warpnerf.rendering.stored import (
     Layout,
-    StoredField,
     dense_layout,
     layout_of,
     named_tensors,
