@@ -17,7 +17,7 @@ EDGES_OF_JAX = "jax_operations/test_stored_fields.py::test_bad_edges_are_refused
 ARGUMENTS, JAX = "rendering/arguments.py", "jax/launches.py"
 FIRST = f"{TESTS}test_first_tensors_are_those_of_a_training"
 OPERATION, STORED = "rendering/operation.py", "rendering/stored.py"
-RENDERING, TENSORS = "torch/rendering.py", "torch/tensors.py"
+RENDERING = "torch/rendering.py"
 
 MUTANTS = [
     of_host("operation: levels for another lattice", OPERATION, ".as_final()", "", ORACLE),
@@ -62,13 +62,6 @@ MUTANTS = [
     ),
     of_host("operation: one node is enough", STORED, "if min(x, y, z) < 2 or", "if", FIELDS),
     of_host("operation: a hash with a size", STORED, "if size is not None:", "if False:", TOO_MUCH),
-    of_host(
-        "operation: tensors of several types",
-        TENSORS,
-        "if tensor.dtype != tensors[0].dtype:",
-        "if False:",
-        FIELDS,
-    ),
     of_host(
         "operation: edges that fall",
         RENDERING,
