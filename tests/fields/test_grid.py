@@ -15,7 +15,7 @@ from warpnerf.fields.dense import DenseGrid
 from warpnerf.fields.lattice import Lattice
 from warpnerf.fields.nodes import cells_within, points_of
 from warpnerf.fields.occupancy import FreeCells
-from warpnerf.fields.storage import require_memory
+from warpnerf.fields.training_memory import require_memory
 from warpnerf.model.models import Deferred, Rgb
 from warpnerf.model.storage_kinds import DENSE
 from warpnerf.rendering.steps import Steps
@@ -100,7 +100,7 @@ def test_grid_size_makes_cubes() -> None:
 
 
 def test_a_grid_larger_than_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("warpnerf.fields.storage.usable_memory", lambda: 48 * 10**3)
+    monkeypatch.setattr("warpnerf.fields.training_memory.usable_memory", lambda: 48 * 10**3)
     cpu = wp.get_device("cpu")
     require_memory(DENSE, Rgb(), (10, 10, 10), cpu)
     require_memory(DENSE, Deferred(specular=4), (5, 10, 10), cpu)
@@ -116,7 +116,7 @@ def test_what_fits_alone_may_be_too_large_together(
     besides: float, larger: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     gib = 2**30
-    monkeypatch.setattr("warpnerf.fields.storage.usable_memory", lambda: 8 * gib)
+    monkeypatch.setattr("warpnerf.fields.training_memory.usable_memory", lambda: 8 * gib)
     monkeypatch.setattr(type(DENSE), "training_bytes", lambda *_: 6 * gib)
     each = max(6.0, besides)
     says = rf"^{larger}: of the {6.0 + besides} GiB .* {each} GiB, but this machine has 8\.0 GiB"

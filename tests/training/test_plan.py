@@ -29,7 +29,7 @@ from tests.support.tiny_trainings import early_growth as early_growth
 from warpnerf import grid_config, optim_config
 from warpnerf.checks import InputError
 from warpnerf.cli.inspect import InspectOptions, inspect_command
-from warpnerf.fields import storage
+from warpnerf.fields import training_memory
 from warpnerf.runs.checkpoint import load_checkpoint
 from warpnerf.scenes.scene import Scene
 from warpnerf.training import plan as planning
@@ -219,7 +219,9 @@ def test_a_training_needs_room_for_its_last_grid_also_when_resumed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, on_cpu: None
 ) -> None:
     begun = stopped_at(2, tmp_path / "begun", tiny_config(), ball())
-    monkeypatch.setattr(storage, "usable_memory", lambda: 100_000)  # enough for the first grid
+    monkeypatch.setattr(
+        training_memory, "usable_memory", lambda: 100_000
+    )  # enough for the first grid
     for resume in (None, begun):
         with pytest.raises(InputError, match=r"^grid\.voxels: of the .* a grid of .* nodes of"):
             Trainer(ball(), tiny_config(), resume)

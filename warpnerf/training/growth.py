@@ -11,8 +11,9 @@ import warp as wp
 from warpnerf.config import TrainConfig
 from warpnerf.fields.lattice import Lattice
 from warpnerf.fields.parameters import Parameter
-from warpnerf.fields.storage import Storage, TrainedOn, require_memory
+from warpnerf.fields.storage import Storage, TrainedOn
 from warpnerf.fields.storages import class_of
+from warpnerf.fields.training_memory import require_memory
 from warpnerf.model.interface import Model
 from warpnerf.runtime.parallel import Workers
 from warpnerf.scenes.extent.space import grid_size
