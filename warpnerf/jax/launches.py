@@ -11,8 +11,8 @@ import jax
 import numpy as np
 import warp as wp
 
-from warpnerf.checks import InputError, require_rays
-from warpnerf.rendering.arguments import require_reach
+from warpnerf.checks import require_rays
+from warpnerf.rendering.arguments import require_reach, require_rising
 from warpnerf.rendering.operation import Inputs, Operation, Outputs
 
 
@@ -27,11 +27,10 @@ def require_visible(operation: Operation, origins: np.ndarray, directions: np.nd
     require_reach(reach, operation.steps.step, operation.precision)
 
 
-def require_rising(edges: np.ndarray) -> None:
+def require_edges(edges: np.ndarray) -> None:
     """Raise InputError unless edges of intervals are distances in rising order."""
     rising = (edges[:, 1:] >= edges[:, :-1]).all() and (edges[:, 0] >= 0.0).all()
-    if not (np.isfinite(edges).all() and rising):
-        raise InputError("edges must be finite distances of 0 or above, in rising order.")
+    require_rising(bool(np.isfinite(edges).all() and rising))
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
@@ -136,7 +135,7 @@ def _inputs(operation: Operation, given: tuple[wp.array, ...]) -> Inputs:
     if not inputs.origins.device.is_cuda:
         require_visible(operation, inputs.origins.numpy(), inputs.directions.numpy())
         if operation.n_intervals:
-            require_rising(inputs.edges.numpy())
+            require_edges(inputs.edges.numpy())
     return inputs
 
 

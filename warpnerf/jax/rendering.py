@@ -12,7 +12,7 @@ import numpy as np
 from warpnerf.checks import InputError, require_finite, require_one_of
 from warpnerf.config import Scaling
 from warpnerf.jax.arrays import array_of, constant, known
-from warpnerf.jax.launches import render, require_rising, require_visible
+from warpnerf.jax.launches import render, require_edges, require_visible
 from warpnerf.model.interface import Model
 from warpnerf.rendering.arguments import (
     Head,
@@ -249,7 +249,7 @@ def _edges(edges: Any, n_rays: int, dtype: Any) -> jax.Array:
     require_intervals(array.shape, n_rays)
     values = known("edges", edges, dtype)
     if values is not None:
-        require_rising(values)
+        require_edges(values)
     return constant("edges", array.astype(dtype))
 
 

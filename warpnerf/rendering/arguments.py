@@ -183,6 +183,16 @@ def require_intervals(shape: Sequence[int], n_rays: int) -> None:
         )
 
 
+def require_rising(are_rising: bool) -> None:
+    """Raise InputError unless the edges of intervals are finite, 0 or above, and in rising order.
+
+    Args:
+        are_rising: Whether they are, as the framework found that holds them.
+    """
+    if not are_rising:
+        raise InputError("edges must be finite distances of 0 or above, in rising order.")
+
+
 def steps_of_intervals() -> Steps:
     """How intervals are walked through: all of them, in steps of their own."""
     return Steps(near=0.0, far=1e30, step=1.0)

@@ -17,6 +17,7 @@ from warpnerf.rendering.arguments import (
     head_of,
     require_intervals,
     require_reach,
+    require_rising,
     steps_of,
     steps_of_intervals,
 )
@@ -231,8 +232,7 @@ def _edges(edges: Any, n_rays: int, like: torch.Tensor) -> torch.Tensor:
     require_intervals(edges.shape, n_rays)
     given = edges.detach().to(like.dtype).contiguous()
     rising = (given[:, 1:] >= given[:, :-1]).all() and (given[:, 0] >= 0.0).all()
-    if not (bool(given.isfinite().all()) and bool(rising)):
-        raise InputError("edges must be finite distances of 0 or above, in rising order.")
+    require_rising(bool(given.isfinite().all()) and bool(rising))
     return given
 
 
