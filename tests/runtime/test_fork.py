@@ -80,7 +80,7 @@ def test_a_fork_amid_a_launch(on_cpu: None, monkeypatch: pytest.MonkeyPatch) -> 
         caller.start()
         came.wait()
     try:
-        with kernel_cache._loading:
+        with kernel_cache._changing, kernel_cache._loading[add_up_together.module]:
             assert in_a_fork(lambda: [sums(workers), sums(Workers("cpu", 2))]) == [[3, 3]] * 2
     finally:
         go_on.set()

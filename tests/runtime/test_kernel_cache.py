@@ -80,7 +80,7 @@ class Module:
     """What is asked of Warp's modules."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
+        self.folder, self.name = folder, folder.name
 
     def get_module_identifier(self, block_dim: int) -> str:
         return self.folder.name
@@ -178,19 +178,50 @@ def test_a_library_says_what_is_wrong_with_the_cache(
             kernel_cache.start()
 
 
-def test_one_thread_loads_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("modules", [1, 3])
+def test_one_thread_loads_a_module_and_others_load_others(
+    modules: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Warp crashes where two load a module for the first time."""
-    inside: list[int] = []
+    inside: list[object] = []
     together: list[int] = []
+    meeting = threading.Barrier(modules, timeout=60.0)
 
     def load(module: object, device: object) -> None:
-        inside.append(threading.get_ident())
+        inside.append(module)
+        meeting.wait()
         time.sleep(0.05)
-        together.append(len(inside))
-        inside.remove(threading.get_ident())
+        together.append(inside.count(module))
+        inside.remove(module)
 
     monkeypatch.setattr(kernel_cache, "_load", load)
-    kernel = SimpleNamespace(module=None)
+    made = [Module(Path(str(number))) for number in range(modules)]
+    kernels = [SimpleNamespace(module=made[number % modules]) for number in range(3)]
     with ThreadPoolExecutor(3) as pool:
-        list(pool.map(lambda _: kernel_cache.load(kernel, None), range(3)))
+        list(pool.map(lambda kernel: kernel_cache.load(kernel, None), kernels))
     assert together == [1, 1, 1]
+
+
+def test_threads_leave_a_damaged_cache_together(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each finds its module damaged; one of them chooses where all compile from then on."""
+    kernel_cache.start()
+    monkeypatch.setattr(kernel_cache, "_temporary", None)
+    monkeypatch.setattr(process, "_own", True)
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    meeting, tried, caches = threading.Barrier(2, timeout=60.0), [], []
+
+    def load(module: Module, device: object) -> None:
+        if module not in tried:
+            tried.append(module)
+            meeting.wait()
+            raise DamagedKernelError(f"{module.name} in it is damaged")
+        caches.append(wp.config.kernel_cache_dir)
+
+    monkeypatch.setattr(kernel_cache, "_load", load)
+    kernels = [SimpleNamespace(module=Module(tmp_path / name)) for name in "ab"]
+    with ThreadPoolExecutor(2) as pool, pytest.warns(RuntimeWarning) as warned:
+        list(pool.map(lambda kernel: kernel_cache.load(kernel, None), kernels))
+    assert len(warned) == 1 and caches == [str(kernel_cache._temporary)] * 2
+    assert caches[0] != str(tmp_path)

@@ -2,6 +2,7 @@
 
 import signal
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -10,9 +11,11 @@ import pytest
 import warp as wp
 from warpnerf_kernels.cpu.barrier import wait_for_all
 
+from tests.support.compiling import OPTION
 from tests.support.kernel_runner import Kernels
 from tests.support.problems import make_problem
 from warpnerf.checks import InputError
+from warpnerf.runtime import kernel_cache
 from warpnerf.runtime.parallel import NODES, RAYS, LaunchCache, Thread, Workers
 
 
@@ -301,3 +304,72 @@ def test_same_bits_from_threads_in_any_order(on_cpu: None) -> None:
     assert len(results) == 4
     for error, gradient in results:
         assert np.array_equal(error, expected[0]) and np.array_equal(gradient, expected[1])
+
+
+class Named:
+    """What is looked at of a kernel, or a module, that is loaded."""
+
+    def __init__(self, name: str, module: Any = None) -> None:
+        self.name, self.module, self.options = name, module, {OPTION: 0}
+
+
+def kernels_in(*modules: str) -> list[Any]:
+    """One for each name of a module."""
+    made = {name: Named(name) for name in modules}
+    return [Named(f"in {name}", made[name]) for name in modules]
+
+
+def test_kernels_are_loaded_by_several_threads(
+    on_cpu: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One of each module, the first ones first, and none a second time."""
+    meeting, loaded, told = threading.Barrier(2, timeout=60.0), [], []
+
+    def load(kernel: Any, device: wp.Device) -> None:
+        loaded.append(kernel)
+        meeting.wait()
+
+    monkeypatch.setattr(kernel_cache, "load", load)
+    workers, kernels = Workers("cpu", 2), kernels_in("a", "b", "b", "c", "d")
+    workers.load(*kernels, on_loaded=lambda kernel, seconds: told.append((kernel, seconds)))
+    assert {kernel.module.name for kernel in loaded[:2]} == {"a", "b"}
+    assert sorted(kernel.module.name for kernel in loaded) == ["a", "b", "c", "d"]
+    assert {kernel for kernel, _ in told} == set(loaded) and all(s >= 0.0 for _, s in told)
+    workers.load(*kernels)
+    assert len(loaded) == 4
+
+
+def test_one_thread_loads_in_turn(on_cpu: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    loaded: list[Any] = []
+    monkeypatch.setattr(
+        kernel_cache, "load", lambda *given: loaded.append((given[0], threading.current_thread()))
+    )
+    kernels = kernels_in(*"abcd")
+    Workers("cpu", 1).load(*kernels)
+    assert loaded == [(kernel, threading.current_thread()) for kernel in kernels]
+
+
+@pytest.mark.parametrize("where", ["main", "other"])
+def test_an_error_in_loading_is_raised(
+    where: str, on_cpu: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """When all threads have ended; what was to be loaded is tried again the next time."""
+    meeting, loaded = threading.Barrier(2, timeout=60.0), []
+
+    def load(kernel: Any, device: wp.Device) -> None:
+        meeting.wait()
+        main = threading.current_thread() is threading.main_thread()
+        if main == (where == "main"):
+            raise InputError("no room")
+        time.sleep(0.05)
+        loaded.append(kernel)
+
+    workers, kernels = Workers("cpu", 2), kernels_in(*"abcdef")
+    with monkeypatch.context() as patch:
+        patch.setattr(kernel_cache, "load", load)
+        with pytest.raises(InputError, match="no room"):
+            workers.load(*kernels)
+    assert len(loaded) == 1
+    monkeypatch.setattr(kernel_cache, "load", lambda kernel, device: loaded.append(kernel))
+    workers.load(*kernels)
+    assert len(loaded) == 7

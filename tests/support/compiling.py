@@ -12,6 +12,7 @@ from typing import Any
 
 import warp as wp
 
+from warpnerf.runtime import kernel_cache
 from warpnerf.runtime.parallel import Workers
 
 try:
@@ -81,19 +82,21 @@ def compile_as_tests_do() -> None:
     Kernels in float64 are for checking what is computed, and are launched a few times: they are not
     optimised. Those that train are as users have them, but in ``not_optimising``.
     """
-    load, launch = Workers.load, Workers._launch
+    load, load_all, launch = kernel_cache.load, Workers.load, Workers._launch
 
     @wraps(load)
-    def load_quickly(workers: Workers, kernel: wp.Kernel) -> None:
-        kernel = compiled(workers, kernel)
-        if kernel in workers._loaded:
-            return
+    def load_alone(kernel: wp.Kernel, device: wp.Device) -> None:
         with one_at_a_time(kernel.module.name):
-            load(workers, kernel)
+            load(kernel, device)
+
+    @wraps(load_all)
+    def load_quickly(workers: Workers, *kernels: wp.Kernel, **options: Any) -> None:
+        load_all(workers, *(compiled(workers, kernel) for kernel in kernels), **options)
 
     @wraps(launch)
     def launch_quickly(workers: Workers, kernel: wp.Kernel, *given: Any) -> None:
         launch(workers, compiled(workers, kernel), *given)
 
+    kernel_cache.load = load_alone
     Workers.load = load_quickly  # type: ignore[method-assign]
     Workers._launch = launch_quickly  # type: ignore[method-assign]

@@ -21,6 +21,7 @@ import sys
 import tempfile
 import threading
 import warnings
+import weakref
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -44,8 +45,11 @@ WAY_OUT = (
 )
 
 _log = logging.getLogger("warpnerf")
-_loading = threading.Lock()
-"""Warp would load a module twice where two threads request it, and free the code of one of them."""
+_changing = threading.Lock()
+"""Held for a moment by who changes what is noted here."""
+_loading: weakref.WeakKeyDictionary[wp.Module, threading.Lock] = weakref.WeakKeyDictionary()
+"""Warp would load a module twice where two threads request it, and free the code of one of them.
+Different modules are compiled, and loaded, by several threads at once."""
 _temporary: Path | None = None
 _said = False
 _started = False
@@ -53,8 +57,9 @@ _started = False
 
 def _load_again() -> None:
     """Nobody loads in a process that was just forked, whoever did in the one that it comes from."""
-    global _loading
-    _loading = threading.Lock()
+    global _changing
+    _changing = threading.Lock()
+    _loading.clear()
 
 
 if hasattr(os, "register_at_fork"):
@@ -113,23 +118,33 @@ def load(kernel: wp.Kernel, device: wp.Device) -> None:
     Raises:
         InputError: The cache cannot be used, nor for the command a temporary folder be made.
     """
-    with _loading:
+    module = kernel.module
+    with _changing:
+        loading = _loading.setdefault(module, threading.Lock())
+    with loading:
+        cache = wp.config.kernel_cache_dir
         try:
-            _load(kernel.module, device)
+            _load(module, device)
         except Exception as error:  # whatever came of it: Warp raises plain exceptions
-            mistaken = type(error).__name__.startswith("WarpCodegen")  # the kernel, not the cache
-            if mistaken or _temporary is not None:
-                raise
-            told = isinstance(error, OSError | DamagedKernelError)
-            if not told and not process.is_own():
-                raise
-            cache = wp.config.kernel_cache_dir
-            kernel.module.unload()  # forgets that it failed
-            _leave_cache(error)
+            with _changing:
+                if wp.config.kernel_cache_dir == cache:  # else another thread has left it
+                    _leave_after(error)
+            module.unload()  # forgets that it failed
             try:
-                _load(kernel.module, device)
+                _load(module, device)
             except OSError as again:
                 raise _nowhere(cache, error, again) from None
+
+
+def _leave_after(error: Exception) -> None:
+    """Leave the cache where it may be to blame; raise the error where it is not."""
+    mistaken = type(error).__name__.startswith("WarpCodegen")  # the kernel, not the cache
+    if mistaken or _temporary is not None:
+        raise error
+    told = isinstance(error, OSError | DamagedKernelError)
+    if not told and not process.is_own():
+        raise error
+    _leave_cache(error)
 
 
 def _load(module: wp.Module, device: wp.Device) -> None:
@@ -171,9 +186,10 @@ def _is_compiled(folder: Path, device: wp.Device) -> bool:
 def _say_once() -> None:
     """Say what takes so long, once in a process."""
     global _said
-    if not _said:
+    with _changing:
+        said, _said = _said, True
+    if not said:
         _log.info("compiling kernels (once; later runs start at once)")
-    _said = True
 
 
 def _leave_cache(error: Exception) -> None:

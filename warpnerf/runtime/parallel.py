@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import threading
+import time
 import weakref
 from collections.abc import Callable
 from functools import partial
@@ -27,6 +28,8 @@ NODES = 1 << 20
 RAYS = 1 << 13
 """Items per launch on the CPU, of little and of much work each: a fraction of a second, because
 signals such as Ctrl-C wait for a launch to end."""
+COMPILED_AT_ONCE = 8
+"""Kernels, by as many threads: each takes some hundred megabytes meanwhile."""
 
 
 class LaunchCache:
@@ -194,11 +197,48 @@ class Workers:
         at_once = max(1, RAYS // rays)
         self._launch(kernel, n, lambda worker: (worker, *arguments), at_once, cache)
 
-    def load(self, kernel: wp.Kernel) -> None:
-        """Compile a kernel, or fetch it from the cache, once: else every thread would."""
-        if kernel not in self._loaded:
-            kernel_cache.load(kernel, self.device)
-            self._loaded.add(kernel)
+    def load(
+        self,
+        *kernels: wp.Kernel,
+        on_loaded: Callable[[wp.Kernel, float], None] = lambda kernel, seconds: None,
+    ) -> None:
+        """Compile kernels, or fetch them from the cache, once: else every thread would.
+
+        Several are compiled at a time, each by one thread: those of much work should come first.
+
+        Args:
+            kernels: Which ones. Of those that share a module one is loaded.
+            on_loaded: Called with each that is, one at a time, and how many seconds that took; from
+                any thread.
+        """
+        modules = {kernel.module: kernel for kernel in kernels if kernel not in self._loaded}
+        waiting, telling = iter(modules.values()), threading.Lock()
+
+        def load_waiting() -> None:
+            try:
+                for kernel in waiting:
+                    start = time.perf_counter()
+                    kernel_cache.load(kernel, self.device)
+                    seconds = time.perf_counter() - start
+                    with telling:
+                        on_loaded(kernel, seconds)
+            except BaseException:
+                list(waiting)  # nobody begins with another
+                raise
+
+        cores = usable_cores() if self.device.is_cuda else self.count
+        others = [Thread() for _ in range(1, min(cores, len(modules), COMPILED_AT_ONCE))]
+        errors: list[BaseException | None] = []
+        try:
+            for other in others:
+                other.give(load_waiting)
+            load_waiting()
+        finally:
+            errors += [other.wait() for other in others]
+            _end(others)
+        for error in filter(None, errors):
+            raise error
+        self._loaded.update(kernels)
 
     def _launch(
         self,
@@ -210,7 +250,8 @@ class Workers:
     ) -> None:
         if n == 0:
             return
-        self.load(kernel)
+        if kernel not in self._loaded:
+            self.load(kernel)
         if self.device.is_cuda:
             block = kernel_cache.threads_of_a_block(self.device)
             wp.launch(kernel, n, inputs=[0, *arguments(0)], device=self.device, block_dim=block)

@@ -423,8 +423,7 @@ class Trainer:
         """Compile what is not yet in the cache."""
         of_training = kernels_of(self.plan, self.lattice.contraction, self.workers.device)
         of_peers = self.peers.kernels if self.workers.device.is_cpu else ()
-        for kernel in (*of_training, *of_peers):
-            self.workers.load(kernel)
+        self.workers.load(*of_training, *of_peers)
 
     def _grow(self, fraction: float) -> None:
         """Carry field and optimiser over to more voxels, once the schedule says so."""

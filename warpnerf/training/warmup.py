@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, fields
 from itertools import product
@@ -66,8 +65,8 @@ def training_kernels(
     )
     decaying = [adam.adam_kernel(model.n_floats, decays=True), near_decay.find_near_decay]
     return [
+        assembly.render_train_kernel(variant),  # takes longest, so it is compiled first
         camera.sample_pixels,
-        assembly.render_train_kernel(variant),
         *class_of(stored).kernels(stored, model),
         *(decaying if decays else []),
         *([exposure.add_moments] if exposes else []),
@@ -148,7 +147,7 @@ def warm_up(
 
     Args:
         device: Where they are to run: cpu, cuda, cuda:1, ...
-        on_kernel: Called with each kernel that is ready.
+        on_kernel: Called with each kernel that is ready, one at a time, from any thread.
         configs: For which; None: the presets fast and quality.
 
     Returns:
@@ -157,7 +156,7 @@ def warm_up(
     Raises:
         InputError: The device does not exist, or kernels can be kept nowhere.
     """
-    workers = Workers(device, 1)
+    workers = Workers(device)
     configs = [PRESETS[name] for name in DEFAULT_PRESETS] if configs is None else configs
     first = next(iter(configs), None)
     wanted: dict[wp.Module, tuple[str, wp.Kernel]] = {}
@@ -191,15 +190,17 @@ def warm_up(
                     words = _words(kernel, contraction, stored, scaling, losses) + of_model
                     words += ", proposal" * (kernel in proposals)
                     wanted.setdefault(kernel.module, (words, kernel))
-    done = []
-    for name, kernel in wanted.values():
-        compiled = not kernel_cache.is_compiled(kernel, workers.device)
-        start = time.perf_counter()
-        workers.load(kernel)
-        seconds = time.perf_counter() - start
-        done.append(CompiledKernel(name=name, compiled=compiled, seconds=seconds))
-        on_kernel(done[-1])
-    return done
+    names = {kernel: name for name, kernel in wanted.values()}
+    missing = {kernel for kernel in names if not kernel_cache.is_compiled(kernel, workers.device)}
+    ready: dict[wp.Kernel, CompiledKernel] = {}
+
+    def note(kernel: wp.Kernel, seconds: float) -> None:
+        compiled = kernel in missing
+        ready[kernel] = CompiledKernel(name=names[kernel], compiled=compiled, seconds=seconds)
+        on_kernel(ready[kernel])
+
+    workers.load(*names, on_loaded=note)
+    return [ready[kernel] for kernel in names]
 
 
 def _contractions(config: TrainConfig) -> tuple[Contraction, ...]:
