@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import warp as wp
+from warpnerf_kernels.space import camera as camera32
 
 from tests import reference
 from tests.support.kernel_runner import Kernels
@@ -291,7 +292,10 @@ def launch_draw(
     rays.background = kernels.zeros(n, vec3)
     if which is None:
         which = wp.zeros(n, dtype=wp.int32, device=kernels.device)
-    given = source, how, rays, target, which
+    picked = [wp.zeros(n, dtype=wp.int32, device=kernels.device) for _ in range(2)]
+    picks = wp.array(np.arange(n), dtype=wp.int32, device=kernels.device)
+    kernels.workers.launch(camera.pick_pixels, n, source, how, *picked, at_once=at_once)
+    given = source, *picked, picks, how, rays, target, which
     kernels.workers.launch(camera.sample_pixels, n, *given, at_once=at_once)
     return rays, target
 
@@ -309,7 +313,7 @@ def test_sampled_pixels_are_their_rays(kernels64: Kernels) -> None:
     pixel = black["target"] / alpha * 255.0
     np.testing.assert_allclose(pixel[:, 2], 100 * number, atol=1e-9)
     u, v = pixel[:, 0].round().astype(int), pixel[:, 1].round().astype(int)
-    assert len(np.unique(number * WIDTH * HEIGHT + v * WIDTH + u)) > 4000
+    assert len(np.unique(number * WIDTH * HEIGHT + v * WIDTH + u)) == 5000
     for k in range(3):
         of_view = number == k
         origins, directions = expected_rays(pose(k), LENSES[2])
@@ -339,6 +343,42 @@ def test_exposures_are_taken_out_of_pixels_before_their_background(kernels64: Ke
     pixel[2] = 0.4 * pixel[2] + 0.6 * np.array([0.3, 0.6, 0.9])
     np.testing.assert_allclose(target.numpy(), pixel[number], atol=1e-12)
     np.testing.assert_array_equal(which.numpy(), np.array([0, 1, -1])[number])
+
+
+def test_all_pixels_are_drawn_before_any_is_again(kernels64: Kernels) -> None:
+    """In an order of their own each time, in which near ones are far apart."""
+    n = 3 * WIDTH * HEIGHT
+    found = draw(kernels64, 3 * n + 7, 7, (0.0, 0.0, 0.0), 0, 0)
+    number = np.searchsorted([2.0, 3.0, 5.0], found["content_distance"])
+    u, v = np.round(found["target"][:, :2].T * 255.0 / np.where(number == 0, 1.0, 0.2)).astype(int)
+    pixels = number * WIDTH * HEIGHT + v * WIDTH + u
+    epochs = pixels[: 3 * n].reshape(3, n)
+    assert (np.sort(epochs, axis=1) == np.arange(n)).all()
+    assert len(np.unique(pixels[3 * n :])) == 7
+    places = [np.arange(n), *epochs]
+    between = np.corrcoef([*places, np.roll(epochs[0], 1), np.roll(epochs[0], 2)])
+    assert np.abs(between - np.eye(len(between))).max() < 0.05
+    for epoch in epochs:  # as many of each photograph in each batch, but for chance
+        counts = np.stack([np.bincount(b, minlength=3) for b in (epoch // 4800).reshape(144, 100)])
+        assert 20.0 < counts.var(axis=0).mean() < 25.0  # 100 * 1/3 * 2/3, less what is not put back
+
+
+@wp.kernel(enable_backward=False)
+def shuffle_all(n: wp.int64, seed: int, epoch: int, out: wp.array(dtype=wp.int64)):
+    place = wp.tid()
+    out[place] = wp.int64(camera32.shuffled(wp.uint64(place), wp.uint64(n), seed, epoch))
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 5, 16, 17, 100, 4096, 4097])
+def test_an_order_has_each_number_once(n: int, on_cpu: None) -> None:
+    out = wp.zeros(n, dtype=wp.int64, device="cpu")
+    orders = []
+    for seed, epoch in ((0, 0), (0, 1), (1, 0), (2**31 - 1, 2**31 - 1)):
+        wp.launch(shuffle_all, n, inputs=[n, seed, epoch, out], device="cpu")
+        orders.append(out.numpy().copy())
+        assert np.array_equal(np.sort(orders[-1]), np.arange(n))
+    if n > 10:
+        assert all((a != b).mean() > 0.8 for k, a in enumerate(orders) for b in orders[:k])
 
 
 def test_pixels_beyond_32_bits_are_drawn_evenly(kernels32: Kernels) -> None:
@@ -390,7 +430,7 @@ def test_rays_are_counted_through_the_training(kernels32: Kernels) -> None:
     whole = draw(kernels32, 300, *options, rays_before=2**32 - 100, at_once=7)
     parts = [
         draw(kernels32, n, *options, rays_before=before)
-        for n, before in ((60, 2**32 - 100), (40, 2**32 - 40), (200, 0))
+        for n, before in ((60, 2**32 - 100), (40, 2**32 - 40), (200, 2**32))
     ]
     for name, found in whole.items():
         assert np.array_equal(found, np.concatenate([part[name] for part in parts]))

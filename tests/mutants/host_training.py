@@ -293,7 +293,7 @@ MUTANTS = [
     of_host("no gradient lies in shared memory", TRAINER, "config.threads, peers.zeros)", "config.threads)", PROCESSES),
     of_host("the shared are not summed", "torch/processes.py", "            add()\n", "            pass\n", PROCESSES),
     of_host("each process's mean is over its own rays", TRAINER,
-            "self._space.seen * (batch.count / self._sampler.count(n_steps))", "self._space.seen", PROCESSES),
+            "share = batch.count / self._sampler.count(n_steps)", "share = 1.0", PROCESSES),
     of_host("an older reach is the distance", PLANNED, "one, distances, self.reach)", "one, distances, one)", WITHOUT_PLAN),
     of_host("older distances are forgotten", PLANNED, "list(self.content_distances or [one] * n_views)",
             "[one] * n_views", OLDER_DISTANCES),

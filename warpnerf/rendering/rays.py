@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from types import ModuleType
 from typing import Any
@@ -145,7 +145,7 @@ class PixelSampler:
             background: rgb in [0, 1]; None: a random colour for each ray.
             n_rays: Rays in the batch of one step.
             jitter: Whether samples are shifted by a random part of a step.
-            seed: Of all that is random here; what is drawn repeats after 2^32 rays.
+            seed: Of all that is random here.
             workers: Where to work.
         """
         self._workers = workers
@@ -170,8 +170,9 @@ class PixelSampler:
         source.n_pixels = self._n_pixels
         source.content_distances = wp.array(content_distances, dtype=real, device=workers.device)
         self._draw_anywhere()
-        self._batch = _room(n_rays, workers)
         self._launches = LaunchCache()
+        self._room = _Room(n_rays, workers)
+        self._batch = self._room.rays
 
     def _add(self, view: View) -> kernels.CameraParams:
         """A photograph as the kernel takes it: on the CPU where it lies, on CUDA a copy there."""
@@ -209,7 +210,7 @@ class PixelSampler:
         """From now on draw no pixels whose rays, and those of all around them, meet nothing.
 
         Such rays see the background, whatever is trained. Pixels are told apart in square blocks.
-        Batches have as many rays as had met something among all, on average.
+        Batches are what is left of those of all pixels.
 
         Args:
             lattice: Without contraction.
@@ -241,27 +242,24 @@ class PixelSampler:
             self._source.block, self._source.covered = edge, covered
             device = self._workers.device
             self._source.first_blocks = wp.array(first[:-1], dtype=wp.int32, device=device)
-        share = share or 1.0
-        self._n_drawn = max(1, round(share * self._n_rays))
-        return share
+        return share or 1.0
 
     def _draw_anywhere(self) -> None:
         """No blocks are left out."""
-        self._n_drawn = self._n_rays
         self._source.block = 1
         self._source.first_blocks = wp.empty(0, dtype=wp.int32, device=self._workers.device)
         self._source.covered = wp.empty(0, dtype=wp.uint8, device=self._workers.device)
 
     def count(self, n_steps: int = 1) -> int:
-        """Rays of the batches of some steps."""
-        return n_steps * self._n_drawn
+        """Rays of the batches of some steps, those that are left out included."""
+        return n_steps * self._n_rays
 
     def draw(self, step: int, n_steps: int = 1, share: tuple[int, int] = (0, 1)) -> RayBatch:
         """The batches of some steps as one, or a share of it.
 
-        What is drawn is a function of the steps, the seed, and of what ``cull_background`` was
-        given. As long as that has left nothing out, a batch of several steps is made of those of
-        each.
+        No pixel is drawn again before all have been: one after the other in a random order, each
+        time in another one. What is drawn is a function of the steps, the seed, and of what
+        ``cull_background`` was given. A batch of several steps is made of those of each.
 
         Args:
             step: The first.
@@ -269,23 +267,59 @@ class PixelSampler:
             share: (k, n): of n parts that make the batch, part k.
 
         Returns:
-            ``count`` rays or their share, in the same arrays from one call to the next as long as
-            there are as many.
+            ``count`` rays or their share, less those that are left out, but one at least; in the
+            same memory from one call to the next as long as there is room.
         """
         part, parts = share
         n_rays = max(parts, self.count(n_steps))
         begin, end = (n_rays * k // parts for k in (part, part + 1))
-        if self._batch.count != end - begin:
-            self._batch = _room(end - begin, self._workers)
+        if self._room.rays.count < end - begin:
+            self._room = _Room(end - begin, self._workers)
+            self._batch = self._room.rays
+        picked = self._room.picked_views, self._room.picked_pixels
+        self._draw.rays_before = step * self._n_rays + begin
+        self._workers.launch(
+            kernels.pick_pixels,
+            end - begin,
+            *(self._source, self._draw, *picked),
+            cache=self._launches,
+        )
+        picks, count = self._left(end - begin)
+        if self._batch.count != count:
+            self._batch = _first_rays(self._room.rays, count)
         batch = self._batch
-        self._draw.rays_before = (step * self._n_rays + begin) % 2**32
         self._workers.launch(
             kernels.sample_pixels,
             batch.count,
-            *(self._source, self._draw, batch.struct, batch.target_rgb, batch.views),
+            *(self._source, *picked, picks, self._draw),
+            *(batch.struct, batch.target_rgb, batch.views),
             cache=self._launches,
         )
         return batch
+
+    def _left(self, n_picked: int) -> tuple[wp.array, int]:
+        """Which of the picked pixels rays are drawn through, and how many: one at least."""
+        room = self._room
+        if self._source.covered.shape[0] == 0:
+            return room.all, n_picked
+        covered = np.flatnonzero(room.picked_views.numpy()[:n_picked] >= 0).astype(np.int32)
+        if covered.size == 0:
+            covered = np.zeros(1, np.int32)
+        wp.copy(room.covered, wp.array(covered, device="cpu"), count=covered.size)
+        return room.covered, int(covered.size)
+
+
+class _Room:
+    """Arrays for a batch: the pixels that are picked, and rays through those that are left."""
+
+    def __init__(self, n_rays: int, workers: Workers) -> None:
+        """For so many."""
+        device = workers.device
+        self.rays = _batch(n_rays, workers)
+        self.picked_views = wp.zeros(n_rays, dtype=wp.int32, device=device)
+        self.picked_pixels = wp.zeros(n_rays, dtype=wp.int32, device=device)
+        self.all = wp.array(np.arange(n_rays), dtype=wp.int32, device=device)
+        self.covered = wp.zeros(n_rays, dtype=wp.int32, device=device)
 
 
 def _n_blocks(camera: Camera, edge: int) -> int:
@@ -341,7 +375,13 @@ def runs_of(mask: np.ndarray) -> np.ndarray:
     return np.stack([before, begins], axis=1).astype(np.int32)
 
 
-def _room(n_rays: int, workers: Workers) -> RayBatch:
+def _first_rays(batch: RayBatch, count: int) -> RayBatch:
+    """So many rays of a batch, in the same memory."""
+    arrays = {field.name: getattr(batch, field.name)[:count] for field in fields(batch)}
+    return RayBatch(**arrays)
+
+
+def _batch(n_rays: int, workers: Workers) -> RayBatch:
     """Arrays for that many rays, not filled yet."""
 
     def empty(dtype: type) -> wp.array:

@@ -32,7 +32,7 @@ from warpnerf.training.schedule import Schedule
 STEPS_SHARE = 0.1
 """Of a training's steps, that a short one which looks for the extent takes at most."""
 
-RAY_BYTES = 100
+RAY_BYTES = 116
 """Memory of a ray of an update: where it comes from and goes, and what it should be and is."""
 
 RECORD_BYTES = 1 << 29

@@ -254,7 +254,7 @@ class Trainer:
         """Add the gradient of a batch's losses to that of the update."""
         if self._resampling is not None:
             self._resampling.propose(self.free, batch, self.fraction)
-        share = self._space.seen * (batch.count / self._sampler.count(n_steps))
+        share = batch.count / self._sampler.count(n_steps)
         self._pass.run(self.free, batch, n_steps, share)
         self._views = batch.views
         if self._resampling is not None:
@@ -289,7 +289,7 @@ class Trainer:
         if self._resampling is not None:
             self._resampling.step(self.optimiser, *how)
         if self.exposures is not None:
-            self.exposures.fit(self._sampler.count(n_steps))
+            self.exposures.fit(round(self._space.seen * self._sampler.count(n_steps)))
             self.exposures = self.exposures.judged(self.fraction, self._rays_drawn, self.peers)
 
     def report(self) -> Progress:

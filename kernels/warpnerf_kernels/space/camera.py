@@ -16,13 +16,11 @@ RANDOM_BACKGROUND = 1
 AHEAD = 8
 """Rays from the one that a CPU draws to the one whose pixel it prefetches."""
 
+SPREAD = 0x9E3779B97F4A7C15
+"""2^64 over the golden ratio, made odd: multiplied by it, low bits reach all higher ones."""
 
-TRIES = 1024
-"""Pixels drawn for a ray until one of them lies in a block that is covered: of a share of 1 % all
-but one ray in thirty thousand find one."""
-
-MANY_PIXELS = 2**26
-"""Up to so many, 32 random bits draw none more than 1/64 more often than another."""
+ROUNDS = 3
+"""Of multiplication and shift in which the bits of a place become those of a pixel."""
 
 
 @wp.struct
@@ -66,7 +64,7 @@ class Draw:
     """How a batch of pixels is drawn."""
 
     seed: int  # of the training
-    rays_before: wp.uint32  # in the training, before ray 0 of this batch
+    rays_before: wp.int64  # in the training, before ray 0 of this batch
     background: vec3  # rgb in [0, 1]
     background_mode: int  # RANDOM_BACKGROUND: a colour of its own for each ray
     jitter: int  # 1: a random offset for each ray, 0: the middle of the step
@@ -270,41 +268,58 @@ def counting_pixel(view: CameraParams, number: int) -> int:
 
 
 @wp.func
-def random_below(state: wp.uint32, n: wp.int64):
-    """A random number from 0 to n - 1, and the state of the generator after it.
+def shuffled(place: wp.uint64, n: wp.uint64, seed: int, epoch: int) -> wp.uint64:
+    """The number from 0 to n - 1 at a place from 0 to n - 1 of a random order of all of these.
 
-    Of many, 32 bits would draw some much more often than others, so it takes 64.
+    A bijection of all numbers of as many bits as n - 1 has, applied until it ends below n: less
+    than twice on average.
     """
-    drawn = wp.uint64(wp.randu(state))
-    if n > wp.int64(MANY_PIXELS):
-        drawn = (drawn << wp.uint64(32)) | wp.uint64(wp.randu(state))
-    return wp.int64(drawn % wp.uint64(n)), state
+    mask = n - wp.uint64(1)
+    bits = wp.uint64(1)
+    while mask >> bits != wp.uint64(0):
+        bits += wp.uint64(1)
+    mask = (wp.uint64(1) << bits) - wp.uint64(1)
+    half = (bits + wp.uint64(1)) / wp.uint64(2)
+    number = place
+    found = int(0)
+    while found == 0:
+        state = wp.rand_init(seed, -1 - epoch)  # rays have the numbers from 0 on
+        for _ in range(wp.static(ROUNDS)):
+            number = (number + wp.uint64(wp.randu(state))) * wp.uint64(wp.static(SPREAD)) & mask
+            number = number ^ (number >> half)
+        found = wp.where(number < n, 1, 0)
+    return number
 
 
-@wp.func
-def draw_pixel(source: PixelSource, seed: int, ray: wp.uint32):
-    """A ray's view, its pixel there, and the state of the ray's generator after that.
-
-    Where blocks are given, a pixel whose block is not covered is drawn again.
-    """
-    state = wp.rand_init(seed, int(ray))
-    view = int(0)
-    local = int(0)
-    tries = int(0)
-    while tries < wp.static(TRIES):
-        pixel, state = random_below(state, source.n_pixels)
-        view = view_of_pixel(source.views, pixel)
-        local = counting_pixel(source.views[view], int(pixel - source.views[view].first_pixel))
-        tries += 1
-        if source.covered.shape[0] == 0:
-            break
-        width = source.views[view].width
+@wp.kernel
+def pick_pixels(
+    # launch
+    first: int,  # it picks for rays first, first + 1, ...
+    # scene
+    source: PixelSource,
+    # choices
+    draw: Draw,
+    # out
+    out_views: wp.array(dtype=wp.int32),  # [n_rays] the pixel's photograph v; -1 - v: not covered
+    out_pixels: wp.array(dtype=wp.int32),  # [n_rays] the pixel there
+):
+    """The pixels of a batch: all that count in a random order, and then again in another one."""
+    i = first + wp.tid()
+    ray = draw.rays_before + wp.int64(i)
+    epoch = ray // source.n_pixels
+    place = wp.uint64(ray - epoch * source.n_pixels)
+    pixel = wp.int64(shuffled(place, wp.uint64(source.n_pixels), draw.seed, int(epoch)))
+    v = view_of_pixel(source.views, pixel)
+    local = counting_pixel(source.views[v], int(pixel - source.views[v].first_pixel))
+    out_views[i] = v
+    out_pixels[i] = local
+    if source.covered.shape[0] > 0:
+        width = source.views[v].width
         block = source.block
         across = (width + block - 1) // block
-        at = source.first_blocks[view] + local // width // block * across + local % width // block
-        if source.covered[at] != wp.uint8(0):
-            break
-    return view, local, state
+        at = source.first_blocks[v] + local // width // block * across + local % width // block
+        if source.covered[at] == wp.uint8(0):
+            out_views[i] = -1 - v
 
 
 @wp.kernel
@@ -313,6 +328,9 @@ def sample_pixels(
     first: int,  # it makes rays first, first + 1, ...
     # scene
     source: PixelSource,
+    picked_views: wp.array(dtype=wp.int32),  # [n_picked] by pick_pixels
+    picked_pixels: wp.array(dtype=wp.int32),  # [n_picked] likewise
+    picks: wp.array(dtype=wp.int32),  # [n_rays, and room] which of these rays are made of
     # choices
     draw: Draw,
     # out
@@ -320,13 +338,15 @@ def sample_pixels(
     out_target_rgb: wp.array(dtype=vec3),  # [n_rays] the pixel over its background
     out_views: wp.array(dtype=wp.int32),  # [n_rays] its photograph; -1: the pixel is not opaque
 ):
-    """A batch of rays through random pixels, all that count and are covered equally likely."""
+    """A batch of rays through the pixels that were picked."""
     i = first + wp.tid()
-    ray = draw.rays_before + wp.uint32(i)
-    later = ray + wp.uint32(wp.static(AHEAD))
-    later_v, later_local, _later = draw_pixel(source, draw.seed, later)
-    prefetch(source.views[later_v].pixels, later_local * source.views[later_v].channels)
-    v, local, state = draw_pixel(source, draw.seed, ray)
+    later = picks[wp.min(i + wp.static(AHEAD), picks.shape[0] - 1)]
+    later_view = source.views[wp.max(picked_views[later], -1 - picked_views[later])]
+    prefetch(later_view.pixels, picked_pixels[later] * later_view.channels)
+    pick = picks[i]
+    v = wp.max(picked_views[pick], -1 - picked_views[pick])
+    local = picked_pixels[pick]
+    state = wp.rand_init(draw.seed, int(draw.rays_before + wp.int64(pick)))
     view = source.views[v]
     out_rays.origins[i] = view.position
     out_rays.directions[i] = pixel_direction(
