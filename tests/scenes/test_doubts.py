@@ -8,8 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.scenes.test_conventions import along_a_wall, held, outward, photographed
-from tests.support.tiny_scenes import DATA, needs_capture
+from tests.scenes.test_conventions import SIZE, along_a_wall, held, outward, photographed
+from tests.support.tiny_scenes import DATA, camera_at, look_at, needs_capture
+from warpnerf.scenes.extent.conventions import check_against_photographs
+from warpnerf.scenes.extent.photo_consistency import PhotoConsistency
 from warpnerf.scenes.formats.load import load_scene
 from warpnerf.scenes.scene import View
 
@@ -57,6 +59,36 @@ def test_photographs_of_other_poses_are_named(room: list[View]) -> None:
     assert held(shuffled(room))[2].startswith(REFUTED)
     same = [replace(view, image=room[0].image) for view in room]
     assert held(same)[2].startswith(REFUTED)
+
+
+def mirrored(views: list[View], axis: int) -> list[View]:
+    """Their photographs turned over along rows (1) or columns (0)."""
+    return [replace(view, image=np.ascontiguousarray(np.flip(view.image, axis))) for view in views]
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize(("axis", "how"), [(1, "left to right"), (0, "upside down")])
+def test_mirrored_photographs_are_named(axis: int, how: str, room: list[View]) -> None:
+    assert f"photographs were mirrored {how} after" in held(mirrored(room, axis))[2]
+    poses = np.array([view.camera.c2w for view in room])
+    off = [replace(v, camera=replace(v.camera, cx=40.0, cy=30.0)) for v in mirrored(room, axis)]
+    assert np.array_equal(PhotoConsistency.of(off).poses, poses)
+    picture = PhotoConsistency.of(off).mirrored(across=axis == 1)._picture(0)
+    np.testing.assert_array_equal(picture.gray, PhotoConsistency.of(room)._picture(0).gray)
+    np.testing.assert_array_equal(picture.centre, [40.0, 30.0])
+
+
+@pytest.mark.ci
+def test_mirrored_photographs_of_an_object_are_named(room: list[View]) -> None:
+    """Of cameras that look at one thing nothing else is questioned."""
+    around = [
+        camera_at(look_at((1.2 * np.cos(a), 1.4 * np.sin(a), 1.3), (-0.3, 0.0, 0.5)), **SIZE)
+        for a in np.linspace(0.0, 5.0, 20)
+    ]
+    table = photographed(around)
+    for views, says in ((table, ""), (mirrored(table, 1), "were mirrored left to right")):
+        said = check_against_photographs(views, range(len(views)), None, True)[3]
+        assert ("; ".join(said) == "") if not says else says in said[0]
 
 
 @pytest.mark.ci

@@ -13,7 +13,7 @@ from warpnerf.checks import InputError
 from warpnerf.evaluation.evaluate import require_measurable
 from warpnerf.runtime.memory import usable_cores
 from warpnerf.scenes.cameras.camera import Camera
-from warpnerf.scenes.cameras.focus import far_off, find_focus, share_aimed_at, up_direction
+from warpnerf.scenes.cameras.focus import far_off, find_focus, share_aimed_at, upside_down
 from warpnerf.scenes.formats.survey import Survey
 from warpnerf.scenes.scene import Scene, View
 
@@ -278,12 +278,12 @@ def _turned(camera: Camera) -> Camera:
 def _odd_places(scene: Scene) -> list[str]:
     """Cameras that stand on their heads, or far away from all others."""
     odd = []
-    up = up_direction(scene.cameras)
-    rolled = [view.name for view in scene.views if view.camera.c2w[:, 1] @ up < -0.3]
+    pairs = zip(scene.views, upside_down(scene.cameras), strict=True)
+    rolled = [view.name for view, turned in pairs if turned]
     if rolled:
         odd.append(
             f"upside down against the others: {len(rolled)} of {len(scene.views)} cameras (first: "
-            f"{rolled[0]})"
+            f"{rolled[0]}), whose photographs were turned, or whose poses are in other axes"
         )
     lost = [v.name for v, far in zip(scene.views, far_off(scene.cameras), strict=True) if far]
     if lost:

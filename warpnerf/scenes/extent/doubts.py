@@ -26,10 +26,14 @@ turn, any focal length fits: depths make up for it."""
 
 
 def doubts(photographs: PhotoConsistency) -> list[str]:
-    """Warnings of focal lengths, or else poses, that photographs of the training refute."""
+    """Warnings of what photographs of the training refute: that they are as poses were found by
+    them, focal lengths, or else poses."""
     gain = photographs.agreement.gain
     if len(gain) < ENOUGH or gain.mean() >= UNSURE:
         return []
+    mirrored = mirrored_photographs(photographs)
+    if mirrored:
+        return mirrored
     zoom = _zoom(photographs)
     if zoom is not None:
         return [
@@ -43,6 +47,24 @@ def doubts(photographs: PhotoConsistency) -> list[str]:
             "any depth; poses, focal lengths or the order of the photographs are likely wrong"
         ]
     return []
+
+
+def mirrored_photographs(photographs: PhotoConsistency) -> list[str]:
+    """A warning of photographs that do not fit as they stand, and do once they are mirrored."""
+    given, found = photographs.agreement, {}
+    if given.fits:
+        return []
+    for how, across in (("left to right", True), ("upside down", False)):
+        other = photographs.mirrored(across=across).agreement
+        if other.is_better(given):
+            found[how] = float(other.gain.mean())
+    if not found:
+        return []
+    how = max(found, key=lambda how: found[how])
+    return [
+        f"photographs were mirrored {how} after their poses were found: so they fit each other, "
+        "and not as they stand; mirror them back"
+    ]
 
 
 def _zoom(photographs: PhotoConsistency) -> float | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -34,6 +34,12 @@ class Picture:
     """[2] pixels."""
     centre: np.ndarray
     """[2] principal point, pixels."""
+
+    def mirrored(self, across: bool, down: bool) -> Picture:
+        """Mirrored left to right, and upside down, but for the principal point: a file's is that of
+        the photograph that poses were found by."""
+        gray = self.gray[:: -1 if down else 1, :: -1 if across else 1]
+        return replace(self, gray=np.ascontiguousarray(gray))
 
 
 def reduced(view: View) -> Picture:

@@ -129,6 +129,10 @@ class PhotoConsistency:
     """[n, 3, 4] of these, camera to world in OpenGL axes, scene units."""
     zoom: float = 1.0
     """How many times their focal length the lenses have."""
+    flip: tuple[bool, bool] = (False, False)
+    """Whether photographs are mirrored left to right, and upside down."""
+    among: tuple[int, ...] | None = None
+    """Indices of the views whose patches may be looked for; None: all."""
     _pictures: dict[int, Picture] = field(default_factory=dict)
 
     @classmethod
@@ -138,9 +142,10 @@ class PhotoConsistency:
         return cls(views=chosen, poses=np.array([view.camera.c2w for view in chosen]))
 
     @property
-    def references(self) -> range:
+    def references(self) -> Sequence[int]:
         """Indices of the views whose patches are looked for."""
-        return range(0, len(self.views), max(1, -(-len(self.views) // REFERENCES)))
+        among = range(len(self.views)) if self.among is None else self.among
+        return among[:: max(1, -(-len(among) // REFERENCES))]
 
     @property
     def cameras(self) -> list[Camera]:
@@ -161,6 +166,14 @@ class PhotoConsistency:
     def zoomed(self, factor: float) -> PhotoConsistency:
         """The same photographs, had their lenses so many times the focal length."""
         return replace(self, zoom=factor)
+
+    def mirrored(self, *, across: bool) -> PhotoConsistency:
+        """The same photographs, mirrored left to right (``across``) or upside down."""
+        return replace(self, flip=(across, not across))
+
+    def of_views(self, among: Sequence[int]) -> PhotoConsistency:
+        """The same photographs, of which patches of some are looked for in all."""
+        return replace(self, among=tuple(among))
 
     def apart(self) -> float:
         """How far off the neighbours of a reference are, by the median; see ``neighbours``."""
@@ -353,6 +366,8 @@ class PhotoConsistency:
         if i not in self._pictures:
             self._pictures[i] = reduced(self.views[i])
         picture = self._pictures[i]
+        if any(self.flip):
+            picture = picture.mirrored(*self.flip)
         return picture if self.zoom == 1.0 else replace(picture, focal=self.zoom * picture.focal)
 
 
