@@ -28,6 +28,7 @@ from warpnerf.scenes.formats.left_over import unused_depths, unused_masks, unuse
 from warpnerf.scenes.formats.reduced import with_reduced
 from warpnerf.scenes.images.depths import Depth, readable_depth, unread_depths
 from warpnerf.scenes.images.images import exif_orientation, image_shape, read_image
+from warpnerf.scenes.images.mask_values import other_values
 from warpnerf.scenes.images.masks import (
     PackedMask,
     all_of_blocks,
@@ -132,6 +133,7 @@ def assemble(
         turned = list(pool.map(_may_lie, frames))
     left = [entry for entry in read if entry is not None]
     complete, mask_warnings = _without_masked(file, frames, left, complete)
+    mask_warnings += other_values([entry.frame.mask for entry in left if entry.frame.mask])
     notes += photograph_notes(
         [(entry.frame, entry.whole, entry.photograph.resampling) for entry in left]
     )
