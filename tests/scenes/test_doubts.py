@@ -61,6 +61,43 @@ def test_photographs_of_other_poses_are_named(room: list[View]) -> None:
     assert held(same)[2].startswith(REFUTED)
 
 
+def bent(views: list[View], **lens: float | bool) -> list[View]:
+    return [replace(view, camera=replace(view.camera, **lens)) for view in views]
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize("lens", [{"k1": -0.3, "k2": 0.1}, {"fisheye": True}])
+def test_distortion_of_photographs_without_is_named(
+    lens: dict[str, float | bool], room: list[View]
+) -> None:
+    said = held(bent(room, **lens))[2]
+    assert said.startswith("distortion does not fit the photographs, which fit each other better")
+
+
+@pytest.mark.ci
+def test_photographs_with_their_distortion_are_believed(room: list[View]) -> None:
+    """Resampled to a lens: what was read between pixels is as good as it was."""
+    views = []
+    for view in bent(room, k1=-0.2, p1=0.01):
+        c = view.camera
+        u, v = np.meshgrid(np.arange(c.width) + 0.5, np.arange(c.height) + 0.5)
+        straight = np.stack([u.ravel() - c.cx, v.ravel() - c.cy], axis=1) / c.fx
+        at = np.floor(c.distort(straight)[0] * c.fx + [c.cx, c.cy]).astype(int)
+        image, inside = view.image.copy(), ((at >= 0) & (at < [c.width, c.height])).all(axis=1)
+        image[at[inside, 1], at[inside, 0]] = view.image.reshape(-1, 3)[inside]
+        views.append(replace(view, image=image))
+    assert "distortion" not in held(views)[2]
+
+
+@pytest.mark.ci
+def test_photographs_of_which_some_do_not_fit_are_counted(room: list[View]) -> None:
+    turned = mirrored(mirrored(room, 0), 1)
+    said = held([*room[:10], *turned[10:]])[2]
+    found = re.match(r"some photographs do not fit .*: (\d+) of 10 that .*first: 01[0-9]\)", said)
+    assert found is not None and 3 <= int(found[1]) <= 6
+    assert held([*room[:18], *turned[18:]])[2] == ""
+
+
 def mirrored(views: list[View], axis: int) -> list[View]:
     """Their photographs turned over along rows (1) or columns (0)."""
     return [replace(view, image=np.ascontiguousarray(np.flip(view.image, axis))) for view in views]

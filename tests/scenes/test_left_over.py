@@ -159,6 +159,25 @@ def test_points_that_cannot_be_read_are_said(tmp_path: Path) -> None:
     assert load_scene(tmp_path / "s").observations is None
 
 
+@pytest.mark.parametrize("ending", ["bmp", "tif", "webp"])
+def test_masks_of_other_endings_are_said_and_read(tmp_path: Path, ending: str) -> None:
+    """They were neither."""
+    write_transforms(tmp_path)
+    mask = np.full((6, 8), 255, np.uint8)
+    mask[:2] = 0
+    (tmp_path / "masks").mkdir()
+    options = {"lossless": True} if ending == "webp" else {}
+    Image.fromarray(mask).save(tmp_path / f"masks/001.{ending}", **options)
+    said = f"--masks {tmp_path / 'masks'} ignores what is black there"
+    assert any(said in warning for warning in load_scene(tmp_path).warnings)
+    (given,) = (
+        v.mask
+        for v in load_scene(tmp_path, masks=tmp_path / "masks").views
+        if v.name == "images/001.png"
+    )
+    assert given is not None and np.array_equal(given, mask > 0)
+
+
 @pytest.mark.parametrize("inner", ["person/001.png", "001.npy"])
 def test_masks_in_folders_of_their_folder_or_as_arrays_are_said(tmp_path: Path, inner: str) -> None:
     scene_with_model(tmp_path)

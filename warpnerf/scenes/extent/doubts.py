@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from warpnerf.scenes.extent.photo_consistency import PhotoConsistency
+from warpnerf.scenes.extent.photo_consistency import ALMOST_ALL, NOTABLY, PhotoConsistency
 
 REFUTED = 0.08
 """Mean gain below which photographs do not fit their poses: captures of cameras that are CLOSE have
@@ -13,6 +13,16 @@ CLOSE = 2.0
 """How far apart neighbours may be for that, as in ``photo_consistency.neighbours``."""
 ENOUGH = 6
 """References, at least, that tell."""
+
+FEWEST_UNFIT = 3
+SOME = 0.25
+"""References, at least, and share of them, that do not fit where the others do: captures have none
+with a gain below 0.1 where neighbours are CLOSE."""
+OTHERS = 0.15
+"""Mean gain of the others, at least."""
+
+STRAIGHTER = 0.03
+"""Mean gain by which photographs must fit better without distortion: captures with it lose 0.05."""
 
 UNSURE = 0.2
 """Mean gain from which on focal lengths are believed."""
@@ -27,10 +37,19 @@ turn, any focal length fits: depths make up for it."""
 
 def doubts(photographs: PhotoConsistency) -> list[str]:
     """Warnings of what photographs of the training refute: that they are as poses were found by
-    them, focal lengths, or else poses."""
-    gain = photographs.agreement.gain
-    if len(gain) < ENOUGH or gain.mean() >= UNSURE:
+    them, distortion, focal lengths, or else poses of all or of some."""
+    agreement = photographs.agreement
+    gain = agreement.gain
+    if len(gain) < ENOUGH:
         return []
+    if photographs.distorted and _undistorted(photographs):
+        return [
+            "distortion does not fit the photographs, which fit each other better without it: they "
+            "were undistorted since, or it is that of another lens; leave its coefficients out, or "
+            "use the photographs that it was estimated by"
+        ]
+    if gain.mean() >= UNSURE:
+        return _some_unfit(photographs)
     mirrored = mirrored_photographs(photographs)
     if mirrored:
         return mirrored
@@ -41,12 +60,38 @@ def doubts(photographs: PhotoConsistency) -> list[str]:
             f"{zoom * FINER[0]:.2g} to {zoom * FINER[1]:.2g} times as much; correct them: they may "
             "be those of photographs of another size, or in millimetres"
         ]
-    if gain.mean() < REFUTED and photographs.apart() <= CLOSE:
+    some = _some_unfit(photographs)
+    if not some and gain.mean() < REFUTED and photographs.apart() <= CLOSE:
         return [
             "photographs do not fit their poses: what one shows is not found in its neighbours, at "
             "any depth; poses, focal lengths or the order of the photographs are likely wrong"
         ]
-    return []
+    return some
+
+
+def _undistorted(photographs: PhotoConsistency) -> bool:
+    """Whether photographs fit each other clearly better without the distortion of their lenses."""
+    given, straight = photographs.agreement, photographs.straight().agreement
+    if not straight.fits or len(straight.of) != len(given.of):
+        return False
+    gain = straight.gain - given.gain
+    return bool(gain.mean() >= STRAIGHTER and np.mean(gain > 0.0) >= ALMOST_ALL)
+
+
+def _some_unfit(photographs: PhotoConsistency) -> list[str]:
+    """A warning of references that are found by chance only, where the others are found surely."""
+    gain, of = photographs.agreement.gain, photographs.agreement.of
+    unfit = (gain < NOTABLY) & [photographs.farthest(i) <= CLOSE for i in of]
+    if unfit.all() or unfit.sum() < FEWEST_UNFIT or unfit.mean() < SOME:
+        return []
+    if gain[~unfit].mean() < OTHERS:
+        return []
+    first = photographs.views[int(of[unfit][0])].name
+    return [
+        f"some photographs do not fit their poses: {unfit.sum()} of {len(gain)} that were looked "
+        f"at (first: {first}) are not found in their neighbours, the others are; they may be "
+        "turned, mirrored, of another lens, or wrongly posed"
+    ]
 
 
 def mirrored_photographs(photographs: PhotoConsistency) -> list[str]:

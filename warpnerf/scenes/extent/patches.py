@@ -30,6 +30,8 @@ class Picture:
 
     gray: np.ndarray
     """[H, W] float32 in [0, 255]; NaN where the lens sees nothing."""
+    stored: np.ndarray
+    """The same as of the lens that it has."""
     focal: np.ndarray
     """[2] pixels."""
     centre: np.ndarray
@@ -53,13 +55,14 @@ def reduced(view: View) -> Picture:
     shape = (-1, camera.width, factor, image.shape[2])
     gray = np.stack([_gray(row[::every].reshape(shape)[:, :, ::every]) for row in rows])
     focal, centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
+    stored = gray
     bent = (camera.k1, camera.k2, camera.k3, camera.p1, camera.p2, camera.rational, camera.fisheye)
     if any(bent):
         u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
         straight = (np.stack([u.ravel(), v.ravel()], axis=1) - centre) / focal
         pixels = camera.distort(straight)[0] * focal + centre
         gray = bilinear(gray, pixels).reshape(gray.shape)
-    return Picture(gray=gray, focal=focal, centre=centre)
+    return Picture(gray=gray, stored=stored, focal=focal, centre=centre)
 
 
 def _most(camera: Camera) -> tuple[int, int]:
