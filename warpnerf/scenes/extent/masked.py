@@ -105,10 +105,9 @@ def _share_of_focus(masks: Masks, cameras: Sequence[Camera], training: Sequence[
 def _are_around(masks: Masks) -> bool:
     """Whether nearly all images have masks that leave their corners, as of what is around an
     object."""
-    kept = [
-        mask is not None and mask.read()[[0, 0, -1, -1], [0, -1, 0, -1]].all() for mask in masks
-    ]
-    return float(np.mean(kept)) >= 1.0 - FEW
+    corners = [0, 0, -1, -1], [0, -1, 0, -1]
+    kept = sum(mask is not None and bool(mask.read()[corners].all()) for mask in masks)
+    return kept >= (1.0 - FEW) * len(masks)
 
 
 def _leaves(mask: PackedMask, camera: Camera, point: np.ndarray) -> bool:
