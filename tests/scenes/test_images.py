@@ -113,6 +113,14 @@ def test_focal_lengths_are_read_where_exif_is(
     assert exif_focal_length(saved(tmp_path / "a.png", Image.fromarray(picture(6)))) is None
 
 
+def test_orientation_of_a_png_is_read_where_it_stands_before_the_pixels(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[274] = 3
+    path = saved(tmp_path / "a.png", Image.fromarray(picture(6)), exif=exif)
+    assert exif_orientation(path) == 3
+    assert exif_orientation(saved(tmp_path / "b.png", Image.fromarray(picture(6)))) == 1
+
+
 def test_exif_rotation_is_not_applied(tmp_path: Path) -> None:
     exif = Image.Exif()
     exif[274] = 6

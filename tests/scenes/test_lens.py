@@ -383,6 +383,15 @@ def test_distortion_of_real_lenses_is_accepted() -> None:
 
 
 @pytest.mark.parametrize(
+    ("written", "fisheye"),
+    [("opencv", False), ("Pinhole", False), ("PERSPECTIVE", False), ("opencv_fisheye", True)],
+)
+def test_models_of_cameras_are_known_in_any_case(written: str, fisheye: bool) -> None:
+    lens = read_lens(FILE, [("$", LensFields(camera_model=written, fl_x=9.0))])
+    assert lens.fisheye == fisheye and not lens.doubt
+
+
+@pytest.mark.parametrize(
     ("focal", "own", "says"),
     [
         ((26, 26, 26, 26), False, False),

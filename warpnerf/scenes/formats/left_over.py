@@ -22,7 +22,7 @@ from warpnerf.scenes.scene import Scene
 
 MASK_ENDINGS = (*IN_FOLDERS, ".npy", ".gif")
 DEPTH_ENDINGS = (*SUFFIXES, ".npy", ".tif", ".tiff", ".exr", ".pfm")
-CLOUD_ENDINGS = (".ply", ".pcd", ".las", ".laz", ".e57")
+CLOUD_ENDINGS = (".ply", ".pcd", ".las", ".laz", ".e57", ".xyz", ".pts", ".ptx")
 """Of masks, of depth maps, and of clouds of points."""
 
 MAX_PLY_BYTES = 2**28
@@ -99,8 +99,9 @@ def tried_points(points: Points | None, scene: Scene) -> list[str]:
 
 
 def unused_points(folder: Path) -> list[str]:
-    """A note of clouds of points in the folder of a scene without points."""
-    names = [printable(path.name) for path in _clouds(folder)]
+    """A note of clouds of points in the folder of a scene without points, or in one within it."""
+    clouds = [cloud for place in (folder, *folders_in(folder)) for cloud in _clouds(place)]
+    names = [printable(cloud.relative_to(folder).as_posix()) for cloud in clouds]
     if not names:
         return []
     return [

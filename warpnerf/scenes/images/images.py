@@ -107,8 +107,11 @@ def exif_orientation(path: Path) -> int:
 def read_exif(path: Path, look: Callable[[Image.Exif], T]) -> T | None:
     """What something finds in a photograph's EXIF; None where there is none that can be read."""
     try:
-        # Of a PNG all pixels would be decoded first. MPO, several JPEGs in a file, opens as JPEG.
-        with Image.open(path, formats=("JPEG", "WEBP")) as image:
+        # MPO, several JPEGs in a file, opens as JPEG. Where a PNG's EXIF does not stand before its
+        # pixels, all of these would be decoded.
+        with Image.open(path, formats=("JPEG", "WEBP", "PNG")) as image:
+            if image.format == "PNG" and "exif" not in image.info:
+                return None
             return look(image.getexif())
     except Exception:  # tags are damaged in more ways than Pillow has names for
         return None
