@@ -17,7 +17,7 @@ from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.cameras.focus import find_focus, upside_down
 from warpnerf.scenes.cameras.overlap import in_picture
 from warpnerf.scenes.cameras.quaternions import quaternions, rotations
-from warpnerf.scenes.extent.doubts import doubts, mirrored_photographs
+from warpnerf.scenes.extent.doubts import doubted_others, doubts, mirrored_photographs
 from warpnerf.scenes.extent.photo_consistency import ALMOST_ALL, PhotoConsistency
 from warpnerf.scenes.extent.points import Points
 from warpnerf.scenes.scene import View
@@ -157,7 +157,10 @@ def check_against_photographs(
             "them"
         )
     if photographs.can_tell:
-        warnings += doubts(photographs)
+        told = doubts(photographs)
+        trained = set(training)
+        others = [view for i, view in enumerate(views) if i not in trained]
+        warnings += told or doubted_others(photographs, others)
     if points is not None:
         points, why = _believed(photographs, points)
         warnings += why

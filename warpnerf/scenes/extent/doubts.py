@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from warpnerf.scenes.extent.photo_consistency import ALMOST_ALL, NOTABLY, PhotoConsistency
+from warpnerf.scenes.scene import View
 
 REFUTED = 0.08
 """Mean gain below which photographs do not fit their poses: captures of cameras that are CLOSE have
@@ -18,6 +21,8 @@ FEWEST_UNFIT = 3
 SOME = 0.25
 """References, at least, and share of them, that do not fit where the others do: captures have none
 with a gain below 0.1 where neighbours are CLOSE."""
+MOST_OTHERS = 0.5
+"""Share of those for testing that do not fit."""
 OTHERS = 0.15
 """Mean gain of the others, at least."""
 
@@ -69,6 +74,35 @@ def doubts(photographs: PhotoConsistency) -> list[str]:
     return some
 
 
+def doubted_others(photographs: PhotoConsistency, views: Sequence[View]) -> list[str]:
+    """A warning of views that are not for training whose photographs do not fit their poses.
+
+    Args:
+        photographs: Of the training.
+        views: The others.
+    """
+    gain = photographs.agreement.gain
+    if len(views) < FEWEST_UNFIT or len(gain) < ENOUGH or gain.mean() < OTHERS:
+        return []
+    others = photographs.beside(views)
+    unfit = _unfit(others)
+    if unfit.sum() < max(FEWEST_UNFIT, MOST_OTHERS * len(unfit)):
+        return []
+    first = others.views[int(others.agreement.of[unfit][0])].name
+    return [
+        f"photographs for testing do not fit their poses: {unfit.sum()} of {len(unfit)} that were "
+        f"looked at (first: {first}) are not found in their neighbours, those for training are; "
+        "their axes, units or lens are likely others, so test scores mean nothing"
+    ]
+
+
+def _unfit(photographs: PhotoConsistency) -> np.ndarray:
+    """Which references are found by chance only, though their neighbours are close, [n] bool."""
+    agreement = photographs.agreement
+    near = [photographs.farthest(i) <= CLOSE for i in agreement.of]
+    return np.asarray((agreement.gain < NOTABLY) & np.array(near, bool))
+
+
 def _undistorted(photographs: PhotoConsistency) -> bool:
     """Whether photographs fit each other clearly better without the distortion of their lenses."""
     given, straight = photographs.agreement, photographs.straight().agreement
@@ -81,7 +115,7 @@ def _undistorted(photographs: PhotoConsistency) -> bool:
 def _some_unfit(photographs: PhotoConsistency) -> list[str]:
     """A warning of references that are found by chance only, where the others are found surely."""
     gain, of = photographs.agreement.gain, photographs.agreement.of
-    unfit = (gain < NOTABLY) & [photographs.farthest(i) <= CLOSE for i in of]
+    unfit = _unfit(photographs)
     if unfit.all() or unfit.sum() < FEWEST_UNFIT or unfit.mean() < SOME:
         return []
     if gain[~unfit].mean() < OTHERS:

@@ -184,6 +184,17 @@ class PhotoConsistency:
         """The same photographs, of which patches of some are looked for in all."""
         return replace(self, among=tuple(among))
 
+    def beside(self, views: Sequence[View]) -> PhotoConsistency:
+        """Some of other views, whose patches are looked for in all of these and of those."""
+        some = views[:: max(1, -(-len(views) // REFERENCES))]
+        n, poses = len(self.views), np.array([view.camera.c2w for view in some])
+        return replace(
+            self,
+            views=[*self.views, *some],
+            poses=np.concatenate([self.poses, poses]),
+            among=tuple(range(n, n + len(some))),
+        )
+
     def apart(self) -> float:
         """How far off the neighbours of a reference are, by the median; see ``neighbours``."""
         poses = self.poses
