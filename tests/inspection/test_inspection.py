@@ -276,6 +276,35 @@ def test_a_camera_far_away_and_one_upside_down(tmp_path: Path) -> None:
     assert "upside down against the others: 1 of 9 cameras (first: images/005.png)" in found
 
 
+@pytest.mark.parametrize("n", [2, 4, 5])
+def test_cameras_in_other_units_are_far_away(tmp_path: Path, n: int) -> None:
+    """Also where they are half of all."""
+    poses = ring(10)
+    for pose in poses[:n]:
+        pose[:3, 3] *= 1000.0
+    found = odd(inspect(scene_with(tmp_path, poses)))
+    assert f"far away from all others: {n} of 10 cameras (first: images/000.png)" in found
+    assert "or in other units" in found
+
+
+def test_two_rooms_are_not_far_away(tmp_path: Path) -> None:
+    poses = ring(10)
+    for pose in poses[:5]:
+        pose[:3, 3] += [20.0, 5.0, 0.0]
+    assert "far away" not in odd(inspect(scene_with(tmp_path, poses)))
+
+
+@pytest.mark.parametrize(("scale", "says"), [(1e-5, True), (1.0, False)])
+def test_degrees_of_longitude_and_latitude_are_named(
+    tmp_path: Path, scale: float, says: bool
+) -> None:
+    poses = ring(9)
+    for k, pose in enumerate(poses):
+        pose[:3, 3] = pose[:3, 3] * [scale, scale, 1.0] + [18.06, 59.33, 20.0 + 0.3 * k]
+    found = odd(inspect(scene_with(tmp_path, poses)))
+    assert ("degrees of longitude and latitude" in found) == says
+
+
 LARGE = {"w": 320, "h": 180, "fl_x": 333.0, "fl_y": 333.0}
 
 

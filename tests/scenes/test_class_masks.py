@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.support.tiny_scenes import save, write_transforms
+from tests.support.tiny_scenes import picture, save, write_transforms
 from warpnerf.checks import InputError
 from warpnerf.scenes.formats.load import load_scene
 
@@ -40,3 +40,57 @@ def test_masks_of_classes_are_told(tmp_path: Path, coloured: bool) -> None:
     assert len(load_scene(tmp_path).warnings) == 1
     warning = load_scene(tmp_path).warnings[0]
     assert "classes" not in warning
+
+
+def warnings_of(folder: Path, masks: list[np.ndarray]) -> str:
+    """Of a scene of four photographs, 48 x 64, with these masks."""
+    content = write_transforms(folder, scale=8)
+    for k, frame in enumerate(content["frames"]):
+        Image.fromarray(masks[k % len(masks)]).save(folder / f"{k}.png")
+        frame["mask_path"] = f"{k}.png"
+    save(folder / "transforms.json", content)
+    return "; ".join(w for w in load_scene(folder).warnings if "masks" in w)
+
+
+def squares(*values: int | tuple[int, ...]) -> np.ndarray:
+    """A mask of upright stripes of these values."""
+    stripes = np.array_split(np.arange(64), len(values))
+    mask = np.zeros((48, 64, *np.shape(values[0])), np.uint8)
+    for stripe, value in zip(stripes, values, strict=True):
+        mask[:, stripe] = value
+    return mask
+
+
+@pytest.mark.parametrize(
+    ("masks", "says"),
+    [
+        ([squares(0, 200, 255)], "masks hold 3 values (0, 200, 255; 0.png), as numbers of classes"),
+        ([squares(0, 90, 180)], "masks hold 3 values (0, 90, 180; 0.png)"),
+        ([squares(*range(0, 208, 8))], "masks hold 25 values (0, 16, 24, 32, 40, 48, ...; 0.png)"),
+        ([squares(0, 255), squares(0, 180)], "masks hold 3 values (0, 180, 255; 1.png)"),
+        (
+            [squares((0, 0, 0), (128, 0, 0), (0, 128, 0))],
+            "masks hold 3 values (0, #008000, #800000; 0.png)",
+        ),
+        ([picture(1, width=64, height=48)], "masks look like photographs: 0.png holds"),
+    ],
+)
+def test_classes_that_are_bright_are_told(
+    tmp_path: Path, masks: list[np.ndarray], says: str
+) -> None:
+    assert says in warnings_of(tmp_path / "scene", masks)
+
+
+def test_masks_of_two_values_and_soft_edges_are_none_of_classes(tmp_path: Path) -> None:
+    soft = np.clip(np.add.outer(np.arange(48), 20.0 * np.arange(64)) - 440.0, 0, 255)
+    ramp = np.clip(40.0 * (np.arange(64) - 30.0) + np.zeros((48, 1)), 0, 255)
+    masks = {
+        "binary": squares(0, 255),
+        "gray": squares(0, 200),
+        "soft": soft.astype(np.uint8),
+        "ramp": ramp.astype(np.uint8),
+        "one": squares(0, 1),
+        "nearly": squares(0, 3, 8, 250, 255, 254),
+    }
+    for name, mask in masks.items():
+        assert warnings_of(tmp_path / name, [mask]) == "", name

@@ -16,6 +16,7 @@ from tests.scenes.test_points import write_ply
 from tests.support.tiny_scenes import DATA, camera_at, look_at, needs_capture, picture, ring
 from warpnerf.scenes.builtin.room import first_hit, photograph
 from warpnerf.scenes.cameras.camera import Camera
+from warpnerf.scenes.cameras.focus import upside_down
 from warpnerf.scenes.cameras.quaternions import quaternions, rotations
 from warpnerf.scenes.extent import photo_consistency
 from warpnerf.scenes.extent.conventions import check_against_photographs
@@ -142,8 +143,75 @@ def test_poses_that_fit_stay(room: list[View], wall: list[View]) -> None:
 def test_poses_in_other_axes_are_read_as_the_photographs_show(name: str, room: list[View]) -> None:
     found, _, said = held(misread(room, WRITTEN[name]))
     assert said.startswith("poses are read as ") and name in said and "photographs fit" in said
+    turned = {"x left, y down, looking along -z": 180, "LLFF's": 90, "x up, y left": 90}.get(name)
+    assert ("unless the photographs were turned" in said) == (turned is not None)
+    assert turned is None or f"turned by {turned} degrees" in said
     for view, right in zip(found, room, strict=True):
         np.testing.assert_allclose(view.camera.c2w, right.camera.c2w, atol=1e-12)
+
+
+PARTS = {
+    "half": range(10, 20),
+    "every other": range(0, 20, 2),
+    "most": range(6, 20),
+    "five": range(4, 9),
+}
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize("part", PARTS)
+def test_a_part_in_opencv_axes_is_read_as_the_photographs_show(part: str, room: list[View]) -> None:
+    """Every other one was taken for all."""
+    wrong = misread(room, WRITTEN["camera to world in OpenCV"])
+    views = [wrong[k] if k in PARTS[part] else view for k, view in enumerate(room)]
+    found, _, said = held(views)
+    assert said.startswith(
+        f"poses of {len(PARTS[part])} of 20 images (first: {PARTS[part][0]:03d}) are read as "
+        "camera to world in OpenCV axes"
+    )
+    for view, right in zip(found, room, strict=True):
+        np.testing.assert_allclose(view.camera.c2w, right.camera.c2w, atol=1e-12)
+
+
+@pytest.mark.ci
+def test_a_folder_in_other_axes_is_read_as_the_photographs_show(room: list[View]) -> None:
+    wrong = misread(room, WRITTEN["world to camera in OpenCV"])
+    views = [
+        replace(wrong[k], name=f"second/{k}.png") if k % 3 == 0 else view
+        for k, view in enumerate(room)
+    ]
+    found, _, said = held(views)
+    assert "poses of 7 of 20 images (first: second/0.png) are read as world to camera" in said
+    for view, right in zip(found, room, strict=True):
+        np.testing.assert_allclose(view.camera.c2w, right.camera.c2w, atol=1e-12)
+
+
+@pytest.mark.ci
+def test_a_drone_whose_half_looks_up_is_read_as_the_photographs_show() -> None:
+    """Of cameras that look down, turned in all ways, none stands on its head."""
+    poses = []
+    for k in range(20):
+        pose, a = np.eye(4), 2.4 * k
+        pose[:2, :2] = [[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]
+        pose[:3, 3] = (-0.9 + 0.45 * (k % 5), -1.2 + 0.8 * (k // 5), 2.3)
+        poses.append(pose)
+    down = photographed([camera_at(pose, **SIZE) for pose in poses])
+    wrong = misread(down, WRITTEN["camera to world in OpenCV"])
+    assert held(down)[2] == ""
+    found, _, said = held(down[:10] + wrong[10:])
+    assert "poses of 10 of 20 images (first: 010) are read as camera to world in OpenCV" in said
+    np.testing.assert_allclose(found[15].camera.c2w, down[15].camera.c2w, atol=1e-12)
+
+
+def test_a_part_along_a_wall_is_never_taken_for_all(wall: list[View]) -> None:
+    """Half of it fits in both axes, and stays; that it stands on its head is said elsewhere."""
+    wrong = misread(wall, WRITTEN["camera to world in OpenCV"])
+    found, _, said = held([*wrong[:12], *wall[12:]])
+    assert said == "" and found[5] is wrong[5] and found[20] is wall[20]
+    assert upside_down([view.camera for view in found]).tolist() == 12 * [True] + 12 * [False]
+    found, _, said = held([wrong[k] if k % 2 == 0 else view for k, view in enumerate(wall)])
+    assert "poses of 12 of 24 images (first: 000) are read as" in said
+    np.testing.assert_allclose(found[4].camera.c2w, wall[4].camera.c2w, atol=1e-12)
 
 
 def test_opencv_axes_along_a_wall_are_told_by_photographs_alone(wall: list[View]) -> None:

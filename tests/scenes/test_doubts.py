@@ -8,8 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.scenes.test_conventions import along_a_wall, held, outward, photographed
-from tests.support.tiny_scenes import DATA, needs_capture
+from tests.scenes.test_conventions import SIZE, along_a_wall, held, outward, photographed
+from tests.support.tiny_scenes import DATA, camera_at, look_at, needs_capture
+from warpnerf.scenes.extent.conventions import check_against_photographs
+from warpnerf.scenes.extent.photo_consistency import PhotoConsistency
 from warpnerf.scenes.formats.load import load_scene
 from warpnerf.scenes.scene import View
 
@@ -57,6 +59,86 @@ def test_photographs_of_other_poses_are_named(room: list[View]) -> None:
     assert held(shuffled(room))[2].startswith(REFUTED)
     same = [replace(view, image=room[0].image) for view in room]
     assert held(same)[2].startswith(REFUTED)
+
+
+def bent(views: list[View], **lens: float | bool) -> list[View]:
+    return [replace(view, camera=replace(view.camera, **lens)) for view in views]
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize("lens", [{"k1": -0.3, "k2": 0.1}, {"fisheye": True}])
+def test_distortion_of_photographs_without_is_named(
+    lens: dict[str, float | bool], room: list[View]
+) -> None:
+    said = held(bent(room, **lens))[2]
+    assert said.startswith("distortion does not fit the photographs, which fit each other better")
+
+
+@pytest.mark.ci
+def test_photographs_with_their_distortion_are_believed(room: list[View]) -> None:
+    """Resampled to a lens: what was read between pixels is as good as it was."""
+    views = []
+    for view in bent(room, k1=-0.2, p1=0.01):
+        c = view.camera
+        u, v = np.meshgrid(np.arange(c.width) + 0.5, np.arange(c.height) + 0.5)
+        straight = np.stack([u.ravel() - c.cx, v.ravel() - c.cy], axis=1) / c.fx
+        at = np.floor(c.distort(straight)[0] * c.fx + [c.cx, c.cy]).astype(int)
+        image, inside = view.image.copy(), ((at >= 0) & (at < [c.width, c.height])).all(axis=1)
+        image[at[inside, 1], at[inside, 0]] = view.image.reshape(-1, 3)[inside]
+        views.append(replace(view, image=image))
+    assert "distortion" not in held(views)[2]
+
+
+@pytest.mark.ci
+def test_photographs_of_which_some_do_not_fit_are_counted(room: list[View]) -> None:
+    turned = mirrored(mirrored(room, 0), 1)
+    said = held([*room[:10], *turned[10:]])[2]
+    found = re.match(r"some photographs do not fit .*: (\d+) of 10 that .*first: 01[0-9]\)", said)
+    assert found is not None and 3 <= int(found[1]) <= 6
+    assert held([*room[:18], *turned[18:]])[2] == ""
+
+
+@pytest.mark.ci
+def test_photographs_for_testing_are_looked_at_as_well() -> None:
+    """As of another lens."""
+    room = photographed(outward(32))
+    training = [k for k in range(32) if k % 4]
+    zoomed = with_focal(room, 0.5)
+    for wrong in (False, True):
+        views = [zoomed[k] if wrong and k % 4 == 0 else view for k, view in enumerate(room)]
+        said = "; ".join(check_against_photographs(views, training, None, False)[3])
+        assert said.startswith("photographs for testing do not fit their poses: ") == wrong
+        assert wrong or said == ""
+
+
+def mirrored(views: list[View], axis: int) -> list[View]:
+    """Their photographs turned over along rows (1) or columns (0)."""
+    return [replace(view, image=np.ascontiguousarray(np.flip(view.image, axis))) for view in views]
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize(("axis", "how"), [(1, "left to right"), (0, "upside down")])
+def test_mirrored_photographs_are_named(axis: int, how: str, room: list[View]) -> None:
+    assert f"photographs were mirrored {how} after" in held(mirrored(room, axis))[2]
+    poses = np.array([view.camera.c2w for view in room])
+    off = [replace(v, camera=replace(v.camera, cx=40.0, cy=30.0)) for v in mirrored(room, axis)]
+    assert np.array_equal(PhotoConsistency.of(off).poses, poses)
+    picture = PhotoConsistency.of(off).mirrored(across=axis == 1)._picture(0)
+    np.testing.assert_array_equal(picture.gray, PhotoConsistency.of(room)._picture(0).gray)
+    np.testing.assert_array_equal(picture.centre, [40.0, 30.0])
+
+
+@pytest.mark.ci
+def test_mirrored_photographs_of_an_object_are_named(room: list[View]) -> None:
+    """Of cameras that look at one thing nothing else is questioned."""
+    around = [
+        camera_at(look_at((1.2 * np.cos(a), 1.4 * np.sin(a), 1.3), (-0.3, 0.0, 0.5)), **SIZE)
+        for a in np.linspace(0.0, 5.0, 20)
+    ]
+    table = photographed(around)
+    for views, says in ((table, ""), (mirrored(table, 1), "were mirrored left to right")):
+        said = check_against_photographs(views, range(len(views)), None, True)[3]
+        assert ("; ".join(said) == "") if not says else says in said[0]
 
 
 @pytest.mark.ci

@@ -17,6 +17,7 @@ from warpnerf.scenes.cameras.focus import (
     find_focus,
     share_aimed_at,
     up_direction,
+    upside_down,
 )
 
 
@@ -251,6 +252,26 @@ def test_up_is_the_cameras_own_where_nothing_else_tells() -> None:
     np.testing.assert_allclose(up_direction([camera, other]), camera.c2w[:, 1], atol=1e-9)
     rolled = cameras_at([pose @ np.diag([-1.0, -1.0, 1.0, 1.0]) for pose in poses])
     np.testing.assert_array_equal(up_direction([camera, rolled[0]]), [0.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize("part", [range(6), range(0, 12, 2), range(2, 5), range(4)])
+def test_cameras_upside_down_are_the_fewer(part: range) -> None:
+    """Of as many each, either."""
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+    poses = [pose @ flip if k in part else pose for k, pose in enumerate(ring(12))]
+    found = set(np.flatnonzero(upside_down(cameras_at(poses))).tolist())
+    others = set(range(12)) - set(part)
+    assert found == set(part) or (len(part) == 6 and found == others)
+
+
+def test_no_camera_of_a_drone_that_flies_to_and_fro_is_upside_down() -> None:
+    for pitch in (0.0, 15.0, 30.0):
+        a = np.radians(pitch)
+        tilt = np.eye(4)
+        tilt[1:3, 1:3] = [[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]
+        turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+        poses = [(turn if k // 3 % 2 else np.eye(4)) @ tilt for k in range(24)]
+        assert not upside_down(cameras_at(poses)).any()
 
 
 def test_share_of_cameras_aimed_at_a_point() -> None:

@@ -104,3 +104,18 @@ def test_a_shape_of_booleans(tmp_path: Path) -> None:
     file.write_bytes(b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + bytes(136))
     with pytest.raises(InputError, match=r"has the shape \[True, 17\]; save it again"):
         load_scene(tmp_path / "scene")
+
+
+def test_different_photographs_at_one_pose_are_named(tmp_path: Path) -> None:
+    """As of poses that were repeated where none was found."""
+    content = write_transforms(tmp_path, 9)
+    for k in (4, 5):
+        content["frames"][k]["transform_matrix"] = content["frames"][3]["transform_matrix"]
+    (tmp_path / "images/005.png").write_bytes((tmp_path / "images/003.png").read_bytes())
+    save(tmp_path / "transforms.json", content)
+    said = [warning for warning in load_scene(tmp_path).warnings if "003" in warning]
+    assert said[0].startswith(
+        "different photographs at the same pose: 1 of 9 images (first: images/004.png, as images/0"
+    )
+    assert said[1].startswith("the same photograph from the same place: 1 of 9 images")
+    assert len(said) == 2

@@ -14,7 +14,7 @@ from PIL import Image
 
 from tests.support.tiny_scenes import hand_made_png, picture
 from warpnerf.checks import InputError
-from warpnerf.scenes.images.images import exif_orientation, read_image
+from warpnerf.scenes.images.images import exif_focal_length, exif_orientation, read_image
 
 
 def saved(path: Path, image: Image.Image, **options: object) -> Path:
@@ -93,6 +93,32 @@ def test_orientation_is_read_where_exif_is(tmp_path: Path, ending: str) -> None:
     exif[274] = 6
     path = saved(tmp_path / f"a.{ending}", Image.fromarray(picture(6)), exif=exif)
     assert exif_orientation(path) == 6
+
+
+@pytest.mark.parametrize(
+    ("millimetres", "of_film", "stated"),
+    [(4.2, 26, 26.0), (4.2, 0, 4.2), (4.2, None, 4.2), (None, None, None), (0.0, 0, None)],
+)
+def test_focal_lengths_are_read_where_exif_is(
+    tmp_path: Path, millimetres: float | None, of_film: int | None, stated: float | None
+) -> None:
+    exif = Image.Exif()
+    details = exif.get_ifd(0x8769)
+    if millimetres is not None:
+        details[37386] = millimetres
+    if of_film is not None:
+        details[41989] = of_film
+    path = saved(tmp_path / "a.jpg", Image.fromarray(picture(6)), exif=exif)
+    assert exif_focal_length(path) == (None if stated is None else pytest.approx(stated))
+    assert exif_focal_length(saved(tmp_path / "a.png", Image.fromarray(picture(6)))) is None
+
+
+def test_orientation_of_a_png_is_read_where_it_stands_before_the_pixels(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[274] = 3
+    path = saved(tmp_path / "a.png", Image.fromarray(picture(6)), exif=exif)
+    assert exif_orientation(path) == 3
+    assert exif_orientation(saved(tmp_path / "b.png", Image.fromarray(picture(6)))) == 1
 
 
 def test_exif_rotation_is_not_applied(tmp_path: Path) -> None:

@@ -159,6 +159,25 @@ def test_points_that_cannot_be_read_are_said(tmp_path: Path) -> None:
     assert load_scene(tmp_path / "s").observations is None
 
 
+@pytest.mark.parametrize("ending", ["bmp", "tif", "webp"])
+def test_masks_of_other_endings_are_said_and_read(tmp_path: Path, ending: str) -> None:
+    """They were neither."""
+    write_transforms(tmp_path)
+    mask = np.full((6, 8), 255, np.uint8)
+    mask[:2] = 0
+    (tmp_path / "masks").mkdir()
+    options = {"lossless": True} if ending == "webp" else {}
+    Image.fromarray(mask).save(tmp_path / f"masks/001.{ending}", **options)
+    said = f"--masks {tmp_path / 'masks'} ignores what is black there"
+    assert any(said in warning for warning in load_scene(tmp_path).warnings)
+    (given,) = (
+        v.mask
+        for v in load_scene(tmp_path, masks=tmp_path / "masks").views
+        if v.name == "images/001.png"
+    )
+    assert given is not None and np.array_equal(given, mask > 0)
+
+
 @pytest.mark.parametrize("inner", ["person/001.png", "001.npy"])
 def test_masks_in_folders_of_their_folder_or_as_arrays_are_said(tmp_path: Path, inner: str) -> None:
     scene_with_model(tmp_path)
@@ -171,12 +190,27 @@ def test_masks_in_folders_of_their_folder_or_as_arrays_are_said(tmp_path: Path, 
     assert any(said in warning for warning in load_scene(tmp_path).warnings)
 
 
+def test_clouds_of_points_in_folders_are_said(tmp_path: Path) -> None:
+    write_transforms(tmp_path)
+    (tmp_path / "lidar").mkdir()
+    (tmp_path / "lidar/scan.xyz").write_text("0 0 0\n")
+    write_ply(tmp_path / "lidar/scan.ply", np.zeros((4, 3)))
+    said = "not used as points: lidar/scan.ply, lidar/scan.xyz; beside"
+    assert any(said in note for note in load_scene(tmp_path).notes)
+
+
 # photographs
 
 
 @pytest.mark.parametrize(
     ("place", "said"),
-    [("right", True), ("images_2", False), ("thumbs", False), ("others", False)],
+    [
+        ("right", True),
+        ("labels", True),
+        ("images_2", False),
+        ("thumbs", False),
+        ("others", False),
+    ],
 )
 def test_photographs_of_the_same_names_in_a_folder_beside_are_said(
     tmp_path: Path, place: str, said: bool
@@ -192,7 +226,8 @@ def test_photographs_of_the_same_names_in_a_folder_beside_are_said(
         name = f"other_{k}.png" if place == "others" else f"{k:03d}.png"
         Image.fromarray(picture(k + 9)).save(tmp_path / place / name)
     note = (
-        f"also in the folder, and not used: {place}, with 4 photographs of the same names, which "
+        f"also in the folder, and not used: {place}, with 4 "
+        f"{'images' if place == 'labels' else 'photographs'} of the same names, which "
         "transforms.json does not name"
     )
     assert (note in load_scene(tmp_path).notes) == said

@@ -8,13 +8,15 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
+from PIL import Image
 
-from tests.support.tiny_scenes import camera_at
+from tests.support.tiny_scenes import camera_at, picture, save, write_transforms
 from warpnerf.checks import InputError
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.cameras.fisheye import angle_of, largest_angle
 from warpnerf.scenes.cameras.lens import LensFields, read_lens
 from warpnerf.scenes.cameras.undistort import directions, has_invertible_distortion, seen_pixels
+from warpnerf.scenes.formats.load import load_scene
 
 FILE = Path("scene/transforms.json")
 POSE = np.eye(3, 4)
@@ -378,3 +380,40 @@ def test_distortion_of_real_lenses_is_accepted() -> None:
         **{"k1": 0.0578421, "k2": -0.0805099, "p1": -0.000980296, "p2": 0.00015575},
     )
     assert has_invertible_distortion(fox)
+
+
+@pytest.mark.parametrize(
+    ("written", "fisheye"),
+    [("opencv", False), ("Pinhole", False), ("PERSPECTIVE", False), ("opencv_fisheye", True)],
+)
+def test_models_of_cameras_are_known_in_any_case(written: str, fisheye: bool) -> None:
+    lens = read_lens(FILE, [("$", LensFields(camera_model=written, fl_x=9.0))])
+    assert lens.fisheye == fisheye and not lens.doubt
+
+
+@pytest.mark.parametrize(
+    ("focal", "own", "says"),
+    [
+        ((26, 26, 26, 26), False, False),
+        ((26, 27, 26, 26), False, False),
+        ((26, 77, 26, 26), False, True),
+        ((26, 77, 26, 26), True, False),
+        ((0, 26, 0, 0), False, False),
+    ],
+)
+def test_photographs_of_several_focal_lengths_have_no_one_lens(
+    tmp_path: Path, focal: tuple[int, ...], own: bool, says: bool
+) -> None:
+    """As of a zoom, or of a telephone's other camera."""
+    content = write_transforms(tmp_path)
+    for k, frame in enumerate(content["frames"]):
+        exif = Image.Exif()
+        if focal[k]:
+            exif.get_ifd(0x8769)[41989] = focal[k]
+        Image.fromarray(picture(k)).save(tmp_path / f"{k}.jpg", exif=exif)
+        frame |= {"file_path": f"{k}.jpg"} | ({"fl_x": 10.0 * focal[k] / 26} if own else {})
+    save(tmp_path / "transforms.json", content)
+    said = [w for w in load_scene(tmp_path).warnings if "focal lengths by EXIF" in w]
+    assert len(said) == says
+    if says:
+        assert "EXIF (0.jpg 26 mm, 1.jpg 77 mm) have one lens in transforms.json" in said[0]

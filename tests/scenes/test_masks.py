@@ -254,6 +254,34 @@ def test_a_folder_without_masks_of_the_scene_is_refused(tmp_path: Path) -> None:
 # what they leave
 
 
+def around_masks(folder: Path, kept: np.ndarray, n: int = 9) -> str:
+    """Warnings of masks of a scene whose cameras look at its middle, the first n of nine masked."""
+    content = write_transforms(folder, 9)
+    save_mask(folder / "mask.png", kept)
+    for frame in content["frames"][:n]:
+        frame["mask_path"] = "mask.png"
+    save(folder / "transforms.json", content)
+    return "; ".join(w for w in load_scene(folder).warnings if "mask" in w)
+
+
+def test_masks_that_ignore_what_all_look_at_are_told_however_small_it_is(tmp_path: Path) -> None:
+    middle = np.zeros((6, 8), bool)
+    middle[2:5, 3:6] = True
+    said = "masks leave 81.2% of the pixels, and in few images a point that most cameras look at"
+    assert said in around_masks(tmp_path / "inverted", ~middle)
+    assert around_masks(tmp_path / "right", middle) == ""
+    assert around_masks(tmp_path / "some", ~middle, 7) == ""
+    edge = np.ones((6, 8), bool)
+    edge[:, :2] = False
+    assert around_masks(tmp_path / "edge", edge) == ""
+
+
+def test_masks_that_ignore_nothing_are_told(tmp_path: Path) -> None:
+    said = around_masks(tmp_path / "all", KEPT | True)
+    assert said.startswith("masks ignore no pixel: none of 9 has one that is black (first: mask.p")
+    assert around_masks(tmp_path / "one", KEPT) == ""
+
+
 def test_images_of_which_nothing_is_left_are_left_out(tmp_path: Path) -> None:
     content = write_transforms(tmp_path, 9)
     for number, kept in ((2, KEPT & False), (3, KEPT | True)):

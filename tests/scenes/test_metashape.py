@@ -144,8 +144,32 @@ def test_metashape_labels_with_extensions_and_cameras_that_are_left_out(tmp_path
     assert "left out 1 of 4 cameras that are not aligned (first: lost)" in said
     lost = 'sensor_id="3" label="lost"'
     file.write_text(file.read_text().replace(lost, f'master_id="0" {lost}'))
-    rig = "(first: lost), 1 of them of a rig, which are placed by another camera"
-    assert any(rig in note for note in load_scene(tmp_path).notes)
+    scene = load_scene(tmp_path)
+    assert not any("not aligned" in note for note in scene.notes)
+    rig = (
+        "left out 1 of 5 cameras (first: lost) that are placed by another one of their rig; export"
+    )
+    assert any(rig in warning for warning in scene.warnings)
+
+
+@pytest.mark.parametrize(
+    ("of_sensor", "of_camera", "says"),
+    [
+        ("<rolling_shutter>true</rolling_shutter>", "", "of 1 sensors and cameras (first: lens)"),
+        ('<property name="rolling_shutter" value="full"/>', "", "of 1 sensors and cameras (first"),
+        ("", "<rolling_shutter>1 0 0</rolling_shutter>", "of 4 sensors and cameras (first: 000)"),
+        ("<rolling_shutter>false</rolling_shutter>", "", None),
+        ('<property name="rolling_shutter" value="disabled"/>', "", None),
+        ("", "", None),
+    ],
+)
+def test_metashape_rolling_shutters_are_named(
+    tmp_path: Path, of_sensor: str, of_camera: str, says: str | None
+) -> None:
+    file = write_metashape(tmp_path, sensor=SENSOR.replace("</sensor>", f"{of_sensor}</sensor>"))
+    file.write_text(file.read_text().replace("<transform>", f"{of_camera}<transform>"))
+    warnings = [w for w in load_scene(tmp_path).warnings if "shutter" in w]
+    assert (len(warnings) == 1 and says in warnings[0]) if says else not warnings
 
 
 def test_metashape_two_photographs_of_a_name_are_refused(tmp_path: Path) -> None:

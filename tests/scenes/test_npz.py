@@ -32,6 +32,12 @@ def write(path: Path, compressed: bool = False, **changes: Any) -> Path:
     return path
 
 
+def test_cameras_of_neus_are_named(tmp_path: Path) -> None:
+    np.savez(tmp_path / "cameras_sphere.npz", world_mat_0=np.eye(4), scale_mat_0=np.eye(4))
+    with pytest.raises(InputError, match=r"holds projection matrices .* as of IDR and NeuS, which"):
+        load_scene(tmp_path)
+
+
 @pytest.mark.parametrize("kind", ["uint8", "float32", "float64", "big-endian"])
 @pytest.mark.parametrize("compressed", [False, True])
 def test_the_scene_is_that_of_transforms_json(tmp_path: Path, kind: str, compressed: bool) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.scenes.test_points import write_ply
 from tests.support.tiny_scenes import (
     DATA,
     needs_capture,
@@ -27,6 +28,42 @@ def load_changed(folder: Path, change: Callable[[dict[str, Any]], None], n: int 
     change(content)
     save(folder / "transforms.json", content)
     return load_scene(folder)
+
+
+@pytest.mark.parametrize("root", ["/home/other/data/scene/", "C:\\data\\scene\\"])
+def test_files_of_another_machine_are_found_in_the_folder(tmp_path: Path, root: str) -> None:
+    """Their absolute paths were refused, though the files lie there."""
+    content = write_transforms(tmp_path)
+    (tmp_path / "masks").mkdir()
+    mask = np.full((6, 8), 255, np.uint8)
+    mask[:2] = 0
+    for frame in content["frames"]:
+        name = frame["file_path"].rpartition("/")[2]
+        Image.fromarray(mask).save(tmp_path / "masks" / name)
+        frame["mask_path"] = f"{root}masks/{name}"
+    content["ply_file_path"] = f"{root}points.ply"
+    content["test_filenames"] = [f"{root}images/002.png"]
+    save(tmp_path / "transforms.json", content)
+    write_ply(tmp_path / "points.ply", np.random.default_rng(0).normal(0.0, 0.3, (200, 3)))
+    scene = load_scene(tmp_path)
+    assert all(view.mask is not None for view in scene.views) and scene.points is not None
+    assert [scene.views[i].name for i in scene.splits["test"]] == ["images/002.png"]
+    (tmp_path / "points.ply").unlink()
+    with pytest.raises(InputError, match=r"ply_file_path: .* leaves the scene's folder"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("listed", ["002.png", "002", "./images/002.png", "scene/images/002.png"])
+def test_lists_may_name_photographs_by_the_ends_of_their_paths(tmp_path: Path, listed: str) -> None:
+    content = write_transforms(tmp_path)
+    for frame in content["frames"]:
+        frame["file_path"] = (
+            f"scene/{frame['file_path']}" if "scene" in listed else frame["file_path"]
+        )
+    save(tmp_path / "transforms.json", content | {"test_filenames": [listed]})
+    scene = load_scene(tmp_path)
+    assert [scene.views[i].name for i in scene.splits["test"]] == ["images/002.png"]
+    assert not scene.warnings
 
 
 def test_tiny_scene_is_loaded(tmp_path: Path) -> None:

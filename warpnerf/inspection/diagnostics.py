@@ -13,12 +13,21 @@ from warpnerf.checks import InputError
 from warpnerf.evaluation.evaluate import require_measurable
 from warpnerf.runtime.memory import usable_cores
 from warpnerf.scenes.cameras.camera import Camera
-from warpnerf.scenes.cameras.focus import far_off, find_focus, share_aimed_at, up_direction
+from warpnerf.scenes.cameras.focus import far_off, find_focus, share_aimed_at, upside_down
 from warpnerf.scenes.formats.survey import Survey
 from warpnerf.scenes.scene import Scene, View
 
 MANY_TIMES = 20.0
 """A content distance so many times the estimate, or as small a part of it, is likely a mistake."""
+
+MOST_APART = 0.6
+"""Share of cameras, at most, that may be in another place."""
+ENOUGH_PLACES, MOST_PLACES = 6, 2000
+"""Of cameras, for that to be looked at."""
+FROM_ZERO = 3000.0
+"""How many times their spread degrees are from 0, at least: a kilometre is a hundredth of one."""
+HIGHER = 50.0
+"""How many times their spread heights in metres spread, at least."""
 
 DARK = 16
 """Of 255, which a photograph's brightest pixel does not exceed that fills 12 of 16 bits."""
@@ -278,20 +287,51 @@ def _turned(camera: Camera) -> Camera:
 def _odd_places(scene: Scene) -> list[str]:
     """Cameras that stand on their heads, or far away from all others."""
     odd = []
-    up = up_direction(scene.cameras)
-    rolled = [view.name for view in scene.views if view.camera.c2w[:, 1] @ up < -0.3]
+    pairs = zip(scene.views, upside_down(scene.cameras), strict=True)
+    rolled = [view.name for view, turned in pairs if turned]
     if rolled:
         odd.append(
             f"upside down against the others: {len(rolled)} of {len(scene.views)} cameras (first: "
-            f"{rolled[0]})"
+            f"{rolled[0]}), whose photographs were turned, or whose poses are in other axes"
         )
-    lost = [v.name for v, far in zip(scene.views, far_off(scene.cameras), strict=True) if far]
+    places = np.array([camera.position for camera in scene.cameras])
+    far = far_off(scene.cameras) | _in_another_place(places)
+    lost = [view.name for view, is_far in zip(scene.views, far, strict=True) if is_far]
     if lost:
         odd.append(
             f"far away from all others: {len(lost)} of {len(scene.views)} cameras (first: "
-            f"{lost[0]}), which may be wrongly posed"
+            f"{lost[0]}), which may be wrongly posed, or in other units"
+        )
+    if _are_degrees(places if scene.offset is None else places + scene.offset):
+        odd.append(
+            "cameras seem to stand at degrees of longitude and latitude, with heights in metres; "
+            "export their positions in metres, in a projected or local coordinate system"
         )
     return odd
+
+
+def _in_another_place(places: np.ndarray) -> np.ndarray:
+    """Which of the places [n, 3] are MANY_TIMES as far from where most are as all of these, [n]
+    bool; up to MOST_APART of them, where a median tells nothing."""
+    between = (
+        np.linalg.norm(places[:, None] - places, axis=2) if len(places) <= MOST_PLACES else None
+    )
+    if between is None or len(places) < ENOUGH_PLACES:
+        return np.zeros(len(places), bool)
+    away = between[np.quantile(between, 1.0 - MOST_APART, axis=1).argmin()]
+    order = np.sort(away)
+    first = int((1.0 - MOST_APART) * len(order))
+    gaps = order[first + 1 :] > MANY_TIMES * np.maximum(order[first:-1], 1e-300)
+    return away > order[first + int(gaps.argmax())] if gaps.any() else np.zeros(len(places), bool)
+
+
+def _are_degrees(places: np.ndarray) -> bool:
+    """Whether places [n, 3] are longitude and latitude, in either order, and height."""
+    if len(places) < ENOUGH_PLACES or np.abs(places[:, :2]).max() > 180.0:
+        return False
+    across, up = np.ptp(places[:, :2], axis=0), float(np.ptp(places[:, 2]))
+    far = np.abs(np.median(places[:, :2], axis=0)).max() > FROM_ZERO * across.max()
+    return bool(far and up > HIGHER * across.max())
 
 
 def _odd_lenses(scene: Scene) -> list[str]:

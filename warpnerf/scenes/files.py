@@ -284,6 +284,21 @@ def find_image(folder: Path, file_path: str, *, field: str) -> Path | None:
     return path
 
 
+def find_moved(folder: Path, file_path: str, *, field: str) -> Path | None:
+    """As ``find_image``; an absolute path, of another machine, may also be that of a file in the
+    folder from some part of it on."""
+    try:
+        return find_image(folder, file_path, field=field)
+    except OutsideError:
+        names = plain_name(file_path).split("/")
+        absolute = not names[0] or bool(PureWindowsPath(names[0]).drive)
+        for start in range(1, len(names) if absolute and ".." not in names else 0):
+            end = "/".join(names[start:])
+            if end and os.path.isfile(folder / end):  # noqa: PTH113, never raises
+                return resolve_inside(folder, end, field=field)
+        raise
+
+
 def photograph_folder(folder: Path) -> Path | None:
     """Where the photographs of a COLMAP or LLFF scene are.
 

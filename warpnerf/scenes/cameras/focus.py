@@ -46,6 +46,13 @@ and likely a mistake."""
 MAX_SHARE_FAR_OFF = 0.25
 """Of the cameras: more that are far off are another place that was photographed, and count."""
 
+NO_UP = 0.45
+"""Length of the mean of the cameras' own up axes, below which it tells no direction."""
+ONE_WAY = 0.8
+"""Length of the mean of their optical axes, from which on they look one way."""
+SPLIT = 0.95
+"""Share of cameras whose up axes must be within 60 degrees of one line, either way."""
+
 MAX_OFFSET = 1e4
 """Largest distance from the origin, in spreads of the cameras, that single precision resolves."""
 
@@ -230,6 +237,26 @@ def up_direction(cameras: Sequence[Camera]) -> np.ndarray:
     normal = directions[:, 0] * np.sign(directions[:, 0] @ mean)
     level = spread[1] > MIN_LEVEL_SPREAD and spread[0] < 0.1 * spread[1]
     return normal if level and normal @ mean > 0.5 else mean
+
+
+def upside_down(cameras: Sequence[Camera]) -> np.ndarray:
+    """Cameras that stand on their heads against the most, [n] bool.
+
+    Where as many stand on their heads as do not, the mean of their own up axes is no direction, and
+    these are split along their principal one, but for cameras that all look the same way: a drone
+    that flies to and fro looks down however it is turned.
+
+    Args:
+        cameras: At least one.
+    """
+    ups = np.stack([camera.c2w[:, 1] for camera in cameras])
+    axes = np.stack([camera.c2w[:, 2] for camera in cameras])
+    if np.linalg.norm(ups.mean(axis=0)) < NO_UP and np.linalg.norm(axes.mean(axis=0)) < ONE_WAY:
+        along = ups @ np.linalg.eigh(ups.T @ ups)[1][:, -1]
+        if np.mean(np.abs(along) > 0.5) >= SPLIT:
+            most = 1.0 if np.mean(along > 0.0) >= 0.5 else -1.0
+            return np.asarray(most * along < 0.0)
+    return np.asarray(ups @ up_direction(cameras) < -0.3)
 
 
 def horizontal_axes(cameras: Sequence[Camera]) -> tuple[int, int]:

@@ -24,6 +24,8 @@ CAMERA_MODELS = (
     *(RATIONAL, FISHEYE),
 )
 
+OTHER_NAMES = {"PERSPECTIVE": "OPENCV"}
+"""What nerfstudio's kinds of cameras are called here."""
 FOCAL_KEYS = ("fl_x", "camera_angle_x", "fl_y", "camera_angle_y")
 
 # The first of a group wins within one level of the file, so that a frame's own angle is not
@@ -76,6 +78,13 @@ class LensFields(msgspec.Struct):
     latlong: object = None
     equirectangular: object = None
     orthographic: object = None
+
+    def __post_init__(self) -> None:
+        """Names of models are one in upper and lower case."""
+        if self.camera_model is not None:
+            upper = self.camera_model.upper()
+            known = upper in CAMERA_MODELS or upper in OTHER_NAMES
+            self.camera_model = OTHER_NAMES.get(upper, upper) if known else self.camera_model
 
 
 MAX_COEFFICIENT = 1e9

@@ -14,10 +14,10 @@ import numpy as np
 
 from warpnerf.checks import InputError
 from warpnerf.scenes.cameras.camera import Camera
-from warpnerf.scenes.cameras.focus import find_focus
+from warpnerf.scenes.cameras.focus import find_focus, upside_down
 from warpnerf.scenes.cameras.overlap import in_picture
 from warpnerf.scenes.cameras.quaternions import quaternions, rotations
-from warpnerf.scenes.extent.doubts import doubts
+from warpnerf.scenes.extent.doubts import doubted_others, doubts, mirrored_photographs
 from warpnerf.scenes.extent.photo_consistency import ALMOST_ALL, PhotoConsistency
 from warpnerf.scenes.extent.points import Points
 from warpnerf.scenes.scene import View
@@ -101,6 +101,22 @@ READINGS: dict[str, Poses] = {
 }
 """Other ways to read poses, by their names; OpenCV's is by far the commonest."""
 
+TURNED = {
+    "camera to world in axes x left, y down, looking along -z": 180,
+    "camera to world in LLFF's axes (x down, y right, looking along -z)": 90,
+    "camera to world in axes x up, y left, looking along -z": 90,
+}
+"""Readings that are also those of photographs that were turned by so many degrees."""
+
+PART = 3
+"""Views of a part, at least, whose poses may be in other axes than those of the others."""
+FEW = 0.1
+"""Share of cameras that may stand on their heads for the axes of all to be questioned."""
+MOST_PARTS = 8
+"""Folders of photographs, at most, that are looked at one by one."""
+ONE_LINE = 0.5
+"""Cosine of the largest angle of an optical axis to a line for it to be along that line."""
+
 
 def check_against_photographs(
     views: Sequence[View], training: Sequence[int], points: Points | None, is_object: bool
@@ -123,11 +139,12 @@ def check_against_photographs(
     """
     photographs = PhotoConsistency.of([views[i] for i in training])
     if is_object and points is None and _look_at_one_thing([views[i].camera for i in training]):
-        return list(views), photographs, None, []
+        told = mirrored_photographs(photographs) if photographs.can_tell else []
+        return list(views), photographs, None, told
     if points is not None and not len(points.positions):
         points = None
+    views, photographs, warnings = _parts_read(list(views), photographs)
     name = _reading(photographs, points)
-    warnings = []
     if name is not None:
         read = READINGS[name]
         every = read(np.array([view.camera.c2w for view in views]))
@@ -136,14 +153,98 @@ def check_against_photographs(
         evidence = "photographs" if photographs.can_tell else "points"
         warnings.append(
             f"poses are read as {name}: so the {evidence} fit each other, and not as camera to "
-            "world in OpenGL axes; convert them, if other programs shall read them"
+            f"world in OpenGL axes{_or_turned(name)}; convert them, if other programs shall read "
+            "them"
         )
     if photographs.can_tell:
-        warnings += doubts(photographs)
+        told = doubts(photographs)
+        trained = set(training)
+        others = [view for i, view in enumerate(views) if i not in trained]
+        warnings += told or doubted_others(photographs, others)
     if points is not None:
         points, why = _believed(photographs, points)
         warnings += why
     return list(views), photographs, points, warnings
+
+
+def _or_turned(name: str) -> str:
+    """What else a reading may come from."""
+    if name not in TURNED:
+        return ""
+    return f", unless the photographs were turned by {TURNED[name]} degrees after that"
+
+
+def _parts_read(
+    views: list[View], photographs: PhotoConsistency
+) -> tuple[list[View], PhotoConsistency, list[str]]:
+    """Poses of a part of the views read in other axes than the rest, where photographs prove it.
+
+    They are only where the rest fits as it stands, and that part does not, but fits the rest once
+    it is read otherwise.
+
+    Returns:
+        The views, the photographs posed as these, and a warning, if there is such a part.
+    """
+    if not photographs.can_tell:
+        return views, photographs, []
+    best: tuple[float, str, frozenset[str]] | None = None
+    for part in _parts(views, not photographs.agreement.fits):
+        inside = [k for k, view in enumerate(photographs.views) if view.name in part]
+        rest = [k for k, view in enumerate(photographs.views) if view.name not in part]
+        if min(len(inside), len(rest)) < PART:
+            continue
+        given = photographs.of_views(inside)
+        if given.agreement.fits or not photographs.of_views(rest).agreement.fits:
+            continue
+        for name, read in READINGS.items():
+            poses = photographs.poses.copy()
+            poses[inside] = read(poses[inside])
+            other = given.posed(poses).agreement
+            if other.is_better(given.agreement):
+                gain = float(photographs.posed(poses).agreement.gain.mean())
+                best = max(best or (gain, name, part), (gain, name, part), key=lambda b: b[0])
+    if best is None:
+        return views, photographs, []
+    _, name, part = best
+    read = READINGS[name]
+    views = [
+        view.posed(read(view.camera.c2w[None])[0]) if view.name in part else view for view in views
+    ]
+    posed = {view.name: view.camera.c2w for view in views}
+    return (
+        views,
+        photographs.posed(np.array([posed[view.name] for view in photographs.views])),
+        [
+            f"poses of {len(part)} of {len(views)} images (first: {min(part)}) are read as {name}: "
+            "so the photographs fit each other, and not in the axes of the others; write all in "
+            "the same"
+        ],
+    )
+
+
+def _parts(views: Sequence[View], any_part: bool) -> list[frozenset[str]]:
+    """Names of views that may be in other axes than the rest.
+
+    Args:
+        views: All.
+        any_part: Whether also those that look one way, where the rest looks the other, and those of
+            each folder, besides those that stand on their heads.
+    """
+    cameras = [view.camera for view in views]
+    masks = [upside_down(cameras)]
+    if any_part:
+        axes = np.array([camera.forward for camera in cameras])
+        along = axes @ np.linalg.eigh(axes.T @ axes)[1][:, -1]
+        if np.mean(np.abs(along) > ONE_LINE) >= ALMOST_ALL:
+            masks.append(along > 0.0)
+    parts = [{v.name for v, m in zip(views, mask, strict=True) if m} for mask in masks]
+    parts += [{view.name for view in views} - part for part in parts]
+    if any_part:
+        folders: dict[str, set[str]] = {}
+        for view in views:
+            folders.setdefault(view.name.rpartition("/")[0], set()).add(view.name)
+        parts += list(folders.values()) if len(folders) <= MOST_PARTS else []
+    return list(dict.fromkeys(frozenset(part) for part in parts))
 
 
 def _look_at_one_thing(cameras: Sequence[Camera]) -> bool:
@@ -172,7 +273,9 @@ def _reading(photographs: PhotoConsistency, points: Points | None) -> str | None
         told = bool(shares) and shares[""] < UNSEEN and shares[found] > SEEN
         return found if told else None
     agreement, better = photographs.agreement, {}
-    for name in (OPENCV,) if agreement.fits else READINGS:
+    # Of cameras of which some stand on their heads, any axes are wrong for some.
+    as_likely = () if upside_down(photographs.cameras).mean() > FEW else (OPENCV,)
+    for name in as_likely if agreement.fits else READINGS:
         other = photographs.posed(READINGS[name](poses)).agreement
         refuted = bool(shares) and shares[name] < 0.5 * shares[""]
         if not refuted and other.is_better(agreement):

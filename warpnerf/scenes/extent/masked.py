@@ -9,15 +9,19 @@ import numpy as np
 from warpnerf.checks import InputError
 from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.cameras.focus import find_focus
-from warpnerf.scenes.images.masks import PackedMask
+from warpnerf.scenes.images.masks import Mask, PackedMask
 
 LITTLE = 0.1
 """Share of the pixels that masks leave, below which they are likely to be inverted."""
 HALF = 0.5
 """The same, where they ignore what the cameras look at: masks of an object leave that, if little
 else, and inverted ones of people who walk by do not."""
+FEW = 0.1
+"""Share of the masks, at most, that leave it where all of them leave more: of nearly all images."""
+SEVERAL = 3
+"""Masks, at least, of which one should ignore something."""
 
-Masks = Sequence[PackedMask | None]
+Masks = list[PackedMask | None]
 """Of all views; None: all pixels count."""
 
 
@@ -37,6 +41,21 @@ def mask_notes(masks: Masks, cameras: Sequence[Camera]) -> list[str]:
     ]
 
 
+def idle_masks(given: Sequence[Mask], left: Masks) -> list[str]:
+    """A warning of masks of which none ignores a pixel.
+
+    Args:
+        given: That were read.
+        left: What they leave of the photographs; None: all pixels.
+    """
+    if len(given) < SEVERAL or any(mask is not None for mask in left):
+        return []
+    return [
+        f"masks ignore no pixel: none of {len(given)} has one that is black (first: "
+        f"{given[0].path.name}); write 0 where pixels are to be ignored, or remove them"
+    ]
+
+
 def inverted_masks(masks: Masks, cameras: Sequence[Camera], training: Sequence[int]) -> list[str]:
     """Detect inverted masks, by how much they leave and by whether the common focus is part of it.
 
@@ -49,8 +68,10 @@ def inverted_masks(masks: Masks, cameras: Sequence[Camera], training: Sequence[i
         A warning, or none.
     """
     share = _share_kept(masks, cameras)
-    if share >= HALF or (share >= LITTLE and _keep_the_focus(masks, cameras, training)):
-        return []
+    if share >= LITTLE:
+        focus = _share_of_focus(masks, cameras, training)
+        if focus > HALF or (share >= HALF and (focus > FEW or not _are_around(masks))):
+            return []
     return [
         f"masks leave {share:.1%} of the pixels"
         + ("" if share < LITTLE else ", and in few images a point that most cameras look at")
@@ -65,20 +86,28 @@ def _share_kept(masks: Masks, cameras: Sequence[Camera]) -> float:
     return sum(kept) / sum(pixels)
 
 
-def _keep_the_focus(masks: Masks, cameras: Sequence[Camera], training: Sequence[int]) -> bool:
-    """Whether most masks leave the point that most cameras look at; true where there is none."""
+def _share_of_focus(masks: Masks, cameras: Sequence[Camera], training: Sequence[int]) -> float:
+    """The share of masks that leave the point that most cameras look at; 1 where there is none."""
     try:
         focus = find_focus([cameras[i] for i in training])
     except InputError:
-        return True
+        return 1.0
     if focus.guessed:
-        return True
+        return 1.0
     kept = [
         _leaves(mask, camera, focus.point)
         for mask, camera in zip(masks, cameras, strict=True)
         if mask is not None
     ]
-    return float(np.mean(kept)) > HALF
+    return float(np.mean(kept)) if kept else 1.0
+
+
+def _are_around(masks: Masks) -> bool:
+    """Whether nearly all images have masks that leave their corners, as of what is around an
+    object."""
+    corners = [0, 0, -1, -1], [0, -1, 0, -1]
+    kept = sum(mask is not None and bool(mask.read()[corners].all()) for mask in masks)
+    return kept >= (1.0 - FEW) * len(masks)
 
 
 def _leaves(mask: PackedMask, camera: Camera, point: np.ndarray) -> bool:

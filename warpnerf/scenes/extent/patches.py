@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,10 +30,18 @@ class Picture:
 
     gray: np.ndarray
     """[H, W] float32 in [0, 255]; NaN where the lens sees nothing."""
+    stored: np.ndarray
+    """The same as of the lens that it has."""
     focal: np.ndarray
     """[2] pixels."""
     centre: np.ndarray
     """[2] principal point, pixels."""
+
+    def mirrored(self, across: bool, down: bool) -> Picture:
+        """Mirrored left to right, and upside down, but for the principal point: a file's is that of
+        the photograph that poses were found by."""
+        gray = self.gray[:: -1 if down else 1, :: -1 if across else 1]
+        return replace(self, gray=np.ascontiguousarray(gray))
 
 
 def reduced(view: View) -> Picture:
@@ -47,13 +55,14 @@ def reduced(view: View) -> Picture:
     shape = (-1, camera.width, factor, image.shape[2])
     gray = np.stack([_gray(row[::every].reshape(shape)[:, :, ::every]) for row in rows])
     focal, centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
+    stored = gray
     bent = (camera.k1, camera.k2, camera.k3, camera.p1, camera.p2, camera.rational, camera.fisheye)
     if any(bent):
         u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
         straight = (np.stack([u.ravel(), v.ravel()], axis=1) - centre) / focal
         pixels = camera.distort(straight)[0] * focal + centre
         gray = bilinear(gray, pixels).reshape(gray.shape)
-    return Picture(gray=gray, focal=focal, centre=centre)
+    return Picture(gray=gray, stored=stored, focal=focal, centre=centre)
 
 
 def _most(camera: Camera) -> tuple[int, int]:

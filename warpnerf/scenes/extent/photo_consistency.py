@@ -15,6 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from warpnerf.scenes.cameras.camera import Camera
+from warpnerf.scenes.cameras.undistort import COEFFICIENTS
 from warpnerf.scenes.extent.patches import (
     LEAST_SIDE,
     PATCH,
@@ -87,6 +88,8 @@ class Agreement:
     """[n] in [0, 1]; what no neighbour sees counts as 0."""
     by_chance: np.ndarray
     """[n], the same in photographs of other places, under the same geometry."""
+    of: np.ndarray
+    """[n] indices of the references."""
 
     @property
     def gain(self) -> np.ndarray:
@@ -129,6 +132,12 @@ class PhotoConsistency:
     """[n, 3, 4] of these, camera to world in OpenGL axes, scene units."""
     zoom: float = 1.0
     """How many times their focal length the lenses have."""
+    flip: tuple[bool, bool] = (False, False)
+    """Whether photographs are mirrored left to right, and upside down."""
+    undistorted: bool = False
+    """Whether photographs are taken to have no distortion, whatever their lenses are."""
+    among: tuple[int, ...] | None = None
+    """Indices of the views whose patches may be looked for; None: all."""
     _pictures: dict[int, Picture] = field(default_factory=dict)
 
     @classmethod
@@ -138,9 +147,10 @@ class PhotoConsistency:
         return cls(views=chosen, poses=np.array([view.camera.c2w for view in chosen]))
 
     @property
-    def references(self) -> range:
+    def references(self) -> Sequence[int]:
         """Indices of the views whose patches are looked for."""
-        return range(0, len(self.views), max(1, -(-len(self.views) // REFERENCES)))
+        among = range(len(self.views)) if self.among is None else self.among
+        return among[:: max(1, -(-len(among) // REFERENCES))]
 
     @property
     def cameras(self) -> list[Camera]:
@@ -162,6 +172,29 @@ class PhotoConsistency:
         """The same photographs, had their lenses so many times the focal length."""
         return replace(self, zoom=factor)
 
+    def mirrored(self, *, across: bool) -> PhotoConsistency:
+        """The same photographs, mirrored left to right (``across``) or upside down."""
+        return replace(self, flip=(across, not across))
+
+    def straight(self) -> PhotoConsistency:
+        """The same photographs, had their lenses no distortion."""
+        return replace(self, undistorted=True)
+
+    def of_views(self, among: Sequence[int]) -> PhotoConsistency:
+        """The same photographs, of which patches of some are looked for in all."""
+        return replace(self, among=tuple(among))
+
+    def beside(self, views: Sequence[View]) -> PhotoConsistency:
+        """Some of other views, whose patches are looked for in all of these and of those."""
+        some = views[:: max(1, -(-len(views) // REFERENCES))]
+        n, poses = len(self.views), np.array([view.camera.c2w for view in some])
+        return replace(
+            self,
+            views=[*self.views, *some],
+            poses=np.concatenate([self.poses, poses]),
+            among=tuple(range(n, n + len(some))),
+        )
+
     def apart(self) -> float:
         """How far off the neighbours of a reference are, by the median; see ``neighbours``."""
         poses = self.poses
@@ -174,6 +207,7 @@ class PhotoConsistency:
         """How well patches of all references that have texture are found again."""
         found: list[float] = []
         by_chance: list[float] = []
+        of: list[int] = []
         for i in self.references:
             middles = self._textured(i, spread_middles(self._picture(i).gray.shape))
             if not len(middles):
@@ -184,7 +218,18 @@ class PhotoConsistency:
             matches = _mean(self._matches(i, near, shown, middles, inverse))
             for match, means in zip(matches, (found, by_chance), strict=True):
                 means.append(float(np.maximum(match.max(axis=0), 0.0).mean()))
-        return Agreement(found=np.array(found), by_chance=np.array(by_chance))
+            of.append(i)
+        return Agreement(found=np.array(found), by_chance=np.array(by_chance), of=np.array(of, int))
+
+    def farthest(self, i: int) -> float:
+        """How far off the farthest neighbour of a reference is; see ``neighbours``."""
+        return float(_apart(self.poses, i)[neighbours(self.poses, i)].max())
+
+    @property
+    def distorted(self) -> bool:
+        """Whether a lens has distortion."""
+        cameras = [view.camera for view in self.views]
+        return any(c.fisheye or any(getattr(c, name) for name in COEFFICIENTS) for c in cameras)
 
     @property
     def tell_depths(self) -> bool:
@@ -353,6 +398,10 @@ class PhotoConsistency:
         if i not in self._pictures:
             self._pictures[i] = reduced(self.views[i])
         picture = self._pictures[i]
+        if self.undistorted:
+            picture = replace(picture, gray=picture.stored)
+        if any(self.flip):
+            picture = picture.mirrored(*self.flip)
         return picture if self.zoom == 1.0 else replace(picture, focal=self.zoom * picture.focal)
 
 

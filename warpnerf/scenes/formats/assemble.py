@@ -18,7 +18,7 @@ from warpnerf.scenes.cameras.tracks import Tracks
 from warpnerf.scenes.cameras.undistort import seen_pixels
 from warpnerf.scenes.extent.conventions import check_against_photographs
 from warpnerf.scenes.extent.given_depths import believed_bounds, doubted_depths
-from warpnerf.scenes.extent.masked import inverted_masks, mask_notes
+from warpnerf.scenes.extent.masked import idle_masks, inverted_masks, mask_notes
 from warpnerf.scenes.extent.photo_consistency import PhotoConsistency
 from warpnerf.scenes.extent.points import Points, extent_by_points
 from warpnerf.scenes.files import by_number, exists
@@ -28,6 +28,7 @@ from warpnerf.scenes.formats.left_over import unused_depths, unused_masks, unuse
 from warpnerf.scenes.formats.reduced import with_reduced
 from warpnerf.scenes.images.depths import Depth, readable_depth, unread_depths
 from warpnerf.scenes.images.images import exif_orientation, image_shape, read_image
+from warpnerf.scenes.images.mask_values import other_values
 from warpnerf.scenes.images.masks import (
     PackedMask,
     all_of_blocks,
@@ -132,6 +133,8 @@ def assemble(
         turned = list(pool.map(_may_lie, frames))
     left = [entry for entry in read if entry is not None]
     complete, mask_warnings = _without_masked(file, frames, left, complete)
+    given = [entry.frame.mask for entry in left if entry.frame.mask]
+    mask_warnings += other_values(given) or idle_masks(given, [entry.mask for entry in left])
     notes += photograph_notes(
         [(entry.frame, entry.whole, entry.photograph.resampling) for entry in left]
     )
@@ -335,7 +338,13 @@ def _diagnostics(
             f"used for training and for testing: {len(shared)} of {len(views)} images (first: "
             f"{min(shared)}), so test scores are too good"
         )
-    copies = _copies(views)
+    copies, others = _at_one_pose(views)
+    if others:
+        warnings.append(
+            f"different photographs at the same pose: {len(others)} of {len(views)} images (first: "
+            f"{others[0][1]}, as {others[0][0]}), of which one at most is right, unless the camera "
+            "stood still; estimate their poses again, or leave them out"
+        )
     if copies:
         warnings.append(
             f"the same photograph from the same place: {len(copies)} of {len(views)} images "
@@ -344,18 +353,23 @@ def _diagnostics(
     return warnings
 
 
-def _copies(views: Sequence[View]) -> list[tuple[str, str]]:
-    """Pairs of names whose poses and pixels are the same, each view with the first of its kind."""
-    pairs = []
+def _at_one_pose(
+    views: Sequence[View],
+) -> tuple[list[tuple[str, str]], list[tuple[str, str]]]:
+    """Pairs of names whose poses are the same, each view with the first of its kind: those of the
+    same pixels, and those of others."""
+    copies, different = [], []
     first_at: dict[bytes, list[View]] = {}
     for view in views:
         others = first_at.setdefault(view.camera.c2w.tobytes(), [])
         again = next((o for o in others if np.array_equal(o.image, view.image)), None)
-        if again is None:
-            others.append(view)
-        else:
-            pairs.append((again.name, view.name))
-    return pairs
+        if again is not None:
+            copies.append((again.name, view.name))
+            continue
+        if others:
+            different.append((others[0].name, view.name))
+        others.append(view)
+    return copies, different
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

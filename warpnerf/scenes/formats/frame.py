@@ -13,10 +13,14 @@ from warpnerf.scenes.cameras.foreign import TOLERANCE, ImagePlane
 from warpnerf.scenes.cameras.lens import Lens
 from warpnerf.scenes.files import printable
 from warpnerf.scenes.images.depths import DepthFile
-from warpnerf.scenes.images.images import image_shape
+from warpnerf.scenes.images.images import exif_focal_length, image_shape
 from warpnerf.scenes.images.masks import Mask, fits, mask_beside, unfit_masks
 from warpnerf.scenes.images.resampling import Resampling
 
+LOOKED_AT = 64
+"""Photographs of a lens, at most, whose EXIF is read."""
+ZOOMED = 0.08
+"""By which focal lengths in EXIF, which are rounded, must differ, as a share, to be others."""
 SAME_LENS = 0.01
 """By which focal lengths, or width / height, may differ, as a share, where sizes are rounded."""
 
@@ -134,11 +138,35 @@ def lens_warnings(used: Sequence[tuple[Frame, Camera]]) -> list[str]:
             f"pixels; Blender's, with sensor fit Auto, is along the height: if Blender wrote it, "
             f"give fl_x, {other:.4g}"
         )
+    warnings += _zoomed([frame for frame, _ in used])
     shared: dict[tuple[tuple[str, float], ...], dict[tuple[int, int], tuple[Frame, Camera]]] = {}
     for frame, camera in used:
         sizes = shared.setdefault(tuple(frame.lens.values.items()), {})
         sizes.setdefault((camera.width, camera.height), (frame, camera))
     return warnings + [_one_lens(sizes) for sizes in shared.values() if not _go_together(sizes)]
+
+
+def _zoomed(frames: Sequence[Frame]) -> list[str]:
+    """Warnings of lenses that photographs share whose EXIF states different focal lengths."""
+    shared: dict[tuple[tuple[str, float], ...], list[Frame]] = {}
+    for frame in frames:
+        if frame.image is None:
+            shared.setdefault(tuple(frame.lens.values.items()), []).append(frame)
+    warnings = []
+    for group in shared.values():
+        if len(group) < 2:
+            continue
+        some = group[:: max(1, -(-len(group) // LOOKED_AT))]
+        stated = [(exif_focal_length(frame.path), frame.name) for frame in some]
+        known = sorted((focal, name) for focal, name in stated if focal is not None)
+        if known and known[-1][0] > (1.0 + ZOOMED) * known[0][0]:
+            (least, near), (most, far) = known[0], known[-1]
+            warnings.append(
+                f"photographs of several focal lengths by EXIF ({near} {least:.4g} mm, {far} "
+                f"{most:.4g} mm) have one lens in {group[0].lens.file.name}: estimate one for each "
+                "focal length, or leave out those that were zoomed"
+            )
+    return warnings
 
 
 def _go_together(sizes: Mapping[tuple[int, int], tuple[Frame, Camera]]) -> bool:

@@ -17,12 +17,13 @@ from warpnerf.scenes.extent.points import Points, usable
 from warpnerf.scenes.files import DEPTHS, MASKS, printable, resolve_inside
 from warpnerf.scenes.formats.frame import Frame
 from warpnerf.scenes.formats.ply import read_ply
-from warpnerf.scenes.images.masks import SUFFIXES, has_mask_of
+from warpnerf.scenes.images.masks import IN_FOLDERS, SUFFIXES, has_mask_of
 from warpnerf.scenes.scene import Scene
 
+MASK_ENDINGS = (*IN_FOLDERS, ".npy", ".gif")
 DEPTH_ENDINGS = (*SUFFIXES, ".npy", ".tif", ".tiff", ".exr", ".pfm")
-CLOUD_ENDINGS = (".ply", ".pcd", ".las", ".laz", ".e57")
-"""Of depth maps, and of clouds of points."""
+CLOUD_ENDINGS = (".ply", ".pcd", ".las", ".laz", ".e57", ".xyz", ".pts", ".ptx")
+"""Of masks, of depth maps, and of clouds of points."""
 
 MAX_PLY_BYTES = 2**28
 """Of points that no file names: larger ones would slow down the reading of a scene."""
@@ -38,7 +39,7 @@ def unused_masks(folder: Path, frames: Sequence[Frame]) -> list[str]:
     masks = [frame.mask.path for frame in frames if frame.mask is not None]
     names = [frame.name for frame in frames]
     warnings = []
-    for place in _unused(folder, frames, MASKS, masks, (*SUFFIXES, ".npy")):
+    for place in _unused(folder, frames, MASKS, masks, MASK_ENDINGS):
         shown = printable(shlex.quote(str(place)))
         if has_mask_of(place, names):
             way_out = f"--masks {shown} ignores what is black there"
@@ -98,8 +99,9 @@ def tried_points(points: Points | None, scene: Scene) -> list[str]:
 
 
 def unused_points(folder: Path) -> list[str]:
-    """A note of clouds of points in the folder of a scene without points."""
-    names = [printable(path.name) for path in _clouds(folder)]
+    """A note of clouds of points in the folder of a scene without points, or in one within it."""
+    clouds = [cloud for place in (folder, *folders_in(folder)) for cloud in _clouds(place)]
+    names = [printable(cloud.relative_to(folder).as_posix()) for cloud in clouds]
     if not names:
         return []
     return [

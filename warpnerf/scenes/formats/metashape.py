@@ -89,6 +89,7 @@ def load_metashape(file: Path, reading: Reading) -> Scene:
     """
     chunk, notes = _chunk(file)
     aligned, more = _aligned(file, chunk)
+    unread = _unread(file, chunk)
     sensors = {sensor.get("id", ""): sensor for sensor in chunk.iterfind("sensors/sensor")}
     poses, turned = _on_the_ground(_poses(file, chunk, aligned), chunk.findtext("reference", ""))
 
@@ -106,7 +107,7 @@ def load_metashape(file: Path, reading: Reading) -> Scene:
 
     entries = [entry(camera, pose) for camera, pose in zip(aligned, poses, strict=True)]
     photographs = Photographs(file.parent)
-    return scene_of(file, entries, photographs, reading, lambda: ([*notes, *more, *turned], ()))
+    return scene_of(file, entries, photographs, reading, lambda: ([*notes, *more, *turned], unread))
 
 
 def _chunk(file: Path) -> tuple[ElementTree.Element, list[str]]:
@@ -161,13 +162,11 @@ def _aligned(file: Path, chunk: ElementTree.Element) -> tuple[list[ElementTree.E
         notes.append(
             f"{file.name}: left out {len(cameras) - len(on)} cameras that are switched off"
         )
-    if len(aligned) < len(on):
-        first = next(camera for camera in on if camera.find("transform") is None)
-        rigged = sum(c.find("transform") is None and "master_id" in c.attrib for c in on)
-        rest = f", {rigged} of them of a rig, which are placed by another camera" if rigged else ""
+    lost = [c for c in on if c.find("transform") is None and "master_id" not in c.attrib]
+    if lost:
         notes.append(
-            f"{file.name}: left out {len(on) - len(aligned)} of {len(on)} cameras that are not "
-            f"aligned (first: {printable(first.get('label', '')[:80])}){rest}"
+            f"{file.name}: left out {len(lost)} of {len(on)} cameras that are not aligned (first: "
+            f"{printable(lost[0].get('label', '')[:80])})"
         )
     parts: dict[str, list[ElementTree.Element]] = {}
     for camera in aligned:
@@ -181,6 +180,36 @@ def _aligned(file: Path, chunk: ElementTree.Element) -> tuple[list[ElementTree.E
         )
         aligned = largest
     return aligned, notes
+
+
+def _unread(file: Path, chunk: ElementTree.Element) -> list[str]:
+    """Warnings of what a chunk says of its cameras that is not read: rigs, rolling shutters."""
+    cameras, warnings = _cameras(chunk), []
+    rigged = [c for c in cameras if c.find("transform") is None and "master_id" in c.attrib]
+    if rigged:
+        warnings.append(
+            f"{file.name}: left out {len(rigged)} of {len(cameras)} cameras (first: "
+            f"{printable(rigged[0].get('label', '')[:80])}) that are placed by another one of their"
+            " rig; export cameras for COLMAP, which has a pose for each"
+        )
+    rolling = [
+        element.get("label", "")
+        for element in (*chunk.iterfind("sensors/sensor"), *cameras)
+        if any(map(_is_rolling, element.iter()))
+    ]
+    if rolling:
+        warnings.append(
+            f"{file.name}: rolling_shutter of {len(rolling)} sensors and cameras (first: "
+            f"{printable(rolling[0][:80])}) is not used: each image is taken at one instant"
+        )
+    return warnings
+
+
+def _is_rolling(element: ElementTree.Element) -> bool:
+    """Whether an element, or the property that it is, says that a shutter rolled."""
+    value = element.get("value", element.text or "").strip().lower()
+    name = f"{element.tag} {element.get('name', '')}".lower()
+    return "rolling" in name and value not in ("", "0", "false", "none", "disabled")
 
 
 def _poses(

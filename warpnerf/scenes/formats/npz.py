@@ -7,6 +7,7 @@ world in OpenGL axes; ``focal`` one number, pixels. Nothing in the file is unpic
 from __future__ import annotations
 
 import lzma
+import re
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -133,6 +134,11 @@ def _open(archive: zipfile.ZipFile, file: Path, name: str) -> tuple[IO[bytes], H
     try:
         info = archive.getinfo(f"{name}.npy")
     except KeyError:
+        if re.search(r"(world_mat|camera_mat|scale_mat)_\d+\.npy", "\n".join(archive.namelist())):
+            raise InputError(
+                f"{file}: holds projection matrices (world_mat_0, ...), as of IDR and NeuS, which "
+                "are not read; convert them to a transforms.json, or estimate poses again."
+            ) from None
         there = printable(", ".join(sorted(archive.namelist()))[:100]) or "nothing"
         raise InputError(
             f"{file}: holds no {name}, but {there}; a scene has images, poses and focal."

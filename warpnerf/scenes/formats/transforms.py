@@ -24,16 +24,16 @@ from warpnerf.scenes.cameras.poses import check_pose
 from warpnerf.scenes.extent.points import Points, usable
 from warpnerf.scenes.files import (
     REDUCED,
-    exists,
-    find_image,
+    find_moved,
+    plain_name,
     printable,
     read_json,
-    resolve_inside,
 )
 from warpnerf.scenes.formats import left_over
 from warpnerf.scenes.formats.assemble import Reading, assemble
 from warpnerf.scenes.formats.colmap import points_beside
 from warpnerf.scenes.formats.colmap_models import find_model, size_of
+from warpnerf.scenes.formats.found_photographs import without_ending
 from warpnerf.scenes.formats.frame import Frame
 from warpnerf.scenes.formats.frame_images import elsewhere_warnings, find_images
 from warpnerf.scenes.formats.ply import read_ply
@@ -181,8 +181,8 @@ def _points(file: Path, data: TransformsFile, frames: Sequence[Frame]) -> tuple[
     beside, why_not = points_beside(file.parent, frames, _applied(data))
     if ply_file_path is None or (beside is not None and beside.tracks is not None):
         return beside, why_not
-    path = resolve_inside(file.parent, ply_file_path, field=f"{file}: $.ply_file_path")
-    if not exists(path):
+    path = find_moved(file.parent, ply_file_path, field=f"{file}: $.ply_file_path")
+    if path is None:
         return None, f"{file.name}: ply_file_path {printable(ply_file_path)} is not there"
     positions = read_ply(path)
     positions = positions[usable(positions)]
@@ -293,7 +293,7 @@ def _named_file(
     """The file that a key names, if it does; one that is not there is added to the lost ones."""
     if not text:
         return None
-    path = find_image(file.parent, text, field=f"{file}: {place}.{key}")
+    path = find_moved(file.parent, text, field=f"{file}: {place}.{key}")
     if path is None:
         lost[key].append(text)
     return path
@@ -313,13 +313,29 @@ def _listed_names(
     """
     members: set[str] = set()
     absent: list[str] = []
+    ends = _ends(names)
     for index, text in enumerate(listed):
         name = names.get(text)
         if name is None:
-            path = find_image(folder, text, field=f"{file}: $.{split}_filenames[{index}]")
+            called = ends.get(plain_name(text), set())
+            name = min(called) if len(called) == 1 else None
+        if name is None:
+            path = find_moved(folder, text, field=f"{file}: $.{split}_filenames[{index}]")
             name = names.get(path.relative_to(folder).as_posix()) if path else None
         if name is None:
             absent.append(text)
         else:
             members.add(name)
     return members, absent
+
+
+def _ends(names: Mapping[str, str]) -> dict[str, set[str]]:
+    """The frames whose names end so, with and without the ending of a photograph."""
+    ends: dict[str, set[str]] = {}
+    for called, name in names.items():
+        parts = plain_name(called).split("/")
+        for start in range(len(parts)):
+            end = "/".join(parts[start:])
+            for text in {end, without_ending(end)}:
+                ends.setdefault(text, set()).add(name)
+    return ends

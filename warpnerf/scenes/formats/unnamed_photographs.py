@@ -6,12 +6,23 @@ import re
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
-from warpnerf.scenes.files import OTHER_IMAGES, PHOTOGRAPHS, is_photograph, printable
+from warpnerf.scenes.files import (
+    DEPTHS,
+    MASKS,
+    OTHER_IMAGES,
+    PHOTOGRAPHS,
+    is_photograph,
+    printable,
+)
 from warpnerf.scenes.formats.left_over import files_in, folders_in
 from warpnerf.scenes.images.masks import without_masks
 
 UNPOSED = 0.1
 """Share of the photographs that is left, above which that is a warning."""
+SAID_ELSEWHERE = re.compile(
+    rf"{MASKS.pattern}|{DEPTHS.pattern}|(.*[_-])?thumb(nail)?s?([_-]?images?)?", re.IGNORECASE
+)
+"""Folders of masks and depth maps, which are named where these are read, and of previews."""
 SAME = 0.5
 """Share of the names of photographs, above which a folder beside is of another camera."""
 
@@ -51,14 +62,15 @@ def same_names_beside(folder: Path, used: Collection[Path], named_by: str) -> li
         for other in folders_in(place):
             if other in stems or any(other in path.parents for path in used):
                 continue
-            if PHOTOGRAPHS.fullmatch(other.name) or OTHER_IMAGES.fullmatch(other.name):
+            if PHOTOGRAPHS.fullmatch(other.name) or SAID_ELSEWHERE.fullmatch(other.name):
                 continue
+            what = "images" if OTHER_IMAGES.fullmatch(other.name) else "photographs"
             same = [p for p in files_in(other) if is_photograph(p.name) and p.stem in own]
             if len(same) > SAME * len(own):
                 notes.append(
                     f"also in the folder, and not used: "
                     f"{printable(other.relative_to(folder).as_posix()[:80])}, with {len(same)} "
-                    f"photographs of the same names, which {named_by} does not name"
+                    f"{what} of the same names, which {named_by} does not name"
                 )
     return notes
 

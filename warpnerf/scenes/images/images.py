@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import sys
 from collections.abc import Callable
@@ -9,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from PIL import Image, ImageFile, TiffImagePlugin, UnidentifiedImageError
+from PIL import ExifTags, Image, ImageFile, TiffImagePlugin, UnidentifiedImageError
 
 from warpnerf.checks import InputError
 from warpnerf.scenes.files import require_regular_file
@@ -106,11 +107,27 @@ def exif_orientation(path: Path) -> int:
 def read_exif(path: Path, look: Callable[[Image.Exif], T]) -> T | None:
     """What something finds in a photograph's EXIF; None where there is none that can be read."""
     try:
-        # Of a PNG all pixels would be decoded first. MPO, several JPEGs in a file, opens as JPEG.
-        with Image.open(path, formats=("JPEG", "WEBP")) as image:
+        # MPO, several JPEGs in a file, opens as JPEG. Where a PNG's EXIF does not stand before its
+        # pixels, all of these would be decoded.
+        with Image.open(path, formats=("JPEG", "WEBP", "PNG")) as image:
+            if image.format == "PNG" and "exif" not in image.info:
+                return None
             return look(image.getexif())
     except Exception:  # tags are damaged in more ways than Pillow has names for
         return None
+
+
+def exif_focal_length(path: Path) -> float | None:
+    """The focal length that a photograph's EXIF states, millimetres; for film 36 mm wide where it
+    says that, which a digital zoom changes as well. None where it says none."""
+
+    def look(exif: Image.Exif) -> float | None:
+        details = exif.get_ifd(ExifTags.IFD.Exif)
+        names = (ExifTags.Base.FocalLengthIn35mmFilm, ExifTags.Base.FocalLength)
+        stated = (float(details.get(name) or 0.0) for name in names)
+        return next((value for value in stated if 0.0 < value < math.inf), None)
+
+    return read_exif(path, look)
 
 
 def says_equirectangular(path: Path) -> bool:

@@ -14,6 +14,8 @@ from warpnerf.scenes.images.images import image_size, read_image
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 """Of masks, which are named after a photograph or its stem."""
+IN_FOLDERS = (*SUFFIXES, ".tif", ".tiff", ".bmp", ".webp")
+"""Of those in folders of masks."""
 LOSSY = (".jpg", ".jpeg")
 """Of those in which black is not quite black."""
 
@@ -98,7 +100,7 @@ def mask_in(folder: Path, name: str) -> Mask | None:
     if relative.is_absolute() or ".." in relative.parts or not relative.name:
         return None
     stems = relative.with_suffix(""), relative.with_name(f"mask_{relative.stem}")
-    own, prefixed = ([f"{stem}{suffix}" for suffix in SUFFIXES] for stem in stems)
+    own, prefixed = ([f"{stem}{suffix}" for suffix in IN_FOLDERS] for stem in stems)
     for path in (f"{name}.png", *own, name, *prefixed):
         if os.path.isfile(folder / path):  # noqa: PTH113, never raises
             return Mask(folder / path)
