@@ -136,7 +136,7 @@ class TrainConfig:
     """Updates of the grid between two looks for free space, each of one or several steps."""
     skip_empty_rays: bool = True
     """Whether rays that meet free space only are left out of the batches of bounded scenes. They
-    see the background, whatever is trained: gradients are the same on average, for less work."""
+    see the background, whatever is trained: gradients are the same, for less work."""
     alpha_min: float = 0.05
     """A cell is free where the longest step that there can be would be less opaque than this: what
     light crosses twenty voxels of is fog in most scenes. Smoke needs less."""

@@ -51,9 +51,9 @@ def train(
 ) -> TrainResult:
     """Train a voxel grid on a scene's training views.
 
-    Each step draws random pixels, marches their rays, and runs one hand-written adjoint back into
-    the grid that scales each sample's gradient by its distance from the camera
-    (Philip & Deschaintre 2023). kernels/README.md derives it.
+    Each step takes pixels in a random order, marches their rays, and runs one hand-written adjoint
+    back into the grid that scales each sample's gradient by its distance from the camera (Philip &
+    Deschaintre 2023). kernels/README.md derives it.
 
     Args:
         scene: From ``load_scene``.
