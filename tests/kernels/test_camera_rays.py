@@ -1,4 +1,4 @@
-"""Rays of cameras with lens distortion, and batches of random pixels."""
+"""Rays of cameras with lens distortion, and batches of pixels in a random order."""
 
 from typing import Any
 

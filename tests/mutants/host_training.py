@@ -142,6 +142,8 @@ OPTIM, STATE, COARSE = (f"training/{name}.py" for name in ("optim", "state", "co
 SPACE_PLAN = "scenes/extent/space_plan.py"
 SCHEDULE, CHECKPOINT = "training/schedule.py", "runs/checkpoint.py"
 KEPT = "runs/optimiser_tensors.py"
+CACHE, PARALLEL = "runtime/kernel_cache.py", "runtime/parallel.py"
+LOADED = "runtime/test_parallel.py::test_one_kernel_of_each_module_is_loaded_once"
 RAYS, RENDER, JOINED = (f"rendering/{name}.py" for name in ("rays", "render", "losses"))
 MARCH = "rendering/steps.py"
 
@@ -214,8 +216,19 @@ MUTANTS = [
     # rays.py, render.py, losses.py
     of_host("sampler: no jitter", RAYS, "self._draw.jitter = int(jitter)", "self._draw.jitter = 0", BOUNDED),
     of_host("sampler: black behind", RAYS, "background_mode = kernels.RANDOM_BACKGROUND", "background_mode = 0", BOUNDED),
-    of_host("sampler: as many rays as before", RAYS, "self._n_drawn = max(1, round(share * self._n_rays))",
-            "self._n_drawn = self._n_rays", EMPTY),
+    of_host("sampler: rays that meet nothing", RAYS, "np.flatnonzero(room.picked_views.numpy()[:n_picked] >= 0)",
+            "np.arange(n_picked)", EMPTY),
+    of_host("loading: continues after an error", PARALLEL, "list(waiting)  # nobody", "pass  # nobody",
+            "runtime/test_parallel.py::test_an_error_in_loading_is_raised"),
+    of_host("loading: a second time", PARALLEL, "self._loaded.update(kernels)", "pass", LOADED),
+    of_host("loading: all of a module", PARALLEL, "{kernel.module: kernel for", "{kernel: kernel for", LOADED),
+    of_host("loading: one after the other", PARALLEL, "range(1, min(cores, len(modules), COMPILED_AT_ONCE))",
+            "range(0)",
+            "runtime/test_parallel.py::test_several_threads_load_at_once"),
+    of_host("loading: a module by two threads", CACHE, "loading = _loading.setdefault(module, threading.Lock())",
+            "loading = threading.Lock()", "runtime/test_kernel_cache.py::test_one_thread_loads_a_module_and_others_load_others"),
+    of_host("loading: it failed for good", CACHE, "module.unload()  # forgets that it failed", "pass",
+            "runtime/test_kernel_cache.py::test_a_library_loads_once_the_cause_is_gone"),
     of_host("pass: a sum", RENDER, "n_batches * share / batch.count", "n_batches * share", BOUNDED),
     of_host("pass: no near plane", MARCH, "march.near = 0.0 if self.in_ndc else self.near", "march.near = 0.0",
             BOUNDED),
@@ -279,7 +292,7 @@ MUTANTS = [
     of_host("what is auto is decided again", TRAINER, "plan = resume.plan_of(scene, asked)",
             "plan = resolve(scene, asked, looked=True)", GOES_BY),
     of_host("gradients are not reduced", TRAINER, "        self._add_gradients()\n", "", REDUCED),
-    of_host("all processes draw the same rays", RAYS, "self._n_rays + begin)", "self._n_rays)", PROCESSES),
+    of_host("all processes draw the same rays", RAYS, "self._n_rays + begin\n", "self._n_rays\n", PROCESSES),
     of_host("a flag stands for its tile alone", "torch/processes.py",
             "    holds[1:] |= touched[:-1]\n", "", PROCESSES),
     of_host("a share of the rows stays as it is", "torch/processes.py", "dim=1)[self.rank]", "dim=1)[0]", PROCESSES),

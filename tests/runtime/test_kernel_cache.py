@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import threading
 import time
@@ -178,6 +179,41 @@ def test_a_library_says_what_is_wrong_with_the_cache(
             kernel_cache.start()
 
 
+class ForgetfulModule(Module):
+    """Fails as long as it is told to, and, as Warp's do, until it is unloaded."""
+
+    error: Exception | None = None
+    failed = False
+
+    def load(self, device: object, block_dim: int) -> None:
+        self.failed = self.failed or self.error is not None
+        if self.failed:
+            raise self.error or RuntimeError("it failed before")
+        super().load(device, block_dim)
+
+    def unload(self) -> None:
+        self.failed = False
+
+
+@pytest.mark.parametrize("error", [PermissionError("not yours"), RuntimeError("cut short")])
+def test_a_library_loads_once_the_cause_is_gone(
+    error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kernel_cache.start()
+    monkeypatch.setattr(process, "_own", False)
+    monkeypatch.setattr(kernel_cache, "_temporary", None)
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    module, cpu = ForgetfulModule(tmp_path / "a"), wp.get_device("cpu")
+    module.error = error
+    for _ in range(2):
+        with pytest.raises((InputError, RuntimeError), match=str(error)):
+            kernel_cache.load(SimpleNamespace(module=module), cpu)
+    module.error = None
+    with contextlib.suppress(InputError, RuntimeError):
+        kernel_cache.load(SimpleNamespace(module=module), cpu)
+    assert (tmp_path / "a" / SUMS).exists()
+
+
 @pytest.mark.parametrize("modules", [1, 3])
 def test_one_thread_loads_a_module_and_others_load_others(
     modules: int, monkeypatch: pytest.MonkeyPatch
@@ -197,8 +233,9 @@ def test_one_thread_loads_a_module_and_others_load_others(
     monkeypatch.setattr(kernel_cache, "_load", load)
     made = [Module(Path(str(number))) for number in range(modules)]
     kernels = [SimpleNamespace(module=made[number % modules]) for number in range(3)]
+    load_it = getattr(kernel_cache.load, "__wrapped__", kernel_cache.load)  # tests lock files
     with ThreadPoolExecutor(3) as pool:
-        list(pool.map(lambda kernel: kernel_cache.load(kernel, None), kernels))
+        list(pool.map(lambda kernel: load_it(kernel, None), kernels))
     assert together == [1, 1, 1]
 
 

@@ -1,4 +1,4 @@
-"""Rays of cameras, and batches of rays through random pixels of photographs."""
+"""Rays of cameras, and batches of rays through pixels of photographs, in a random order."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def camera_rays(camera: Camera, workers: Workers) -> tuple[wp.array, wp.array]:
 
 
 class PixelSampler:
-    """Photographs, from which batches of random pixels are drawn."""
+    """Photographs, from which batches of pixels are drawn, in a random order."""
 
     def __init__(
         self,

@@ -55,7 +55,7 @@ _said = False
 _started = False
 
 
-def _load_again() -> None:
+def _unlock() -> None:
     """Nobody loads in a process that was just forked, whoever did in the one that it comes from."""
     global _changing
     _changing = threading.Lock()
@@ -63,7 +63,7 @@ def _load_again() -> None:
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_load_again)
+    os.register_at_fork(after_in_child=_unlock)
 
 
 class DamagedKernelError(Exception):
@@ -126,10 +126,12 @@ def load(kernel: wp.Kernel, device: wp.Device) -> None:
         try:
             _load(module, device)
         except Exception as error:  # whatever came of it: Warp raises plain exceptions
+            if type(error).__name__.startswith("WarpCodegen"):  # the kernel is wrong
+                raise
+            module.unload()  # forgets that it failed
             with _changing:
                 if wp.config.kernel_cache_dir == cache:  # else another thread has left it
                     _leave_after(error)
-            module.unload()  # forgets that it failed
             try:
                 _load(module, device)
             except OSError as again:
@@ -138,11 +140,8 @@ def load(kernel: wp.Kernel, device: wp.Device) -> None:
 
 def _leave_after(error: Exception) -> None:
     """Leave the cache where it may be to blame; raise the error where it is not."""
-    mistaken = type(error).__name__.startswith("WarpCodegen")  # the kernel, not the cache
-    if mistaken or _temporary is not None:
-        raise error
     told = isinstance(error, OSError | DamagedKernelError)
-    if not told and not process.is_own():
+    if _temporary is not None or not (told or process.is_own()):
         raise error
     _leave_cache(error)
 

@@ -232,12 +232,15 @@ class Workers:
         try:
             for other in others:
                 other.give(load_waiting)
-            load_waiting()
+            try:
+                load_waiting()
+            finally:
+                errors += [other.wait() for other in others]
+            if any(errors):
+                raise next(filter(None, errors))
         finally:
-            errors += [other.wait() for other in others]
             _end(others)
-        for error in filter(None, errors):
-            raise error
+            del errors  # as in _launch
         self._loaded.update(kernels)
 
     def _launch(

@@ -40,7 +40,7 @@ class CompiledKernel:
     compiled: bool
     """Whether it had to be compiled; else it was in the cache."""
     seconds: float
-    """How long that took."""
+    """How long that took, beside others that were compiled at the same time."""
 
 
 def training_kernels(
@@ -66,7 +66,7 @@ def training_kernels(
     decaying = [adam.adam_kernel(model.n_floats, decays=True), near_decay.find_near_decay]
     return [
         assembly.render_train_kernel(variant),  # takes longest, so it is compiled first
-        camera.sample_pixels,
+        camera.sample_pixels,  # and pick_pixels
         *class_of(stored).kernels(stored, model),
         *(decaying if decays else []),
         *([exposure.add_moments] if exposes else []),

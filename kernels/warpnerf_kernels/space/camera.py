@@ -17,7 +17,7 @@ AHEAD = 8
 """Rays from the one that a CPU draws to the one whose pixel it prefetches."""
 
 SPREAD = 0x9E3779B97F4A7C15
-"""2^64 over the golden ratio, made odd: multiplied by it, low bits reach all higher ones."""
+"""2^64 over the golden ratio. Multiplied by it, low bits reach all higher ones."""
 
 ROUNDS = 3
 """Of multiplication and shift in which the bits of a place become those of a pixel."""
