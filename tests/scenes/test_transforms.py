@@ -59,7 +59,7 @@ def test_files_of_another_machine_are_found_in_the_folder(tmp_path: Path, root: 
         ("", "/home/other/scene/masks/images/{k:03d}.png"),
         ("", "/home/other/scene/images/{k:03d}.png"),
         ("masks", "/home/other/masks{k}/masks/000.png"),
-        ("masks", "/home/other/{k:03d}/000.png"),
+        (".", "/home/other/{k:03d}/000.png"),
         (".", "C:\\data\\scene\\mask_{k:03d}.png"),
     ],
 )
