@@ -288,16 +288,16 @@ class MovedFiles:
     """Files that a key of a scene file names, also by absolute paths of another machine, some ends
     of which are those of files in the folder; no two texts then name one file."""
 
-    def __init__(self, folder: Path, *, but: Collection[Path] = (), alone: bool = False) -> None:
+    def __init__(self, folder: Path, *, taken: Collection[Path] = (), alone: bool = False) -> None:
         """Begin with none.
 
         Args:
             folder: The scene's.
-            but: Files that an end must not lead to.
+            taken: Files that an end must not lead to.
             alone: Whether a name alone is end enough; else a folder of the path must be there, too.
         """
         self._folder = folder
-        self._but = but
+        self._taken = taken
         self._least = 1 if alone else 2
         self._texts: dict[Path, str] = {}
 
@@ -334,7 +334,7 @@ class MovedFiles:
             end = "/".join(names[start:])
             if names[start] and os.path.isfile(self._folder / end):  # noqa: PTH113, never raises
                 path = resolve_inside(self._folder, end, field=field)
-                if path not in self._but and self._texts.get(path, text) == text:
+                if path not in self._taken and self._texts.get(path, text) == text:
                     yield path
 
 

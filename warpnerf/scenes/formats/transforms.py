@@ -294,7 +294,7 @@ class _Named:
 
     def __init__(self, file: Path, key: str, photographs: Iterable[Path]) -> None:
         self._field, self._key = f"{file}: ", key
-        self._files = MovedFiles(file.parent, but=set(photographs))
+        self._files = MovedFiles(file.parent, taken=set(photographs))
         self.lost: list[str] = []
         """Those that are not there, as the file has them."""
 
