@@ -314,7 +314,7 @@ def in_two_places(
     [
         (0.03, 0.03, 3.0),  # by hand
         (0.03, 0.03, 3.0, True),  # of a panorama's faces
-        (0.02, 0.7, 0.3),  # near a thing, and around it
+        (0.01, 0.4, 0.15),  # near a thing, and around it
         (0.003, 0.3, 30.0),
         (3.0, 3.0, 30.0),  # two rooms
     ],
@@ -345,6 +345,7 @@ def test_degrees_of_longitude_and_latitude_are_named(
         ((12.0, 8.0, 0.0), (0.0, 1e-3)),
         ((12.0, 8.0, 0.0), (1e-7, 1e-7)),
         ((120.0, 98.0, 0.0), (1e-3, 1e-3)),
+        ((12.0, 170.0, 0.0), (0.025, 0.05)),
     ],
 )
 def test_straight_tracks_are_no_degrees(

@@ -92,7 +92,6 @@ TESTING = "scenes/test_doubts.py::test_photographs_for_testing_are_looked_at_as_
 MIRROR = "scenes/test_doubts.py::test_mirrored_photographs_are_named"
 MATTES = "scenes/test_class_masks.py::test_mattes_with_wide_soft_edges_are_no_photographs"
 TRACKS = "inspection/test_inspection.py::test_straight_tracks_are_no_degrees"
-DEGREES = "inspection/test_inspection.py::test_degrees_of_longitude_and_latitude_are_named"
 TWO_PLACES = "inspection/test_inspection.py::test_two_places_are_in_the_same_units"
 OF_ANOTHER = "scenes/test_transforms.py::test_files_of_another_machine_are_none_of_another_path"
 
@@ -276,7 +275,7 @@ MUTANTS = [
     of_host("metashape: shutters that do not roll", "scenes/formats/metashape.py", 'not in ("", "0", "false", "none", "disabled")', 'not in ("", "0")',
             "scenes/test_metashape.py::test_metashape_rolling_shutters_are_named"),
     of_host("degrees: along one axis", DIAGNOSTICS, "both = across.min() > ASKEW * across.max()", "both = True", TRACKS),
-    of_host("degrees: in metres", DIAGNOSTICS, "HIGHER * across.max() < up < HIGHEST", "0.0 <= up < HIGHEST", DEGREES),
+    of_host("degrees: in metres", DIAGNOSTICS, "HIGHER * across.max() < up < HIGHEST", "0.0 <= up < HIGHEST", TRACKS),
     of_host("units: of any spread", DIAGNOSTICS, "LIKELY = 1.5", "LIKELY = 1e9", TWO_PLACES),
     of_host("units: how far does not count", DIAGNOSTICS, "if is_unit and times / ALONG <= further <= ALONG * times else", "if is_unit else", TWO_PLACES),
     of_host("moved: by the name alone", "scenes/files.py", "self._least = 1 if alone else 2", "self._least = 1", OF_ANOTHER),
