@@ -315,7 +315,7 @@ MUTANTS = [
     of_host(
         "beside: whatever it is called",
         UNNAMED,
-        "if PHOTOGRAPHS.fullmatch(other.name) or OTHER_IMAGES.fullmatch(other.name):",
+        "if PHOTOGRAPHS.fullmatch(other.name) or SAID_ELSEWHERE.fullmatch(other.name):",
         "if False:",
         f"{LEFT_TESTS}photographs_of_the_same_names_in_a_folder_beside_are_said",
     ),

@@ -80,6 +80,21 @@ ANY_FOCAL, FOCAL, HARDLY, OTHER_POSES = (
 CLASSES = "scenes/test_class_masks.py::test_masks_of_classes_are_told"
 READ_AS = "scenes/test_conventions.py::test_poses_in_other_axes_are_read_as_the_photographs_show"
 
+CONVENTIONS = "scenes/extent/conventions.py"
+PROVED = (
+    "scenes/test_conventions.py::test_a_part_is_proved_by_nearly_every_reference_and_by_the_whole"
+)
+FEWER = "scenes/test_focus.py::test_cameras_upside_down_are_the_fewer"
+DRONE = "scenes/test_focus.py::test_no_camera_of_a_drone_that_flies_to_and_fro_is_upside_down"
+BENT = "scenes/test_doubts.py::test_distortion_of_photographs_without_is_named"
+UNFIT = "scenes/test_doubts.py::test_photographs_of_which_some_do_not_fit_are_counted"
+TESTING = "scenes/test_doubts.py::test_photographs_for_testing_are_looked_at_as_well"
+MIRROR = "scenes/test_doubts.py::test_mirrored_photographs_are_named"
+MATTES = "scenes/test_class_masks.py::test_mattes_with_wide_soft_edges_are_no_photographs"
+TRACKS = "inspection/test_inspection.py::test_straight_tracks_are_no_degrees"
+TWO_PLACES = "inspection/test_inspection.py::test_two_places_are_in_the_same_units"
+OF_ANOTHER = "scenes/test_transforms.py::test_files_of_another_machine_are_none_of_another_path"
+
 MUTANTS = [
     # doubts.py and conventions.py
     of_host("doubts: focal lengths that fit about as well", DOUBTS, "return zoom if sharp else None", "return zoom", ANY_FOCAL),
@@ -87,8 +102,8 @@ MUTANTS = [
     of_host("doubts: the inverse factor", DOUBTS, "photographs.zoomed(middle * step)", "photographs.zoomed(1.0 / (middle * step))", FOCAL),
     of_host("doubts: of cameras far apart", DOUBTS, " and photographs.apart() <= CLOSE", "", HARDLY),
     of_host("doubts: of few references", DOUBTS, "len(gain) < ENOUGH or ", "", HARDLY),
-    of_host("doubts: none of poses", DOUBTS, "if gain.mean() < REFUTED and", "if False and", OTHER_POSES),
-    of_host("doubts: not asked", "scenes/extent/conventions.py", "        warnings += doubts(photographs)\n", "        pass\n", OTHER_POSES),
+    of_host("doubts: none of poses", DOUBTS, "if not some and gain.mean() < REFUTED and", "if False and", OTHER_POSES),
+    of_host("doubts: not asked", "scenes/extent/conventions.py", "told = doubts(photographs)", "told = []", OTHER_POSES),
     of_host("positions: as translations", "scenes/extent/conventions.py", "-to_camera @ poses[:, :, 3:]], axis=2)", "poses[:, :, 3:]], axis=2)", READ_AS),
     of_host("left-handed: the camera alone", "scenes/extent/conventions.py", " * MIRRORED[:3, None]", "", READ_AS),
     of_host("masks: classes are no reason", "scenes/images/masks.py", "if 1 < values[-1] < 128:", "if False:", CLASSES),
@@ -234,12 +249,38 @@ MUTANTS = [
     of_host("depths: depth_path comes first", "scenes/formats/transforms.py", "if ngp_depth and not entry.depth_file_path:", "if entry.depth_path:",
             "scenes/test_depths.py::test_depth_is_read_as_instant_ngp_names_it"),
     of_host("masks: half is little", MASKED, "HALF = 0.5", "HALF = 0.7", LEFT),
-    of_host("masks: a third is enough", MASKED, "share >= HALF or", "share >= 0.3 or", LEFT),
-    of_host("masks: any focus", MASKED, "    if focus.guessed:\n        return True\n", "", LEFT),
+    of_host("masks: a third is enough", MASKED, "focus > HALF or (share >= HALF and (", "focus > HALF or (share >= 0.3 and (", LEFT),
+    of_host("masks: any focus", MASKED, "    if focus.guessed:\n        return 1.0\n", "", LEFT),
     of_host("masks: the focus upside down", MASKED, "camera.cx - camera.fx * x / z", "camera.cx + 2.0 + camera.fx * x / z", LEFT),
     of_host("masks: any of a block", "scenes/images/masks.py", "blocks.all(axis=(1, 3))", "blocks.any(axis=(1, 3))", BLOCKS),
     of_host("masks: transparent counts", "scenes/images/masks.py", "        white &= image[..., 3] > 127\n", "        pass\n",
             "scenes/test_masks.py::test_every_kind_of_image_is_a_mask"),
+    # parts, other units, what photographs and files tell of poses, lenses and masks
+    of_host("parts: of some that do not fit", CONVENTIONS, "other.is_better(given) and bool(np.mean(each) >= NEARLY_EVERY)", "other.is_better(given)", PROVED),
+    of_host("parts: whatever the others do", CONVENTIONS, "agreement.fits and bool(np.mean(agreement.gain > NOTABLY) >= ALMOST_ALL)", "agreement.fits", PROVED),
+    of_host("upside down: no line", FOCUS, "if np.mean(np.abs(along) > 0.5) >= SPLIT:", "if False:", FEWER),
+    of_host("upside down: drones, too", FOCUS, " and np.linalg.norm(axes.mean(axis=0)) < ONE_WAY", "", DRONE),
+    of_host("doubts: distortion always fits", DOUBTS, "if photographs.distorted and _undistorted(photographs):", "if False:", BENT),
+    of_host("doubts: some never unfit", DOUBTS, "    if gain[~unfit].mean() < OTHERS:\n", "    if True:\n", UNFIT),
+    of_host("doubts: of testing none", DOUBTS, "    if unfit.sum() < max(FEWEST_UNFIT, MOST_OTHERS * len(unfit)):\n", "    if True:\n", TESTING),
+    of_host("doubts: mirrored the other way", DOUBTS, "photographs.mirrored(across=across)", "photographs.mirrored(across=not across)", MIRROR),
+    of_host("masks: gray photographs", "scenes/images/mask_values.py", " and _coloured(image) > COLOURED", "", MATTES),
+    of_host("masks: soft edges are classes", "scenes/images/mask_values.py", "FLAT = 0.5", "FLAT = 0.0", MATTES),
+    of_host("masks: idle are none", MASKED, "if len(given) < SEVERAL or any(", "if True or any(", "scenes/test_masks.py::test_masks_that_ignore_nothing_are_told"),
+    of_host("lens: any zoom is one", FRAME, "ZOOMED = 0.08", "ZOOMED = 8.0", "scenes/test_lens.py::test_photographs_of_several_focal_lengths_have_no_one_lens"),
+    of_host("lens: kinds of focal lengths are one", FRAME, "kinds.setdefault(is_of_film, [])", "kinds.setdefault(True, [])",
+            "scenes/test_lens.py::test_focal_lengths_for_film_are_no_others_than_the_lens_s_own"),
+    of_host("poses: others at one are copies", "scenes/formats/assemble.py", "if np.array_equal(o.image, view.image)), None)", "), None)",
+            "scenes/test_given_twice.py::test_different_photographs_at_one_pose_are_named"),
+    of_host("metashape: shutters that do not roll", "scenes/formats/metashape.py", 'not in ("", "0", "false", "none", "disabled")', 'not in ("", "0")',
+            "scenes/test_metashape.py::test_metashape_rolling_shutters_are_named"),
+    of_host("degrees: along one axis", DIAGNOSTICS, "both = across.min() > ASKEW * across.max()", "both = True", TRACKS),
+    of_host("degrees: in metres", DIAGNOSTICS, "HIGHER * across.max() < up < HIGHEST", "0.0 <= up < HIGHEST", TRACKS),
+    of_host("units: of any spread", DIAGNOSTICS, "LIKELY = 1.5", "LIKELY = 1e9", TWO_PLACES),
+    of_host("units: how far does not count", DIAGNOSTICS, "if is_unit and times / ALONG <= further <= ALONG * times else", "if is_unit else", TWO_PLACES),
+    of_host("moved: by the name alone", "scenes/files.py", "self._least = 1 if alone else 2", "self._least = 1", OF_ANOTHER),
+    of_host("moved: photographs are masks", "scenes/files.py", "path not in self._taken and ", "", OF_ANOTHER),
+    of_host("moved: one file of two paths", "scenes/files.py", "self._texts.get(path, text) == text", "True", OF_ANOTHER),
     # cameras and scenes made by hand
     of_host("camera: any matrix", "scenes/cameras/camera.py", '        require_rigid("Camera.c2w", self.c2w)\n', "", NO_RAYS),
     of_host("camera: complex", "scenes/cameras/camera.py", 'self.c2w.dtype.kind not in "fiu"', "False", NO_RAYS),

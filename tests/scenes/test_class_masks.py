@@ -6,11 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageFilter
 
 from tests.support.tiny_scenes import picture, save, write_transforms
 from warpnerf.checks import InputError
 from warpnerf.scenes.formats.load import load_scene
+from warpnerf.scenes.images.mask_values import other_values
+from warpnerf.scenes.images.masks import Mask
 
 
 @pytest.mark.parametrize("coloured", [False, True])
@@ -94,3 +96,11 @@ def test_masks_of_two_values_and_soft_edges_are_none_of_classes(tmp_path: Path) 
     }
     for name, mask in masks.items():
         assert warnings_of(tmp_path / name, [mask]) == "", name
+
+
+@pytest.mark.parametrize("wide", [10.0, 60.0, 100.0])
+def test_mattes_with_wide_soft_edges_are_no_photographs(tmp_path: Path, wide: float) -> None:
+    u, v = np.meshgrid(np.arange(640) - 320, np.arange(480) - 240)
+    disc = Image.fromarray(np.where(u**2 + v**2 < 150**2, 255, 0).astype(np.uint8))
+    disc.filter(ImageFilter.GaussianBlur(wide)).save(tmp_path / "matte.png")
+    assert other_values([Mask(tmp_path / "matte.png")]) == []

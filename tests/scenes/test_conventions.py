@@ -19,8 +19,13 @@ from warpnerf.scenes.cameras.camera import Camera
 from warpnerf.scenes.cameras.focus import upside_down
 from warpnerf.scenes.cameras.quaternions import quaternions, rotations
 from warpnerf.scenes.extent import photo_consistency
-from warpnerf.scenes.extent.conventions import check_against_photographs
-from warpnerf.scenes.extent.photo_consistency import FEWEST, PhotoConsistency, neighbours
+from warpnerf.scenes.extent.conventions import _fit_all, _is_proved, check_against_photographs
+from warpnerf.scenes.extent.photo_consistency import (
+    FEWEST,
+    Agreement,
+    PhotoConsistency,
+    neighbours,
+)
 from warpnerf.scenes.extent.points import Points
 from warpnerf.scenes.formats.load import load_scene
 from warpnerf.scenes.scene import View
@@ -212,6 +217,30 @@ def test_a_part_along_a_wall_is_never_taken_for_all(wall: list[View]) -> None:
     found, _, said = held([wrong[k] if k % 2 == 0 else view for k, view in enumerate(wall)])
     assert "poses of 12 of 24 images (first: 000) are read as" in said
     np.testing.assert_allclose(found[4].camera.c2w, wall[4].camera.c2w, atol=1e-12)
+
+
+@pytest.mark.ci
+def test_a_part_that_no_reading_fits_whole_stays(wall: list[View]) -> None:
+    """Of every third photograph of a wall those were read in axes as of Unity."""
+    wrong = misread(wall, WRITTEN["camera to world in OpenCV"])
+    given = [wrong[k] if k % 3 == 0 else view for k, view in enumerate(wall)]
+    found, _, said = held(given)
+    assert "are read as" not in said
+    assert all(one is other for one, other in zip(found, given, strict=True))
+
+
+def test_a_part_is_proved_by_nearly_every_reference_and_by_the_whole() -> None:
+    def agreement(gain: list[float]) -> Agreement:
+        chance = np.full(len(gain), 0.1)
+        return Agreement(found=gain + chance, by_chance=chance, of=np.arange(len(gain)))
+
+    given = agreement(12 * [0.0])
+    assert _is_proved(given, agreement(11 * [0.3] + [0.0]))
+    assert not _is_proved(given, agreement(9 * [0.3] + 3 * [0.01]))
+    assert not _is_proved(agreement(10 * [0.0] + 2 * [0.4]), agreement(12 * [0.3]))
+    assert _fit_all(agreement(10 * [0.3] + 2 * [0.0]))
+    assert not _fit_all(agreement(9 * [0.3] + 3 * [0.0]))
+    assert not _fit_all(agreement(12 * [0.06]))
 
 
 def test_opencv_axes_along_a_wall_are_told_by_photographs_alone(wall: list[View]) -> None:

@@ -202,6 +202,19 @@ def test_clouds_of_points_in_folders_are_said(tmp_path: Path) -> None:
 # photographs
 
 
+def test_masks_outside_the_folder_of_photographs_are_none_of_these(tmp_path: Path) -> None:
+    """More of them than there are frames ended in a traceback."""
+    content = write_transforms(tmp_path)
+    for k in range(8):
+        Image.new("L", (8, 6), 255 * (k % 2)).save(tmp_path / f"{k:03d}.png")
+    for k, frame in enumerate(content["frames"]):
+        frame["mask_path"] = f"{2 * k + 1:03d}.png"
+    Image.fromarray(picture(9)).save(tmp_path / "images/009.png")
+    save(tmp_path / "transforms.json", content)
+    said = "1 of 5 photographs in images are not in transforms.json (first: 009.png)"
+    assert said in load_scene(tmp_path).warnings
+
+
 @pytest.mark.parametrize(
     ("place", "said"),
     [

@@ -417,3 +417,28 @@ def test_photographs_of_several_focal_lengths_have_no_one_lens(
     assert len(said) == says
     if says:
         assert "EXIF (0.jpg 26 mm, 1.jpg 77 mm) have one lens in transforms.json" in said[0]
+
+
+@pytest.mark.parametrize(
+    ("of_film", "own", "says"),
+    [
+        ((26, 0, 26, 0), (4.25, 4.25, 4.25, 4.25), False),
+        ((26, 0, 26, 0), (4.25, 4.25, 4.25, 9.0), True),
+        ((26, 0, 52, 0), (4.25, 4.25, 4.25, 4.25), True),
+    ],
+)
+def test_focal_lengths_for_film_are_no_others_than_the_lens_s_own(
+    tmp_path: Path, of_film: tuple[int, ...], own: tuple[float, ...], says: bool
+) -> None:
+    """Some photographs of a telephone state one of these only."""
+    content = write_transforms(tmp_path)
+    for k, frame in enumerate(content["frames"]):
+        exif = Image.Exif()
+        details = exif.get_ifd(0x8769)
+        details[37386] = own[k]
+        if of_film[k]:
+            details[41989] = of_film[k]
+        Image.fromarray(picture(k)).save(tmp_path / f"{k}.jpg", exif=exif)
+        frame["file_path"] = f"{k}.jpg"
+    save(tmp_path / "transforms.json", content)
+    assert any("focal lengths by EXIF" in w for w in load_scene(tmp_path).warnings) == says

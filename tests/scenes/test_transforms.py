@@ -53,6 +53,32 @@ def test_files_of_another_machine_are_found_in_the_folder(tmp_path: Path, root: 
         load_scene(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("masks", "named"),
+    [
+        ("", "/home/other/scene/masks/images/{k:03d}.png"),
+        ("", "/home/other/scene/images/{k:03d}.png"),
+        ("masks", "/home/other/masks{k}/masks/000.png"),
+        (".", "/home/other/{k:03d}/000.png"),
+        (".", "C:\\data\\scene\\mask_{k:03d}.png"),
+    ],
+)
+def test_files_of_another_machine_are_none_of_another_path(
+    tmp_path: Path, masks: str, named: str
+) -> None:
+    """Photographs were taken for their own masks, and one file for those of all."""
+    content = write_transforms(tmp_path)
+    for k, frame in enumerate(content["frames"]):
+        frame["mask_path"] = named.format(k=k)
+        if masks:
+            (tmp_path / masks).mkdir(exist_ok=True)
+            for name in (f"{k:03d}.png", f"mask_{k:03d}.png"):
+                Image.new("L", (8, 6), 255).save(tmp_path / masks / name)
+    save(tmp_path / "transforms.json", content)
+    with pytest.raises(InputError, match=r"mask_path: .* leaves the scene's folder"):
+        load_scene(tmp_path)
+
+
 @pytest.mark.parametrize("listed", ["002.png", "002", "./images/002.png", "scene/images/002.png"])
 def test_lists_may_name_photographs_by_the_ends_of_their_paths(tmp_path: Path, listed: str) -> None:
     content = write_transforms(tmp_path)

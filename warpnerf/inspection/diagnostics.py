@@ -26,8 +26,20 @@ ENOUGH_PLACES, MOST_PLACES = 6, 2000
 """Of cameras, for that to be looked at."""
 FROM_ZERO = 3000.0
 """How many times their spread degrees are from 0, at least: a kilometre is a hundredth of one."""
-HIGHER = 50.0
-"""How many times their spread heights in metres spread, at least."""
+HIGHER, HIGHEST = 50.0, 1e6
+"""How many times their spread heights in metres spread, at least and at most: what is 10 m wide is
+1e-4 degrees wide."""
+ASKEW = 0.02
+"""Spread along one of longitude and latitude in that along the other, at least: of a straight track
+there is next to none."""
+FAR_FROM_ZERO = 5.0
+"""Degrees of longitude or of latitude, at least, but in the Gulf of Guinea."""
+UNITS = np.array([100.0, 1000.0])
+"""How many of them make another."""
+LIKELY = 1.5
+"""One spread in another times such a number, or less, for these to be of other units."""
+ALONG = 5.0
+"""The same of distances from where most are: they need not lie around the origin."""
 
 DARK = 16
 """Of 255, which a photograph's brightest pixel does not exceed that fills 12 of 16 bits."""
@@ -285,7 +297,7 @@ def _turned(camera: Camera) -> Camera:
 
 
 def _odd_places(scene: Scene) -> list[str]:
-    """Cameras that stand on their heads, or far away from all others."""
+    """Cameras that stand on their heads, far away from all others, or in other units."""
     odd = []
     pairs = zip(scene.views, upside_down(scene.cameras), strict=True)
     rolled = [view.name for view, turned in pairs if turned]
@@ -295,12 +307,20 @@ def _odd_places(scene: Scene) -> list[str]:
             f"{rolled[0]}), whose photographs were turned, or whose poses are in other axes"
         )
     places = np.array([camera.position for camera in scene.cameras])
-    far = far_off(scene.cameras) | _in_another_place(places)
+    far = far_off(scene.cameras)
     lost = [view.name for view, is_far in zip(scene.views, far, strict=True) if is_far]
     if lost:
         odd.append(
             f"far away from all others: {len(lost)} of {len(scene.views)} cameras (first: "
             f"{lost[0]}), which may be wrongly posed, or in other units"
+        )
+    scaled, times = _in_other_units(places)
+    others = [view.name for view, is_far in zip(scene.views, scaled & ~far, strict=True) if is_far]
+    if others:
+        odd.append(
+            f"cameras seem to be in other units: {len(others)} of {len(scene.views)} (first: "
+            f"{others[0]}) are about {times:.2g} times as far from each other as the others are; "
+            "bring all positions into the same units"
         )
     if _are_degrees(places if scene.offset is None else places + scene.offset):
         odd.append(
@@ -310,28 +330,46 @@ def _odd_places(scene: Scene) -> list[str]:
     return odd
 
 
-def _in_another_place(places: np.ndarray) -> np.ndarray:
-    """Which of the places [n, 3] are MANY_TIMES as far from where most are as all of these, [n]
-    bool; up to MOST_APART of them, where a median tells nothing."""
-    between = (
-        np.linalg.norm(places[:, None] - places, axis=2) if len(places) <= MOST_PLACES else None
-    )
-    if between is None or len(places) < ENOUGH_PLACES:
-        return np.zeros(len(places), bool)
+def _in_other_units(places: np.ndarray) -> tuple[np.ndarray, float]:
+    """Which of the places [n, 3], up to MOST_APART of them, where a median tells nothing, may be in
+    other units than the others, [n] bool, and how many of these make one of theirs.
+
+    They are MANY_TIMES as far from where most are as all of these, and about as many times as far
+    from each other, which places somewhere else are not.
+    """
+    nowhere = np.zeros(len(places), bool), 1.0
+    if not ENOUGH_PLACES <= len(places) <= MOST_PLACES:
+        return nowhere
+    between = np.linalg.norm(places[:, None] - places, axis=2)
     away = between[np.quantile(between, 1.0 - MOST_APART, axis=1).argmin()]
     order = np.sort(away)
     first = int((1.0 - MOST_APART) * len(order))
     gaps = order[first + 1 :] > MANY_TIMES * np.maximum(order[first:-1], 1e-300)
-    return away > order[first + int(gaps.argmax())] if gaps.any() else np.zeros(len(places), bool)
+    if not gaps.any():
+        return nowhere
+    far = away > order[first + int(gaps.argmax())]
+    times = _spread(places[far]) / max(_spread(places[~far]), 1e-300)
+    from_middle = np.linalg.norm(places - places[~far].mean(axis=0), axis=1)
+    further = np.median(from_middle[far]) / max(float(np.median(from_middle[~far])), 1e-300)
+    is_unit = np.abs(np.log(UNITS / max(times, 1e-300))).min() <= np.log(LIKELY)
+    return (far, times) if is_unit and times / ALONG <= further <= ALONG * times else nowhere
+
+
+def _spread(places: np.ndarray) -> float:
+    """Root mean square distance of places [n, 3] from their middle."""
+    return float(np.sqrt(places.var(axis=0).sum()))
 
 
 def _are_degrees(places: np.ndarray) -> bool:
     """Whether places [n, 3] are longitude and latitude, in either order, and height."""
-    if len(places) < ENOUGH_PLACES or np.abs(places[:, :2]).max() > 180.0:
+    level = np.abs(places[:, :2]).max(axis=0)
+    if len(places) < ENOUGH_PLACES or level.max() > 180.0 or level.min() > 90.0:
         return False
     across, up = np.ptp(places[:, :2], axis=0), float(np.ptp(places[:, 2]))
-    far = np.abs(np.median(places[:, :2], axis=0)).max() > FROM_ZERO * across.max()
-    return bool(far and up > HIGHER * across.max())
+    away = np.abs(np.median(places[:, :2], axis=0)).max()
+    far = away > max(FAR_FROM_ZERO, FROM_ZERO * across.max())
+    both = across.min() > ASKEW * across.max()
+    return bool(far and both and HIGHER * across.max() < up < HIGHEST * across.max())
 
 
 def _odd_lenses(scene: Scene) -> list[str]:

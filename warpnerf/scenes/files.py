@@ -11,7 +11,7 @@ import os
 import re
 import stat
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path, PureWindowsPath
 from typing import Any, TypeVar
 
@@ -284,19 +284,58 @@ def find_image(folder: Path, file_path: str, *, field: str) -> Path | None:
     return path
 
 
-def find_moved(folder: Path, file_path: str, *, field: str) -> Path | None:
-    """As ``find_image``; an absolute path, of another machine, may also be that of a file in the
-    folder from some part of it on."""
-    try:
-        return find_image(folder, file_path, field=field)
-    except OutsideError:
-        names = plain_name(file_path).split("/")
-        absolute = not names[0] or bool(PureWindowsPath(names[0]).drive)
-        for start in range(1, len(names) if absolute and ".." not in names else 0):
+class MovedFiles:
+    """Files that a key of a scene file names, also by absolute paths of another machine, some ends
+    of which are those of files in the folder; no two texts then name one file."""
+
+    def __init__(self, folder: Path, *, taken: Collection[Path] = (), alone: bool = False) -> None:
+        """Begin with none.
+
+        Args:
+            folder: The scene's.
+            taken: Files that an end must not lead to.
+            alone: Whether a name alone is end enough; else a folder of the path must be there, too.
+        """
+        self._folder = folder
+        self._taken = taken
+        self._least = 1 if alone else 2
+        self._texts: dict[Path, str] = {}
+
+    def find(self, text: str, *, field: str) -> Path | None:
+        """Find the file that a text names.
+
+        Args:
+            text: The path as the scene file has it.
+            field: File and field that it comes from, for the message.
+
+        Returns:
+            As ``find_image``.
+
+        Raises:
+            InputError: As ``find_image``.
+            OutsideError: The path leaves the folder, and no end of it is free to be taken.
+        """
+        try:
+            path = find_image(self._folder, text, field=field)
+        except OutsideError:
+            path = next(self._ends(text, field), None)
+            if path is None:
+                raise
+        if path is not None:
+            self._texts.setdefault(path, text)
+        return path
+
+    def _ends(self, text: str, field: str) -> Iterator[Path]:
+        """Files that ends of an absolute path lead to, the longest first."""
+        names = plain_name(text).split("/")
+        if ".." in names or not (not names[0] or PureWindowsPath(names[0]).drive):
+            return
+        for start in range(1, len(names) - self._least + 1):
             end = "/".join(names[start:])
-            if end and os.path.isfile(folder / end):  # noqa: PTH113, never raises
-                return resolve_inside(folder, end, field=field)
-        raise
+            if names[start] and os.path.isfile(self._folder / end):  # noqa: PTH113, never raises
+                path = resolve_inside(self._folder, end, field=field)
+                if path not in self._taken and self._texts.get(path, text) == text:
+                    yield path
 
 
 def photograph_folder(folder: Path) -> Path | None:

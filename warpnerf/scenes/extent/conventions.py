@@ -18,7 +18,13 @@ from warpnerf.scenes.cameras.focus import find_focus, upside_down
 from warpnerf.scenes.cameras.overlap import in_picture
 from warpnerf.scenes.cameras.quaternions import quaternions, rotations
 from warpnerf.scenes.extent.doubts import doubted_others, doubts, mirrored_photographs
-from warpnerf.scenes.extent.photo_consistency import ALMOST_ALL, PhotoConsistency
+from warpnerf.scenes.extent.photo_consistency import (
+    ALMOST_ALL,
+    CLEARLY,
+    NOTABLY,
+    Agreement,
+    PhotoConsistency,
+)
 from warpnerf.scenes.extent.points import Points
 from warpnerf.scenes.scene import View
 
@@ -110,6 +116,8 @@ TURNED = {
 
 PART = 3
 """Views of a part, at least, whose poses may be in other axes than those of the others."""
+NEARLY_EVERY = 0.9
+"""Share of the references of such a part that must fit once it is read otherwise."""
 FEW = 0.1
 """Share of cameras that may stand on their heads for the axes of all to be questioned."""
 MOST_PARTS = 8
@@ -179,8 +187,8 @@ def _parts_read(
 ) -> tuple[list[View], PhotoConsistency, list[str]]:
     """Poses of a part of the views read in other axes than the rest, where photographs prove it.
 
-    They are only where the rest fits as it stands, and that part does not, but fits the rest once
-    it is read otherwise.
+    They are only where the rest fits as it stands, and that part does not, but once it is read
+    otherwise fits the rest, nearly every view of it, and all fit.
 
     Returns:
         The views, the photographs posed as these, and a warning, if there is such a part.
@@ -199,9 +207,14 @@ def _parts_read(
         for name, read in READINGS.items():
             poses = photographs.poses.copy()
             poses[inside] = read(poses[inside])
-            other = given.posed(poses).agreement
-            if other.is_better(given.agreement):
-                gain = float(photographs.posed(poses).agreement.gain.mean())
+            then = photographs.posed(poses)
+            if (
+                _is_proved(given.agreement, given.posed(poses).agreement)
+                and _fit_all(then.of_views(rest).agreement)
+                and then.agreement.fits
+                and then.agreement.gain.mean() >= photographs.agreement.gain.mean() + CLEARLY
+            ):
+                gain = float(then.agreement.gain.mean())
                 best = max(best or (gain, name, part), (gain, name, part), key=lambda b: b[0])
     if best is None:
         return views, photographs, []
@@ -220,6 +233,17 @@ def _parts_read(
             "the same"
         ],
     )
+
+
+def _is_proved(given: Agreement, other: Agreement) -> bool:
+    """Whether references of a part, nearly every one, fit otherwise, and better than as given."""
+    each = (other.gain > NOTABLY) & (other.gain > given.gain)
+    return other.is_better(given) and bool(np.mean(each) >= NEARLY_EVERY)
+
+
+def _fit_all(agreement: Agreement) -> bool:
+    """Whether almost all references fit: more than where photographs fit as a whole."""
+    return agreement.fits and bool(np.mean(agreement.gain > NOTABLY) >= ALMOST_ALL)
 
 
 def _parts(views: Sequence[View], any_part: bool) -> list[frozenset[str]]:

@@ -157,10 +157,15 @@ def _zoomed(frames: Sequence[Frame]) -> list[str]:
         if len(group) < 2:
             continue
         some = group[:: max(1, -(-len(group) // LOOKED_AT))]
-        stated = [(exif_focal_length(frame.path), frame.name) for frame in some]
-        known = sorted((focal, name) for focal, name in stated if focal is not None)
-        if known and known[-1][0] > (1.0 + ZOOMED) * known[0][0]:
-            (least, near), (most, far) = known[0], known[-1]
+        kinds: dict[bool, list[tuple[float, str]]] = {}
+        for frame in some:
+            stated = exif_focal_length(frame.path)
+            if stated is not None:
+                focal, is_of_film = stated
+                kinds.setdefault(is_of_film, []).append((focal, frame.name))
+        several = [k for k in kinds.values() if max(k)[0] > (1.0 + ZOOMED) * min(k)[0]]
+        if several:
+            (least, near), (most, far) = min(several[0]), max(several[0])
             warnings.append(
                 f"photographs of several focal lengths by EXIF ({near} {least:.4g} mm, {far} "
                 f"{most:.4g} mm) have one lens in {group[0].lens.file.name}: estimate one for each "

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,7 +24,7 @@ from warpnerf.scenes.cameras.poses import check_pose
 from warpnerf.scenes.extent.points import Points, usable
 from warpnerf.scenes.files import (
     REDUCED,
-    find_moved,
+    MovedFiles,
     plain_name,
     printable,
     read_json,
@@ -50,6 +50,8 @@ IGNORED = {
     "rolling_shutter": "each image is taken at one instant",
 }
 """Keys that would change the picture, and what happens without them."""
+OF_FRAMES = ("mask_path", "depth_file_path", "depth_path")
+"""Keys of frames that name files besides the photograph."""
 
 
 class PictureKeys(LensFields):
@@ -181,7 +183,7 @@ def _points(file: Path, data: TransformsFile, frames: Sequence[Frame]) -> tuple[
     beside, why_not = points_beside(file.parent, frames, _applied(data))
     if ply_file_path is None or (beside is not None and beside.tracks is not None):
         return beside, why_not
-    path = find_moved(file.parent, ply_file_path, field=f"{file}: $.ply_file_path")
+    path = MovedFiles(file.parent, alone=True).find(ply_file_path, field=f"{file}: $.ply_file_path")
     if path is None:
         return None, f"{file.name}: ply_file_path {printable(ply_file_path)} is not there"
     positions = read_ply(path)
@@ -232,17 +234,17 @@ def read_frames(
             "above 0."
         )
     frames = []
-    lost: dict[str, list[str]] = {"mask_path": [], "depth_file_path": [], "depth_path": []}
+    named = {key: _Named(file, key, found.values()) for key in OF_FRAMES}
     for index, path in found.items():
         entry = data.frames[index]
         place = f"$.frames[{index}]"
-        mask = _named_file(file, place, "mask_path", entry.mask_path, lost)
+        mask = named["mask_path"].find(place, entry.mask_path)
         if mask is None and not entry.mask_path:
-            mask = _named_file(file, "$", "mask_path", data.mask_path, lost)
-        depth = _named_file(file, place, "depth_file_path", entry.depth_file_path, lost)
+            mask = named["mask_path"].find("$", data.mask_path)
+        depth = named["depth_file_path"].find(place, entry.depth_file_path)
         depth_unit = unit
         if ngp_depth and not entry.depth_file_path:
-            depth = _named_file(file, place, "depth_path", entry.depth_path, lost)
+            depth = named["depth_path"].find(place, entry.depth_path)
             depth_unit = unit_of_ngp
         lens = read_lens(file, [(place, entry), ("$", data)])
         if index in moved:
@@ -260,11 +262,11 @@ def read_frames(
             )
         )
     warnings += elsewhere_warnings(file, frames)
-    for key, names in lost.items():
-        if names:
+    for key, of_key in named.items():
+        if of_key.lost:
             warnings.append(
-                f"{file.name}: the {key} of {len(names)} of {len(data.frames)} frames leads to no "
-                f"file (first: {names[0]})"
+                f"{file.name}: the {key} of {len(of_key.lost)} of {len(data.frames)} frames leads "
+                f"to no file (first: {of_key.lost[0]})"
             )
     for key, consequence in IGNORED.items():
         if any(_is_set(getattr(level, key)) for level in (data, *data.frames)):
@@ -287,16 +289,23 @@ def _require_size(file: Path, place: str, lens: Lens, path: Path) -> None:
         )
 
 
-def _named_file(
-    file: Path, place: str, key: str, text: str | None, lost: dict[str, list[str]]
-) -> Path | None:
-    """The file that a key names, if it does; one that is not there is added to the lost ones."""
-    if not text:
-        return None
-    path = find_moved(file.parent, text, field=f"{file}: {place}.{key}")
-    if path is None:
-        lost[key].append(text)
-    return path
+class _Named:
+    """Files that a key of frames names."""
+
+    def __init__(self, file: Path, key: str, photographs: Iterable[Path]) -> None:
+        self._field, self._key = f"{file}: ", key
+        self._files = MovedFiles(file.parent, taken=set(photographs))
+        self.lost: list[str] = []
+        """Those that are not there, as the file has them."""
+
+    def find(self, place: str, text: str | None) -> Path | None:
+        """That of a place in the file, if it names one that is there."""
+        if not text:
+            return None
+        path = self._files.find(text, field=f"{self._field}{place}.{self._key}")
+        if path is None:
+            self.lost.append(text)
+        return path
 
 
 def _listed_names(
@@ -313,14 +322,14 @@ def _listed_names(
     """
     members: set[str] = set()
     absent: list[str] = []
-    ends = _ends(names)
+    ends, moved = _ends(names), MovedFiles(folder)
     for index, text in enumerate(listed):
         name = names.get(text)
         if name is None:
             called = ends.get(plain_name(text), set())
             name = min(called) if len(called) == 1 else None
         if name is None:
-            path = find_moved(folder, text, field=f"{file}: $.{split}_filenames[{index}]")
+            path = moved.find(text, field=f"{file}: $.{split}_filenames[{index}]")
             name = names.get(path.relative_to(folder).as_posix()) if path else None
         if name is None:
             absent.append(text)

@@ -39,6 +39,8 @@ def unnamed_photographs(
     """
     there: list[Path] = []
     for place in {path.parent for path in used}:  # others hold masks or thumbnails
+        if place != root and root not in place.parents:  # only masks and depth maps
+            continue
         there += without_masks([path for path in files_in(place) if is_photograph(path.name)])
     what = f"in {printable(root.absolute().name)} are not in {named_by}"
     return photographs_left(there, used, root, what)

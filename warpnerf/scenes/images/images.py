@@ -117,15 +117,18 @@ def read_exif(path: Path, look: Callable[[Image.Exif], T]) -> T | None:
         return None
 
 
-def exif_focal_length(path: Path) -> float | None:
-    """The focal length that a photograph's EXIF states, millimetres; for film 36 mm wide where it
-    says that, which a digital zoom changes as well. None where it says none."""
+def exif_focal_length(path: Path) -> tuple[float, bool] | None:
+    """The focal length that a photograph's EXIF states, in millimetres, and whether it is that for
+    film 36 mm wide, which a digital zoom changes as well; else it is the lens's own.
 
-    def look(exif: Image.Exif) -> float | None:
+    None where it says none.
+    """
+
+    def look(exif: Image.Exif) -> tuple[float, bool] | None:
         details = exif.get_ifd(ExifTags.IFD.Exif)
         names = (ExifTags.Base.FocalLengthIn35mmFilm, ExifTags.Base.FocalLength)
-        stated = (float(details.get(name) or 0.0) for name in names)
-        return next((value for value in stated if 0.0 < value < math.inf), None)
+        stated = ((float(details.get(name) or 0.0), name is names[0]) for name in names)
+        return next((of for of in stated if 0.0 < of[0] < math.inf), None)
 
     return read_exif(path, look)
 

@@ -17,10 +17,16 @@ MOST_PIXELS = 2**20
 PLAIN = 0.005
 """Share of the pixels, equal to those above and to the left, from which on a value is one of the
 mask's, and not of the soft edge between two."""
+FLAT = 0.5
+"""Share of the pixels that are neither black nor white which must have such values: else these are
+of a wide soft edge."""
 SHADES = 64
 """Colours of a photograph, at least, and more than a mask has but at its edges."""
 BETWEEN = 0.5
 """Share of the pixels that must be neither black nor white for an image to be no mask."""
+COLOURED = 0.05
+"""Share of the pixels whose channels must differ by more than NEARLY for that: a gray image may be
+a matte with a wide soft edge."""
 NEARLY = 8
 """Of 255, by which black and white may be off."""
 
@@ -38,10 +44,11 @@ def other_values(masks: Sequence[Mask]) -> list[str]:
         if mask.path.suffix.lower() in LOSSY or not mask.white_counts:
             continue
         try:
-            plain, shades, between = _values(read_image(mask.path))
+            image = read_image(mask.path)
         except InputError:
             continue
-        if shades >= SHADES and between > BETWEEN:
+        plain, shades, between = _values(image)
+        if shades >= SHADES and between > BETWEEN and _coloured(image) > COLOURED:
             return [
                 f"masks look like photographs: {mask.path.name} holds {shades} colours or more, of "
                 "which what is brighter than half counts; name a folder of masks, white where "
@@ -71,9 +78,17 @@ def _values(image: np.ndarray) -> tuple[set[int], int, float]:
         )
     )
     values, counts = np.unique(at[(at == above) & (at == before)], return_counts=True)
-    between = np.mean((at > 0) & (at < 0xFFFFFF)) if at.size else 0.0
+    between = (at > 0) & (at < 0xFFFFFF)
     plain = values[counts >= PLAIN * at.size]
-    return set(plain.tolist()), len(np.unique(at)), float(between)
+    if np.isin(at[between], plain).sum() < FLAT * between.sum():
+        plain = plain[(plain == 0) | (plain == 0xFFFFFF)]
+    return set(plain.tolist()), len(np.unique(at)), float(between.mean()) if at.size else 0.0
+
+
+def _coloured(image: np.ndarray) -> float:
+    """Share of the pixels of an image [H, W, 3 or 4] that are not gray."""
+    rgb = image[..., :3].astype(np.int16)
+    return float(np.mean(np.ptp(rgb, axis=2) > NEARLY))
 
 
 def _numbers(image: np.ndarray) -> np.ndarray:
