@@ -314,7 +314,7 @@ def in_two_places(
     [
         (0.03, 0.03, 3.0),  # by hand
         (0.03, 0.03, 3.0, True),  # of a panorama's faces
-        (0.01, 0.4, 0.15),  # near a thing, and around it
+        (0.005, 0.25, 0.02),  # near a thing, and around it
         (0.003, 0.3, 30.0),
         (3.0, 3.0, 30.0),  # two rooms
     ],
