@@ -66,7 +66,8 @@ def training_kernels(
     decaying = [adam.adam_kernel(model.n_floats, decays=True), near_decay.find_near_decay]
     return [
         assembly.render_train_kernel(variant),  # takes longest, so it is compiled first
-        camera.sample_pixels,  # and pick_pixels
+        camera.pick_pixels,
+        camera.sample_pixels,
         *class_of(stored).kernels(stored, model),
         *(decaying if decays else []),
         *([exposure.add_moments] if exposes else []),
