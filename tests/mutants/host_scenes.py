@@ -91,8 +91,8 @@ UNFIT = "scenes/test_doubts.py::test_photographs_of_which_some_do_not_fit_are_co
 TESTING = "scenes/test_doubts.py::test_photographs_for_testing_are_looked_at_as_well"
 MIRROR = "scenes/test_doubts.py::test_mirrored_photographs_are_named"
 MATTES = "scenes/test_class_masks.py::test_mattes_with_wide_soft_edges_are_no_photographs"
-TRACKS = "inspection/test_inspection.py::test_straight_tracks_are_no_degrees"
-TWO_PLACES = "inspection/test_inspection.py::test_two_places_are_in_the_same_units"
+TRACKS = "inspection/test_places.py::test_straight_tracks_are_no_degrees"
+TWO_PLACES = "inspection/test_places.py::test_two_places_are_in_the_same_units"
 OF_ANOTHER = "scenes/test_transforms.py::test_files_of_another_machine_are_none_of_another_path"
 
 MUTANTS = [
