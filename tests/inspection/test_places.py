@@ -65,7 +65,7 @@ def in_two_places(
     ],
 )
 def test_two_places_are_in_the_same_units(tmp_path: Path, places: tuple[float, ...]) -> None:
-    """They were far away from all others."""
+    """Neither is far away from all others."""
     said = in_two_places(tmp_path, *places[:3], is_point=len(places) > 3)
     assert "far away" not in said and "units" not in said
 

@@ -93,6 +93,14 @@ class Module:
     def unload(self) -> None: ...
 
 
+def use_cache(folder: Path, monkeypatch: pytest.MonkeyPatch, *, own: bool) -> None:
+    """Have kernels in a folder, in a process that is the command's own, or is not."""
+    kernel_cache.start()
+    monkeypatch.setattr(process, "_own", own)
+    monkeypatch.setattr(kernel_cache, "_temporary", None)  # and afterwards what it was
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(folder))
+
+
 def test_compiling_is_announced_once_and_reading_is_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -154,10 +162,7 @@ def test_a_library_says_what_is_wrong_with_the_cache(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And uses it again once it is mended."""
-    kernel_cache.start()
-    monkeypatch.setattr(process, "_own", False)
-    monkeypatch.setattr(kernel_cache, "_temporary", None)
-    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    use_cache(tmp_path, monkeypatch, own=False)
     kernel, cpu = SimpleNamespace(module=Module(tmp_path / "a")), wp.get_device("cpu")
     kernel_cache.load(kernel, cpu)
     (tmp_path / "a" / "a.cpu0.o").write_text("damaged")
@@ -199,10 +204,7 @@ class ForgetfulModule(Module):
 def test_a_library_loads_once_the_cause_is_gone(
     error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    kernel_cache.start()
-    monkeypatch.setattr(process, "_own", False)
-    monkeypatch.setattr(kernel_cache, "_temporary", None)
-    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    use_cache(tmp_path, monkeypatch, own=False)
     module, cpu = ForgetfulModule(tmp_path / "a"), wp.get_device("cpu")
     module.error = error
     for _ in range(2):
@@ -243,10 +245,7 @@ def test_threads_leave_a_damaged_cache_together(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each finds its module damaged; one of them chooses where all compile from then on."""
-    kernel_cache.start()
-    monkeypatch.setattr(kernel_cache, "_temporary", None)
-    monkeypatch.setattr(process, "_own", True)
-    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    use_cache(tmp_path, monkeypatch, own=True)
     meeting, tried, caches = threading.Barrier(2, timeout=60.0), [], []
 
     def load(module: Module, device: object) -> None:
