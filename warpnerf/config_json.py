@@ -36,10 +36,10 @@ def config_from_json(tree: dict[str, Any]) -> dict[str, Any]:
     """What to decode as a TrainConfig: fields of later versions are as what was there before them.
 
     Where no model is named, there was only one, rgb, and all rays were drawn; where no losses are,
-    there was the squared error alone; where no appearance is, photographs were taken as they are;
-    where no settle_at is, nothing settled; where no sampler is, rays were marched; where no box is,
-    it was the scene's. Options that did nothing beside the others are left out: they are refused
-    now.
+    there was the squared error alone; where no appearance or average_pixels is, photographs were
+    taken as they are; where no settle_at is, nothing settled; where no sampler is, rays were
+    marched; where no box is, it was the scene's. Options that did nothing beside the others are
+    left out: they are refused now.
     """
     if isinstance(grid := tree.get("grid"), dict):
         tree = tree | {"grid": {"box": "scene"} | grid}
@@ -48,6 +48,7 @@ def config_from_json(tree: dict[str, Any]) -> dict[str, Any]:
         "sampler": {"name": "march"},
         "skip_empty_rays": False,
         "appearance": "none",
+        "average_pixels": False,
         "settle_at": None,
         "loss": {},
     }

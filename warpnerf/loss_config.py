@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from warpnerf.checked import checked
@@ -35,6 +36,9 @@ class LossConfig:
     distortion: float = 0.0
     """Weight of the distortion loss: density concentrates along a ray. Distances count as
     t / (D + t), with D the content distance in use; with auto and per-camera, the scene's."""
+    distortion_rise: float = 1.0
+    """How many times its weight of the start distortion has at the end; halfway it has the weight
+    that is configured, and it rises at an even rate, in a hundred steps. 1: it stays the same."""
     entropy: float = 0.0
     """Weight of the entropy of the remaining light: a ray ends at something opaque, or meets
     nothing."""
@@ -61,6 +65,7 @@ class LossConfig:
         for name in (*WEIGHTS_OF_LOSSES, "near_clip_distance"):
             if name != "opacity" or self.opacity != "auto":
                 require_at_least(f"loss.{name}", getattr(self, name), 0.0)
+        require_positive("loss.distortion_rise", self.distortion_rise)
         if self.photometric != "huber" and self.huber_delta != HUBER_DELTA:
             raise InputError(
                 f"loss.huber_delta is {self.huber_delta:g}, but loss.photometric is squared; set "
@@ -77,6 +82,20 @@ class LossConfig:
                 "densities are pushed down; give both, or leave near_clip at 0."
             )
 
+    def at(self, fraction: float) -> LossConfig:
+        """The weights when so much of a training is done.
+
+        Args:
+            fraction: Of it, [0, 1].
+
+        Returns:
+            The same, with what changes as it is then, and staying so.
+        """
+        if self.distortion_rise == 1.0:
+            return self
+        weight = self.distortion * self.distortion_rise ** (math.floor(100 * fraction) / 100 - 0.5)
+        return replace(self, distortion=weight, distortion_rise=1.0)
+
     @property
     def kinds(self) -> tuple[str, ...]:
         """Which loss terms there are besides the squared error; kernels are compiled for them."""
@@ -84,7 +103,7 @@ class LossConfig:
         return huber + tuple(name for name in WEIGHTS_OF_LOSSES if getattr(self, name) != 0.0)
 
 
-USUAL_LOSSES = LossConfig(distortion=0.01, entropy=1e-3, opacity="auto")
+USUAL_LOSSES = LossConfig(distortion=0.03, distortion_rise=100.0, entropy=1e-3, opacity="auto")
 """What trainings minimise by default. Without the entropy of remaining light, colours of an MLP
 make up for walls that stay soft; without opacity, the background makes up for what is as dark as
 it."""

@@ -95,6 +95,7 @@ _FAST = TrainConfig()
 
 _DVGO = TrainConfig(
     appearance="none",
+    average_pixels=False,
     settle_at=None,
     sampler=MARCHED,
     steps=20_000,
@@ -210,6 +211,7 @@ _PRESETS = {
     ),
     "ngp": TrainConfig(
         appearance="none",
+        average_pixels=False,
         settle_at=None,
         sampler=MARCHED,
         steps=35_000,
@@ -237,6 +239,7 @@ _PRESETS = {
     ),
     "mip360": TrainConfig(
         appearance="none",
+        average_pixels=False,
         settle_at=None,
         steps=25_000,
         model=PerSample(

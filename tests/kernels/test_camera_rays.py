@@ -73,7 +73,7 @@ def view(kernels: Kernels, c2w: Any, lens: dict[str, float], **changes: Any) -> 
     view.tangential = types.vec2(lens.get("p1", 0.0), lens.get("p2", 0.0))
     view.divisor = types.vec3(*(lens.get(k, 0.0) for k in ("k4", "k5", "k6")))
     view.rational = int(any(lens.get(k) for k in ("k4", "k5", "k6")))
-    view.width = WIDTH
+    view.width, view.height = WIDTH, HEIGHT
     view.first_pixel = 0
     for name, value in changes.items():
         setattr(view, name, value)
@@ -345,6 +345,66 @@ def test_exposures_are_taken_out_of_pixels_before_their_background(kernels64: Ke
     np.testing.assert_array_equal(which.numpy(), np.array([0, 1, -1])[number])
 
 
+def mean_over_square(image: Any, edge: float) -> Any:
+    """Of each pixel: the integral of the photograph over a square around its middle, by its area.
+
+    Summed over a fine raster; edges that are multiples of a quarter pixel are exact.
+    """
+    fine = 8
+    pad = 4
+    padded = np.pad(image, [(pad, pad), (pad, pad), (0, 0)], mode="edge")
+    fine_image = padded.repeat(fine, axis=0).repeat(fine, axis=1)
+    half = round(edge * fine / 2)
+    found = np.zeros_like(image)
+    for row, column in np.ndindex(*image.shape[:2]):
+        y, x = (int((at + pad + 0.5) * fine) for at in (row, column))
+        square = fine_image[y - half : y + half, x - half : x + half]
+        found[row, column] = square.mean(axis=(0, 1))
+    return found
+
+
+@pytest.mark.parametrize("edge", [0.0, 1.0, 1.5, 2.0, 2.75, 3.0, 4.0])
+def test_pixels_are_averaged_over_a_square(kernels64: Kernels, edge: float) -> None:
+    """By their alpha, with exposures taken out; but not where there is a mask."""
+    n, vec3, rng = 3 * WIDTH * HEIGHT, kernels64.types.vec3, np.random.default_rng(4)
+    images = [
+        rng.integers(0, 256, (HEIGHT, WIDTH, 3 + (k == 1))).astype(np.uint8) for k in range(3)
+    ]
+    images[1][..., 3] = np.where(rng.random((HEIGHT, WIDTH)) < 0.7, 255, images[1][..., 3])
+    images[1][:20, :20, 3] = 255
+    photographs = [
+        wp.array(image.ravel(), dtype=wp.uint8, device=kernels64.device) for image in images
+    ]
+    views = [
+        view(kernels64, pose(k), {}, pixels=pixels, channels=3 + (k == 1), first_pixel=k * 4800)
+        for k, pixels in enumerate(photographs)
+    ]
+    runs = wp.array([[0, 0]], dtype=wp.vec2i, device=kernels64.device)  # all of them in one
+    views[2].runs = runs
+    source = source_of(kernels64, views)
+    source.average = edge
+    gains, offsets = 0.5 + np.arange(9.0).reshape(3, 3), 0.01 * np.arange(9.0).reshape(3, 3)
+    source.gains, source.offsets = kernels64.array(gains, vec3), kernels64.array(offsets, vec3)
+    which = wp.zeros(n, dtype=wp.int32, device=kernels64.device)
+    behind = np.array([0.3, 0.6, 0.9])
+    rays, target = launch_draw(kernels64, n, source, 7, behind, which=which)
+    number = np.searchsorted([2.0, 3.0, 5.0], rays.content_distance.numpy())
+    directions = rays.directions.numpy()
+    for k, image in enumerate(images):
+        alpha = image[..., 3:] / 255.0 if k == 1 else np.ones((HEIGHT, WIDTH, 1))
+        seen = np.dstack([alpha * (image[..., :3] / 255.0 - offsets[k]) / gains[k], alpha])
+        mean = mean_over_square(seen, 1.0 if k == 2 else max(edge, 1.0))
+        expected = (mean[..., :3] + (1.0 - mean[..., 3:]) * behind).reshape(-1, 3)
+        through = expected_rays(pose(k), {})[1].reshape(-1, 3)
+        of_view = np.flatnonzero(number == k)
+        pixel = np.array([(through @ directions[i]).argmax() for i in of_view])
+        assert np.array_equal(np.sort(pixel), np.arange(WIDTH * HEIGHT))
+        np.testing.assert_allclose(target.numpy()[of_view], expected[pixel], rtol=0, atol=1e-9)
+        opaque = mean[..., 3].ravel()[pixel] > 0.999
+        assert opaque.mean() > 0.05 if k == 1 else opaque.all()
+        assert np.array_equal(which.numpy()[of_view], np.where(opaque, k, -1))
+
+
 def test_all_pixels_are_drawn_before_any_is_again(kernels64: Kernels) -> None:
     """In an order of their own each time, in which near ones are far apart."""
     n = 3 * WIDTH * HEIGHT
@@ -388,7 +448,7 @@ def test_pixels_beyond_32_bits_are_drawn_evenly(kernels32: Kernels) -> None:
     views = []
     for number in range(3):
         place = {"first_pixel": number * pixels, "channels": 0, "pixels": black}
-        views.append(view(kernels32, pose(number), {}, width=2**16, **place))
+        views.append(view(kernels32, pose(number), {}, width=2**16, height=2**15, **place))
     rays, _target = launch_draw(kernels32, n, source_of(kernels32, views, pixels), 7)
     number = np.searchsorted([2.0, 3.0, 5.0], rays.content_distance.numpy())
     assert (np.abs(np.bincount(number, minlength=3) - n / 3) < 300).all()

@@ -17,6 +17,7 @@ from tests.support.tiny_trainings import ball
 from warpnerf.cli import train
 from warpnerf.config import LossConfig
 from warpnerf.config_json import config_from_json, config_to_json, decode
+from warpnerf.loss_config import USUAL_LOSSES
 from warpnerf.model.models import PerSample, model_of
 from warpnerf.model.sampler_kinds import Resampled
 from warpnerf.model.storage_kinds import Hash, Vm
@@ -83,13 +84,18 @@ def test_there_is_one_default() -> None:
     assert wn.TrainConfig() == PRESETS["fast"] == wn.TrainConfig(model="deferred")
     assert wn.Deferred() == model_of("deferred") == PRESETS["quality"].model
     assert wn.Deferred() == wn.Deferred(specular=12, width=64)
-    assert PRESETS["fast"].loss == wn.LossConfig(distortion=0.01, entropy=1e-3, opacity="auto")
+    assert PRESETS["fast"].loss == USUAL_LOSSES and PRESETS["fast"].average_pixels
 
 
 def test_what_older_files_leave_out_is_what_was_the_default_then() -> None:
     tree = json.loads(json.dumps(config_to_json(wn.TrainConfig())))
-    del tree["loss"], tree["model"]["specular"], tree["model"]["width"]
-    then = replace(PRESETS["fast"], loss=wn.LossConfig(), model=wn.Deferred(specular=4, width=32))
+    del tree["loss"], tree["average_pixels"], tree["model"]["specular"], tree["model"]["width"]
+    then = replace(
+        PRESETS["fast"],
+        loss=wn.LossConfig(),
+        average_pixels=False,
+        model=wn.Deferred(specular=4, width=32),
+    )
     assert msgspec.convert(config_from_json(tree), wn.TrainConfig, dec_hook=decode) == then
     tree["loss"] = {"distortion": 0.02}
     found = msgspec.convert(config_from_json(tree), wn.TrainConfig, dec_hook=decode)
@@ -106,6 +112,7 @@ def test_there_are_those_of_others_and_the_everyday_ones() -> None:
     assert set(PRESETS) == {*DEFAULT_PRESETS, *PUBLISHED, "tensorf", "ngp", "mip360"}
     for name, preset in PRESETS.items():  # published figures are of photographs as they are
         assert preset.appearance == ("auto" if name in DEFAULT_PRESETS else "none")
+        assert preset.average_pixels == (name in DEFAULT_PRESETS)
 
 
 PUBLISHED: dict[str, dict[str, Any]] = {
@@ -225,7 +232,11 @@ def test_those_of_dvgo_are_what_is_published(name: str) -> None:
 def test_losses_and_rates_of_the_everyday_ones_are_those_that_were_chosen() -> None:
     """By docs/decisions/presets.md and losses.md, which have no figures of others."""
     fast, quality = (PRESETS[name] for name in DEFAULT_PRESETS)
-    assert fast.loss == quality.loss == LossConfig(distortion=0.01, entropy=0.001, opacity="auto")
+    assert fast.loss == quality.loss == USUAL_LOSSES
+    assert (
+        LossConfig(distortion=0.03, distortion_rise=100.0, entropy=0.001, opacity="auto")
+        == USUAL_LOSSES
+    )
     assert replace(quality.optim, decay=fast.optim.decay) == fast.optim
     assert (fast.optim.decay, quality.optim.decay) == (0.07, 0.03)
     optim = fast.optim

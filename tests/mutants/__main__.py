@@ -27,6 +27,7 @@ import blocks
 import factors
 import hashed
 import heads
+import host_coarse_to_fine
 import host_command
 import host_exports
 import host_folders
@@ -73,6 +74,7 @@ MUTANTS = (
     *host_measures.MUTANTS,
     *host_operations.MUTANTS,
     *host_runs.MUTANTS,
+    *host_coarse_to_fine.MUTANTS,
     *host_command.MUTANTS,
     *host_exports.MUTANTS,
 )

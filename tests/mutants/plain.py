@@ -336,6 +336,6 @@ MUTANTS = [
            "draw.rays_before + wp.int64(pick)", "draw.rays_before + wp.int64(i)", RAYS),
     Mutant("camera: blue is alpha", "space/camera.py", "pixels[at + 3]", "pixels[at + 2]", CAMERA),
     Mutant("camera: alpha twice", "space/camera.py",
-           "alpha * rgb + (real(1.0) - alpha) * behind",
-           "alpha * (alpha * rgb) + (real(1.0) - alpha) * behind", CAMERA),
+           "= rgb + (real(1.0) - alpha) * behind",
+           "= alpha * rgb + (real(1.0) - alpha) * behind", CAMERA),
 ]  # fmt: skip

@@ -125,6 +125,16 @@ def test_a_mask_of_all_pixels_changes_no_bit(device: str) -> None:
         assert np.array_equal(found, other[name])
 
 
+def test_averages_are_of_pixels_from_now_on_and_until_one(device: str) -> None:
+    one, other = sampler(device), sampler(device)
+    other.average_over(2.5)
+    single, mean = drawn(one.draw(3)), drawn(other.draw(3))
+    for name, found in single.items():
+        assert np.array_equal(found, mean[name]) == (name != "target_rgb")
+    other.average_over(1.0)
+    assert np.array_equal(drawn(other.draw(3))["target_rgb"], single["target_rgb"])
+
+
 MIDDLE = np.array([14, 10, 7])
 """Of the cells that are occupied, which each view sees elsewhere."""
 

@@ -99,7 +99,7 @@ def view_struct(camera: Camera) -> kernels.CameraParams:
     elif camera.rational:
         view.rational = 1
         view.divisor = vec3(camera.k4, camera.k5, camera.k6)
-    view.width = camera.width
+    view.width, view.height = camera.width, camera.height
     return view
 
 
@@ -168,6 +168,7 @@ class PixelSampler:
         self._source = source = kernels.PixelSource()
         source.views = wp.array(self._structs, dtype=kernels.CameraParams, device=workers.device)
         source.n_pixels = self._n_pixels
+        source.average = 1.0
         source.content_distances = wp.array(content_distances, dtype=real, device=workers.device)
         self._draw_anywhere()
         self._launches = LaunchCache()
@@ -205,6 +206,16 @@ class PixelSampler:
             offsets: [n_views] vec3, likewise.
         """
         self._source.gains, self._source.offsets = gains, offsets
+
+    def average_over(self, edge: float) -> None:
+        """From now on draw in place of a pixel the mean over a square around its middle.
+
+        Photographs that have masks are taken as they are.
+
+        Args:
+            edge: Of the square, pixels; 1: the pixel itself.
+        """
+        self._source.average = edge
 
     def cull_background(self, lattice: Lattice, free: FreeCells) -> float:
         """From now on draw no pixels whose rays, and those of all around them, meet nothing.

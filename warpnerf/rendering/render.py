@@ -15,7 +15,7 @@ from warpnerf.fields.occupancy import FreeCells
 from warpnerf.fields.storage import Storage
 from warpnerf.model.interface import Model
 from warpnerf.rendering.adjoint import AdjointLaunch
-from warpnerf.rendering.losses import PHOTOMETRIC_ONLY, Objective
+from warpnerf.rendering.losses import PHOTOMETRIC_ONLY, Objective, loss_struct
 from warpnerf.rendering.proposal import Intervals
 from warpnerf.rendering.rays import RayBatch, rays_struct
 from warpnerf.rendering.steps import Steps
@@ -203,6 +203,7 @@ class TrainingPass:
             objective=objective,
             stored=storage.kind,
         )
+        self._model, self._objective = model, objective
         self.n_rays = n_rays
         """Rays of the last run; before the first, those that there is room for."""
         self._outputs = outputs = train_outputs(n_rays, "float32", workers)
@@ -216,6 +217,16 @@ class TrainingPass:
         """Visited steps of each of these, then room."""
         self.gradients = storage.gradients(model, workers)
         """What batches have accumulated since the last update."""
+
+    def minimise(self, objective: Objective) -> None:
+        """From now on weigh losses as this one does.
+
+        Args:
+            objective: Which has the same losses as the one before.
+        """
+        if objective != self._objective:
+            self._scene.loss = loss_struct(self._model, "float32", objective)
+            self._objective = objective
 
     def run(self, free: FreeCells, batch: RayBatch, n_batches: int = 1, share: float = 1.0) -> None:
         """Add the gradient of a batch to ``gradients``, or of several put together.

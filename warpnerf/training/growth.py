@@ -29,6 +29,26 @@ def require_room(plan: TrainingPlan, device: wp.Device) -> None:
     require_memory(config.field, _model(config), plan.stages[-1].size, device, of_rays)
 
 
+MOST_AVERAGED = 4.0
+"""Edge of the largest square that pixels are averaged over."""
+
+
+def averaged_over(plan: TrainingPlan, grown: int) -> float:
+    """The edge of the square that pixels are averaged over, 1 to MOST_AVERAGED pixels.
+
+    What is finer than a grid's voxels is noise to it. Those of the final grid are about as wide as
+    pixels.
+
+    Args:
+        plan: Of the training.
+        grown: How often the grid has grown.
+    """
+    if not plan.config.average_pixels:
+        return 1.0
+    edge = (plan.stages[-1].nodes / plan.stages[grown].nodes) ** (1.0 / 3.0)
+    return min(edge, MOST_AVERAGED)
+
+
 def trained_on(scene: Scene, plan: TrainingPlan) -> TrainedOn:
     """What the regularisation of each grid may know of a training.
 

@@ -29,6 +29,7 @@ from warpnerf.training.exposure import STATE, Exposures, exposures_of
 from warpnerf.training.extent import march_steps, require_samples
 from warpnerf.training.free_space import SampledSpace, has_settled, occupied_box, pixel_sampler
 from warpnerf.training.growth import (
+    averaged_over,
     first_storage,
     grown_states,
     grown_storage,
@@ -132,6 +133,7 @@ class Trainer:
             free = FreeCells.none(self.workers)
         else:
             free = self._restore(resume)
+        self._sampler.average_over(averaged_over(plan, self._grown))
         settled = resume is not None and has_settled(resume)
         self._space = SampledSpace(config, self._sampler, free, settled, self.workers)
         self.exposures: Exposures | None = None
@@ -237,6 +239,7 @@ class Trainer:
             self._look_for_free_space()
         before = self.steps_done
         n_steps = min(self.schedule.steps_an_update(fraction), self.config.steps - before)
+        self._pass.minimise(self._objective(fraction))
         self._differentiate(self._draw(n_steps), n_steps)
         self._add_gradients()
         self._regularise(fraction, n_steps)
@@ -410,8 +413,13 @@ class Trainer:
             self.config.scaling,
             self.config.jacobian,
             self.workers,
-            Objective(config=self.plan.losses, content_distance=self.plan.content_distance),
+            self._objective(self.fraction),
         )
+
+    def _objective(self, fraction: float) -> Objective:
+        """What is minimised when so much of the training is done."""
+        losses = self.plan.losses.at(fraction)
+        return Objective(config=losses, content_distance=self.plan.content_distance)
 
     def _drop_pass(self) -> None:
         """What holds its arrays gives their memory back before more is requested."""
@@ -445,6 +453,7 @@ class Trainer:
             )
         self.storage = storage
         self._grown = grown
+        self._sampler.average_over(averaged_over(self.plan, grown))
         if restarts:
             self.optimiser = first_states(self.parameters(), self.workers)
             self._restarted = self._updates

@@ -39,6 +39,7 @@ class CameraParams:
     k4: real  # of a fisheye lens
     angle_max: real  # of a fisheye lens: up to where the distorted angle rises, radians
     width: int  # pixels
+    height: int  # pixels
     first_pixel: wp.int64  # how many pixels count in the views before
     channels: int  # bytes of a pixel: 3, or 4 with straight alpha
     pixels: wp.array(dtype=wp.uint8)  # [H * W * channels]; empty where only rays are requested
@@ -54,6 +55,7 @@ class PixelSource:
     content_distances: wp.array(dtype=real)  # [n_views] scene units
     gains: wp.array(dtype=vec3)  # [n_views] of their exposures; empty: pixels are as they are
     offsets: wp.array(dtype=vec3)  # [n_views] likewise
+    average: real  # edge of the square that the mean is taken over, pixels; up to 1: none is
     block: int  # edge of a block of pixels
     first_blocks: wp.array(dtype=int)  # [n_views] how many the views before have
     covered: wp.array(dtype=wp.uint8)  # [n_blocks] 0: nothing is drawn there; empty: draw anywhere
@@ -322,6 +324,43 @@ def pick_pixels(
             out_views[i] = -1 - v
 
 
+@wp.func
+def averaged(view: CameraParams, column: int, row: int, edge: real):
+    """The mean of a photograph over a square around the middle of a pixel: alpha * rgb, and alpha.
+
+    Pixels count by how much of them lies in the square. Beyond the photograph's edges there are
+    copies of the pixels along these. Where there is a mask, a pixel stands for itself: none takes
+    in what is masked.
+    """
+    edge = wp.where(view.runs.shape[0] > 0, real(1.0), wp.max(edge, real(1.0)))
+    reach = int(wp.ceil((edge - real(1.0)) * real(0.5)))
+    width = view.width
+    unit = real(1.0) / real(255.0)
+    rgb = vec3(real(0.0), real(0.0), real(0.0))
+    sum_alpha = real(0.0)
+    for down in range(-reach, reach + 1):
+        y = wp.clamp(row + down, 0, view.height - 1)
+        for right in range(-reach, reach + 1):
+            x = wp.clamp(column + right, 0, width - 1)
+            share = overlap(down, edge) * overlap(right, edge)
+            at = (y * width + x) * view.channels
+            alpha = share
+            if view.channels == 4:
+                alpha = share * (real(view.pixels[at + 3]) * unit)
+            sum_alpha += alpha
+            r, g, b = real(view.pixels[at]), real(view.pixels[at + 1]), real(view.pixels[at + 2])
+            rgb += alpha * (unit * vec3(r, g, b))
+    whole = real(1.0) / (edge * edge)
+    return whole * rgb, whole * sum_alpha
+
+
+@wp.func
+def overlap(away: int, edge: real) -> real:
+    """How much of a pixel lies in an interval of that length around the middle of another one."""
+    within = real(0.5) * (edge + real(1.0)) - real(wp.abs(away))
+    return wp.clamp(within, real(0.0), real(1.0))
+
+
 @wp.kernel
 def sample_pixels(
     # launch
@@ -335,14 +374,16 @@ def sample_pixels(
     draw: Draw,
     # out
     out_rays: Rays,
-    out_target_rgb: wp.array(dtype=vec3),  # [n_rays] the pixel over its background
+    out_target_rgb: wp.array(dtype=vec3),  # [n_rays] the pixel, or mean, over its background
     out_views: wp.array(dtype=wp.int32),  # [n_rays] its photograph; -1: the pixel is not opaque
 ):
     """A batch of rays through the pixels that were picked."""
     i = first + wp.tid()
     later = picks[wp.min(i + wp.static(AHEAD), picks.shape[0] - 1)]
     later_view = source.views[wp.max(picked_views[later], -1 - picked_views[later])]
-    prefetch(later_view.pixels, picked_pixels[later] * later_view.channels)
+    row = later_view.width * later_view.channels * wp.where(source.average > real(1.0), 1, 0)
+    for k in range(-1, 2):
+        prefetch(later_view.pixels, picked_pixels[later] * later_view.channels + k * row)
     pick = picks[i]
     v = wp.max(picked_views[pick], -1 - picked_views[pick])
     local = picked_pixels[pick]
@@ -358,17 +399,11 @@ def sample_pixels(
     offset = real(0.5)
     if draw.jitter == 1:
         offset = real(wp.randf(state))
-    at = local * view.channels
-    opaque = wp.uint8(255)
-    if view.channels == 4:
-        opaque = view.pixels[at + 3]
-    unit = real(1.0) / real(255.0)
-    alpha = real(opaque) * unit
-    rgb = unit * vec3(real(view.pixels[at]), real(view.pixels[at + 1]), real(view.pixels[at + 2]))
+    rgb, alpha = averaged(view, local % view.width, local // view.width, source.average)
     if source.gains.shape[0] > 0:
-        rgb = wp.cw_div(rgb - source.offsets[v], source.gains[v])
+        rgb = wp.cw_div(rgb - alpha * source.offsets[v], source.gains[v])
     out_rays.offsets[i] = offset
     out_rays.background[i] = behind
     out_rays.content_distance[i] = source.content_distances[v]
-    out_target_rgb[i] = alpha * rgb + (real(1.0) - alpha) * behind
-    out_views[i] = wp.where(opaque == wp.uint8(255), v, -1)
+    out_target_rgb[i] = rgb + (real(1.0) - alpha) * behind
+    out_views[i] = wp.where(alpha > real(0.999), v, -1)
