@@ -37,8 +37,9 @@ class LossConfig:
     """Weight of the distortion loss: density concentrates along a ray. Distances count as
     t / (D + t), with D the content distance in use; with auto and per-camera, the scene's."""
     distortion_rise: float = 1.0
-    """How many times its weight of the start distortion has at the end; halfway it has the weight
-    that is configured, and it rises at an even rate, in a hundred steps. 1: it stays the same."""
+    """How many times its weight of the start distortion has at the end, 1e-6 to 1e6. Halfway it has
+    the weight that is configured, and each hundredth of a training multiplies it by as much. 1: it
+    stays the same."""
     entropy: float = 0.0
     """Weight of the entropy of the remaining light: a ray ends at something opaque, or meets
     nothing."""
@@ -66,6 +67,14 @@ class LossConfig:
             if name != "opacity" or self.opacity != "auto":
                 require_at_least(f"loss.{name}", getattr(self, name), 0.0)
         require_positive("loss.distortion_rise", self.distortion_rise)
+        if not 1e-6 <= self.distortion_rise <= 1e6 or not (
+            self.distortion == 0.0 or self.distortion_rise == 1.0 or 1e-20 < self.distortion < 1e20
+        ):
+            raise InputError(
+                "loss.distortion_rise must lie between 1e-6 and 1e6, and loss.distortion, which it "
+                f"multiplies, within float32, not {said(self.distortion_rise)} and "
+                f"{said(self.distortion)}."
+            )
         if self.photometric != "huber" and self.huber_delta != HUBER_DELTA:
             raise InputError(
                 f"loss.huber_delta is {self.huber_delta:g}, but loss.photometric is squared; set "

@@ -145,7 +145,7 @@ MUTANTS = [
     Mutant("exposures: offsets keep their mean", "optim/exposure.py", "offset[c] - gain[c] * darker", "offset[c]", EXPOSURE),
     Mutant("draw: offsets added", "space/camera.py", "rgb - alpha * source.offsets[v]", "rgb + alpha * source.offsets[v]", EXPOSED),
     Mutant("draw: the first photograph's exposure", "space/camera.py", "source.gains[v])", "source.gains[0])", EXPOSED),
-    Mutant("draw: transparent pixels are somebody's", "space/camera.py", "wp.where(alpha > real(0.999), v, -1)", "v", EXPOSED),
+    Mutant("draw: transparent pixels are somebody's", "space/camera.py", "wp.where(tells and alpha > real(0.999), v, -1)", "v", EXPOSED),
     # adam.py
     Mutant("Adam: a decay raises", "optim/adam.py", "+ adam.epsilon) - fall;", "+ adam.epsilon) + fall;", ADAM),
     Mutant("Adam: all numbers decay", "optim/adam.py", "(c + n) % FLOATS ? 0.0f : decay", "decay", ADAM),

@@ -120,9 +120,14 @@ def test_a_mask_of_all_pixels_changes_no_bit(device: str) -> None:
     views = small_scene().views
     whole = [replace(v, mask=np.ones(v.image.shape[:2], bool)) for v in views]
     options = (np.full(len(views), 2.0), None, N_RAYS, True, 0, Workers(device, 2))
-    one, other = (drawn(PixelSampler(v, *options).draw(5)) for v in (views, whole))
-    for name, found in one.items():
-        assert np.array_equal(found, other[name])
+    for edge in (1.0, 2.5):
+        batches = []
+        for photographs in (views, whole):
+            sampler = PixelSampler(photographs, *options)
+            sampler.average_over(edge)
+            batches.append(drawn(sampler.draw(5)))
+        for name, found in batches[0].items():
+            assert np.array_equal(found, batches[1][name])
 
 
 def test_averages_are_of_pixels_from_now_on_and_until_one(device: str) -> None:

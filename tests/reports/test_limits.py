@@ -76,6 +76,13 @@ def test_a_fall_is_called_so_and_is_for_want_of_time_where_the_grid_has_just_gro
     before = [replace(r, size=(20, 20, 20)) if r.fraction > 0.6 else r for r in reports(-5.0)]
     fallen = what_limits(before, 1.3, test)
     assert fallen is not None and fallen.name == "exposures"
+    # Of the third before the last, those of the coarser grid do not count: pixels were averaged.
+    coarse = [
+        replace(r, size=(5, 5, 5), psnr=r.psnr + 9.0) if r.fraction < 0.6 else r
+        for r in reports(3.0)
+    ]
+    limit = what_limits(coarse, 1.3, metrics_of(29.0))
+    assert limit is not None and "rose by 2.7 dB in the last third" in str(limit)
     nothing = what_limits(reports(-0.9), 1.3, metrics_of(29.0))
     assert nothing is not None and str(nothing).endswith("and fell by 0.9 dB in the last third")
 

@@ -45,6 +45,15 @@ def test_a_rise_that_is_none_is_refused(rise: object) -> None:
         LossConfig(distortion=0.1, distortion_rise=rise)  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize(
+    ("distortion", "rise"), [(0.1, 1e7), (0.1, 1e-7), (1e-30, 2.0), (1e30, 2.0)]
+)
+def test_a_weight_that_floats_do_not_hold_is_refused(distortion: float, rise: float) -> None:
+    with pytest.raises(InputError, match=r"^loss\.distortion_rise must lie between 1e-6 and 1e6"):
+        LossConfig(distortion=distortion, distortion_rise=rise)
+    assert LossConfig(distortion=1e-30).at(0.3).distortion == 1e-30
+
+
 @pytest.fixture
 def minimised(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[float]]:
     """The weight of the distortion loss at each update."""

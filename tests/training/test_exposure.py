@@ -213,7 +213,7 @@ def test_the_first_share_of_a_training_has_none() -> None:
 
 
 def test_batches_are_drawn_by_the_exposures_as_they_stand() -> None:
-    trainer = Trainer(exposed(), tiny_config(appearance="affine"))
+    trainer = Trainer(exposed(), tiny_config(appearance="affine", average_pixels=False))
     assert trainer.exposures is not None
     before = trainer._draw(1).target_rgb.numpy().copy()
     trainer.exposures.gains.fill_(wp.vec3(0.5, 0.5, 0.5))

@@ -15,7 +15,7 @@ def chosen_losses(begin: LossConfig, options: Sequence[str]) -> LossConfig:
 
     Args:
         begin: Those of the preset, or of the run that is resumed.
-        options: What --loss lists, a field and its value each, such as "distortion=0.01".
+        options: What --loss lists, a field and its value each, such as "distortion=0.03".
 
     Returns:
         `begin` with these values.

@@ -74,8 +74,8 @@ class TrainOptions:
     """Of the model, such as specular=8 width=64: the same as --model.specular 8
     --model.width 64."""
     loss: Settings = ()
-    """What is minimised besides, such as distortion=0.01 entropy=0.001: the same as
-    --loss.distortion 0.01 --loss.entropy 0.001."""
+    """What is minimised besides, such as distortion=0.03 entropy=0.001: the same as
+    --loss.distortion 0.03 --loss.entropy 0.001."""
 
     @property
     def page(self) -> PageOptions | None:

@@ -46,7 +46,8 @@ class RayBatch:
     """[n_rays] vec3, pixels over their background in [0, 1]; beyond that where exposures are taken
     out of them."""
     views: wp.array | None = None
-    """[n_rays] int32, whose pixel that is, -1 where it is not opaque; None: not drawn from any."""
+    """[n_rays] int32, whose pixel that is, -1 where it is not opaque, or the mean of some that are
+    cut off; None: not drawn from any."""
 
     @property
     def count(self) -> int:
@@ -190,7 +191,7 @@ class PixelSampler:
         struct.channels = image.shape[2]
         struct.pixels = pixels
         mask = view.mask
-        if mask is None:
+        if mask is None or mask.all():
             self._n_pixels += view.camera.width * view.camera.height
         else:
             struct.runs = wp.array(runs_of(mask), dtype=wp.vec2i, device=self._workers.device)
@@ -270,7 +271,8 @@ class PixelSampler:
 
         No pixel is drawn again before all have been: one after the other in a random order, each
         time in another one. What is drawn is a function of the steps, the seed, and of what
-        ``cull_background`` was given. A batch of several steps is made of those of each.
+        ``cull_background`` and ``average_over`` were given. A batch of several steps is made of
+        those of each.
 
         Args:
             step: The first.

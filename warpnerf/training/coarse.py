@@ -42,6 +42,8 @@ ROUNDS = 2
 """Where cameras look at no common point; elsewhere one."""
 VOXELS = 48**3
 TIME_SHARE = 0.12
+EARLY = 0.25
+"""Losses weigh as after this share of a training."""
 """Of a training's time limit, that all rounds together take at most."""
 
 QUICK_BORDER, QUICK_GROWTH = 0.2, 0.1
@@ -145,6 +147,7 @@ def extent_by_training(
         optim=replace(config.optim, restart_at_growth=False, near_decay=0.0),
         appearance="none",
         settle_at=None,
+        loss=config.loss.at(EARLY),
         field=DENSE,
         sampler=MARCHED,
     )

@@ -36,8 +36,8 @@ MOST_AVERAGED = 4.0
 def averaged_over(plan: TrainingPlan, grown: int) -> float:
     """The edge of the square that pixels are averaged over, 1 to MOST_AVERAGED pixels.
 
-    What is finer than a grid's voxels is noise to it. Those of the final grid are about as wide as
-    pixels.
+    What is finer than a grid's voxels is noise to it. Voxels count as wide as numbers of nodes say,
+    and those of the final grid as a pixel.
 
     Args:
         plan: Of the training.

@@ -26,7 +26,8 @@ MAY_CHANGE = ("device", "threads", "checkpoint_every")
 first two change how sums are rounded, and so the last bits."""
 
 MAY_GROW = ("steps", "time_limit")
-"""Fields that it may raise. Learning rates and growth then follow the longer schedule."""
+"""Fields that it may raise. Learning rates, growth and
+weights of losses then follow the longer schedule."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,10 +41,11 @@ class Progress:
     seconds: float
     """Of training, those before a resumption included; compiling does not count."""
     loss: float
-    """Of the last update: mean over its rays of what is minimised."""
+    """Of the last update: mean over its rays of what is minimised, by weights as they are then."""
     psnr: float
     """Of the squared error of the last update's rays, dB; in the field's colours, where exposures
-    are taken out of the photographs."""
+    are taken out of the photographs, and of averages of pixels while the grid is coarse
+    (``TrainConfig.average_pixels``)."""
     samples_per_ray: float
     """Visited steps per ray of the last update."""
     size: tuple[int, int, int]

@@ -326,18 +326,20 @@ def pick_pixels(
 
 @wp.func
 def averaged(view: CameraParams, column: int, row: int, edge: real):
-    """The mean of a photograph over a square around the middle of a pixel: alpha * rgb, and alpha.
+    """The mean of a photograph over a square around the middle of a pixel: alpha * rgb, and alpha;
+    and whether it tells of an exposure: no mean does of which a part is cut off at 0 or 255.
 
     Pixels count by how much of them lies in the square. Beyond the photograph's edges there are
     copies of the pixels along these. Where there is a mask, a pixel stands for itself: none takes
     in what is masked.
     """
     edge = wp.where(view.runs.shape[0] > 0, real(1.0), wp.max(edge, real(1.0)))
-    reach = int(wp.ceil((edge - real(1.0)) * real(0.5)))
+    reach = reach_of(edge)
     width = view.width
     unit = real(1.0) / real(255.0)
     rgb = vec3(real(0.0), real(0.0), real(0.0))
     sum_alpha = real(0.0)
+    tells = bool(True)
     for down in range(-reach, reach + 1):
         y = wp.clamp(row + down, 0, view.height - 1)
         for right in range(-reach, reach + 1):
@@ -348,10 +350,20 @@ def averaged(view: CameraParams, column: int, row: int, edge: real):
             if view.channels == 4:
                 alpha = share * (real(view.pixels[at + 3]) * unit)
             sum_alpha += alpha
-            r, g, b = real(view.pixels[at]), real(view.pixels[at + 1]), real(view.pixels[at + 2])
-            rgb += alpha * (unit * vec3(r, g, b))
+            r, g, b = view.pixels[at], view.pixels[at + 1], view.pixels[at + 2]
+            rgb += alpha * (unit * vec3(real(r), real(g), real(b)))
+            darkest = wp.min(wp.min(r, g), b)
+            brightest = wp.max(wp.max(r, g), b)
+            if reach > 0 and (darkest == wp.uint8(0) or brightest == wp.uint8(255)):
+                tells = bool(False)
     whole = real(1.0) / (edge * edge)
-    return whole * rgb, whole * sum_alpha
+    return whole * rgb, whole * sum_alpha, tells
+
+
+@wp.func
+def reach_of(edge: real) -> int:
+    """How many pixels a square of that edge around the middle of one reaches beyond it."""
+    return int(wp.ceil((wp.max(edge, real(1.0)) - real(1.0)) * real(0.5)))
 
 
 @wp.func
@@ -375,15 +387,16 @@ def sample_pixels(
     # out
     out_rays: Rays,
     out_target_rgb: wp.array(dtype=vec3),  # [n_rays] the pixel, or mean, over its background
-    out_views: wp.array(dtype=wp.int32),  # [n_rays] its photograph; -1: the pixel is not opaque
+    out_views: wp.array(dtype=wp.int32),  # [n_rays] its photograph; -1: tells of no exposure
 ):
     """A batch of rays through the pixels that were picked."""
     i = first + wp.tid()
     later = picks[wp.min(i + wp.static(AHEAD), picks.shape[0] - 1)]
     later_view = source.views[wp.max(picked_views[later], -1 - picked_views[later])]
-    row = later_view.width * later_view.channels * wp.where(source.average > real(1.0), 1, 0)
-    for k in range(-1, 2):
-        prefetch(later_view.pixels, picked_pixels[later] * later_view.channels + k * row)
+    reach = reach_of(source.average)
+    for down in range(-reach, reach + 1):
+        beside = picked_pixels[later] + down * later_view.width
+        prefetch(later_view.pixels, beside * later_view.channels)
     pick = picks[i]
     v = wp.max(picked_views[pick], -1 - picked_views[pick])
     local = picked_pixels[pick]
@@ -399,11 +412,11 @@ def sample_pixels(
     offset = real(0.5)
     if draw.jitter == 1:
         offset = real(wp.randf(state))
-    rgb, alpha = averaged(view, local % view.width, local // view.width, source.average)
+    rgb, alpha, tells = averaged(view, local % view.width, local // view.width, source.average)
     if source.gains.shape[0] > 0:
         rgb = wp.cw_div(rgb - alpha * source.offsets[v], source.gains[v])
     out_rays.offsets[i] = offset
     out_rays.background[i] = behind
     out_rays.content_distance[i] = source.content_distances[v]
     out_target_rgb[i] = rgb + (real(1.0) - alpha) * behind
-    out_views[i] = wp.where(alpha > real(0.999), v, -1)
+    out_views[i] = wp.where(tells and alpha > real(0.999), v, -1)
