@@ -32,7 +32,7 @@ from warpnerf.training.trainer import Trainer
 from warpnerf.viewer.painter import Painter, Settings, Subject
 from warpnerf.viewer.viewpoint import Viewpoint
 
-CONFIG = config_of("columns")
+CONFIG = replace(config_of("columns"), average_pixels=False)
 
 
 @pytest.fixture(scope="module")

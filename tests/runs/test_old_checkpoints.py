@@ -133,12 +133,13 @@ def write_old(path: Path, header: dict[str, Any], **tensors: np.ndarray) -> None
 
 def test_files_of_the_version_before_hold_the_model_rgb(tmp_path: Path) -> None:
     """Values and moments, bit for bit, and a configuration to continue with."""
-    # All rays were drawn then, nothing settled, a thinner medium was not free space, steps outside
-    # the box were shorter, all grids grew late, and boxes were the scene's.
+    # All rays were drawn then, of single pixels, nothing settled, a thinner medium was not free
+    # space, steps outside the box were shorter, all grids grew late, and boxes were the scene's.
     then = {
         "sampler": MARCHED,
         "skip_empty_rays": False,
         "appearance": "none",
+        "average_pixels": False,
         "settle_at": None,
         "alpha_min": 0.01,
         "march": MarchConfig(growth=0.02),
