@@ -135,7 +135,8 @@ class TrainConfig:
     average_pixels: bool = True
     """Whether pixels are averaged as long as the grid is coarse: over a square as many pixels wide
     as its voxels are of the final grid's, by numbers of nodes (``training.growth.averaged_over``).
-    Photographs that have masks are taken as they are."""
+    Photographs that have masks are taken as they are, and those of bounded scenes without
+    alpha."""
     occupancy_every: int = 100
     """Updates of the grid between two looks for free space, each of one or several steps."""
     skip_empty_rays: bool = True

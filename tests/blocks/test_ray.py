@@ -35,7 +35,7 @@ def test_the_largest_machine_counts() -> None:
     assert largest_machine(nodes) == 4 and largest_machine(nodes[1:]) == 1
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_killed_worker_s_block_is_taken_over(tmp_path: Path) -> None:
     pytest.importorskip("ray")
     blocks = BlockFolder.read(cut(tmp_path / "room"))

@@ -355,7 +355,7 @@ def test_gradients_in_another_space(kernels64: Kernels) -> None:
         )
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_training_in_another_space(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """By its name: it learns, and files hold it; who does not know it is told."""
     monkeypatch.setattr(trainer, "REPORT_EVERY", 1)

@@ -54,7 +54,8 @@ MUTANTS = [
             "reports/test_limits.py::test_a_fall_is_called_so_and_is_for_want_of_time_where_the_grid_has_just_grown"),
     # growth.py, config_json.py
     of_host("average: as many as voxels", GROWTH, "** (1.0 / 3.0)", "** (1.0 / 2.0)", AVERAGED),
-    of_host("average: unasked", GROWTH, "if not plan.config.average_pixels:", "if False:", AVERAGED),
+    of_host("average: unasked", GROWTH, "if not plan.config.average_pixels or", "if", AVERAGED),
+    of_host("average: everywhere", GROWTH, " or plan.kind == \"bounded\":", ":", f"{TESTS}bounded_scenes_without_alpha_are_not_averaged"),
     of_host("average: wide squares", GROWTH, "min(edge, MOST_AVERAGED)", "edge", WIDEST),
     of_host("average: in older trainings", "config_json.py", '        "average_pixels": False,\n', "", OLDER),
 ]  # fmt: skip

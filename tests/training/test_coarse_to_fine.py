@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -116,6 +117,12 @@ def test_pixels_are_averaged_until_the_grid_has_grown(
     assert drawn == pytest.approx([edges[1]])
     plan = resolve(large_ball(), tiny_config(average_pixels=False), looked=True)
     assert [averaged_over(plan, grown) for grown in range(3)] == [1.0] * 3
+
+
+def test_bounded_scenes_without_alpha_are_not_averaged(on_cpu: None) -> None:
+    plan = replace(resolve(large_ball(), tiny_config(), looked=True), kind="bounded")
+    assert [averaged_over(plan, grown) for grown in range(3)] == [1.0] * 3
+    assert averaged_over(replace(plan, kind="unbounded"), 0) > 1.0
 
 
 def test_no_square_is_wider_than_four_pixels(on_cpu: None) -> None:

@@ -171,7 +171,7 @@ def test_each_can_fail(
     assert all(any(word in name for name in spoilt) for word in words)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_training_that_differs_fails(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], device: str, on_cpu: None
 ) -> None:
@@ -190,7 +190,7 @@ def test_training_that_differs_fails(
     assert not capsys.readouterr().out
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_check_that_cannot_run_fails_and_says_why(
     monkeypatch: pytest.MonkeyPatch, device: str
 ) -> None:

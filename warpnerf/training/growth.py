@@ -37,13 +37,14 @@ def averaged_over(plan: TrainingPlan, grown: int) -> float:
     """The edge of the square that pixels are averaged over, 1 to MOST_AVERAGED pixels.
 
     What is finer than a grid's voxels is noise to it. Voxels count as wide as numbers of nodes say,
-    and those of the final grid as a pixel.
+    and those of the final grid as a pixel. Bounded scenes without alpha are trained on single
+    pixels: the built-in room loses by averages (docs/decisions/average-pixels.md).
 
     Args:
         plan: Of the training.
         grown: How often the grid has grown.
     """
-    if not plan.config.average_pixels:
+    if not plan.config.average_pixels or plan.kind == "bounded":
         return 1.0
     edge = (plan.stages[-1].nodes / plan.stages[grown].nodes) ** (1.0 / 3.0)
     return min(edge, MOST_AVERAGED)
