@@ -13,7 +13,7 @@ HALFWAY, REFUSED, GAINS, AVERAGED, WIDEST = (
         "no_square_is_wider_than_four_pixels",
     )
 )
-SQUARE = "kernels/test_camera_rays.py::test_pixels_are_averaged_over_a_square"
+SQUARE = "kernels/test_drawn_pixels.py::test_pixels_are_averaged_over_a_square"
 OLDER = "model/test_presets.py::test_what_older_files_leave_out_is_what_was_the_default_then"
 CAMERA, CONFIG = "space/camera.py", "loss_config.py"
 TRAINER, GROWTH, PASS = "training/trainer.py", "training/growth.py", "rendering/render.py"

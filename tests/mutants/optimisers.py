@@ -8,7 +8,7 @@ ADAM, NEAR_DECAY = "kernels/test_adam.py", "fields/test_near_decay.py"
 EXPOSURE = "kernels/test_exposure.py"
 REDUCTION = "kernels/test_reduction.py"
 EXPOSED = (
-    "kernels/test_camera_rays.py::test_exposures_are_taken_out_of_pixels_before_their_background"
+    "kernels/test_drawn_pixels.py::test_exposures_are_taken_out_of_pixels_before_their_background"
 )
 
 MUTANTS = [

@@ -6,6 +6,7 @@ INTERP = "kernels/test_interpolation.py"
 LOST = "kernels/test_render.py::test_rays_that_are_not_finite_see_the_background"
 OCCUPANCY = "kernels/test_free_space.py"
 CAMERA = "kernels/test_camera_rays.py"
+DRAWN = "kernels/test_drawn_pixels.py"
 COVERAGE = "kernels/test_coverage.py"
 REPROJECTION = "viewer/test_reprojection.py"
 RAYS = "rendering/test_rays.py"
@@ -301,7 +302,7 @@ MUTANTS = [
     Mutant("camera: each step draws the same", "space/camera.py",
            "ray = draw.rays_before + wp.int64(i)", "ray = wp.int64(i)", RAYS),
     Mutant("camera: the view before", "space/camera.py",
-           "views[middle].first_pixel <= pixel", "views[middle].first_pixel < pixel", CAMERA),
+           "views[middle].first_pixel <= pixel", "views[middle].first_pixel < pixel", DRAWN),
     Mutant("camera: the run before", "space/camera.py",
            "view.runs[middle][0] <= number", "view.runs[middle][0] < number", RAYS),
     Mutant("camera: blocks of the first view", "space/camera.py",
@@ -325,17 +326,17 @@ MUTANTS = [
     Mutant("camera: runs begin at the row", "space/camera.py",
            "run[1] + number - run[0]", "run[1]", RAYS),
     Mutant("camera: an order of all bits", "space/camera.py",
-           "found = wp.where(number < n, 1, 0)", "number = number % n\n        found = 1", CAMERA),
+           "found = wp.where(number < n, 1, 0)", "number = number % n\n        found = 1", DRAWN),
     Mutant("camera: the same order again", "space/camera.py",
-           "wp.rand_init(seed, -1 - epoch)", "wp.rand_init(seed, -1)", CAMERA),
+           "wp.rand_init(seed, -1 - epoch)", "wp.rand_init(seed, -1)", DRAWN),
     Mutant("camera: an order of 32 bits", "space/camera.py",
-           "wp.uint64(source.n_pixels), draw.seed", "wp.uint64(wp.uint32(source.n_pixels)), draw.seed", CAMERA),
+           "wp.uint64(source.n_pixels), draw.seed", "wp.uint64(wp.uint32(source.n_pixels)), draw.seed", DRAWN),
     Mutant("camera: high bits stay where they are", "space/camera.py",
-           "number = number ^ (number >> half)", "number = number", CAMERA),
+           "number = number ^ (number >> half)", "number = number", DRAWN),
     Mutant("camera: rays of others' offsets", "space/camera.py",
            "draw.rays_before + wp.int64(pick)", "draw.rays_before + wp.int64(i)", RAYS),
-    Mutant("camera: blue is alpha", "space/camera.py", "pixels[at + 3]", "pixels[at + 2]", CAMERA),
+    Mutant("camera: blue is alpha", "space/camera.py", "pixels[at + 3]", "pixels[at + 2]", DRAWN),
     Mutant("camera: alpha twice", "space/camera.py",
            "= rgb + (real(1.0) - alpha) * behind",
-           "= alpha * rgb + (real(1.0) - alpha) * behind", CAMERA),
+           "= alpha * rgb + (real(1.0) - alpha) * behind", DRAWN),
 ]  # fmt: skip

@@ -26,8 +26,8 @@ MAY_CHANGE = ("device", "threads", "checkpoint_every")
 first two change how sums are rounded, and so the last bits."""
 
 MAY_GROW = ("steps", "time_limit")
-"""Fields that it may raise. Learning rates, growth and
-weights of losses then follow the longer schedule."""
+"""Fields that it may raise. Learning rates, growth and weights of losses then follow the longer
+schedule."""
 
 
 @dataclass(frozen=True, kw_only=True)
